@@ -1,0 +1,137 @@
+// What every binding shares: tensor access, last-line checks, device context. LibTorch's stable ABI only; each binding
+// file is compiled once for the CPU library and, with SPS_CUDA, once for the CUDA library.
+#pragma once
+
+#ifdef SPS_CUDA
+#include <cuda_runtime_api.h>
+#endif
+
+#include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/macros.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+#include <torch/headeronly/util/Exception.h>
+
+#include <cstdint>
+#include <exception>
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "core/device.h"
+#include "core/philox.h"
+
+namespace spslam::bindings {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+#ifdef SPS_CUDA
+#define SPS_DISPATCH_KEY CUDA
+using Context = Cuda;
+
+// Makes the tensor's device current and names its current stream.
+class DeviceScope {
+ public:
+  explicit DeviceScope(const Tensor& tensor) : guard_(tensor.get_device_index()) {
+    TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(tensor.get_device_index(), &context.stream));
+  }
+  // Reports a failed launch, unless an exception that is already on its way says more.
+  ~DeviceScope() noexcept(false) {
+    if (std::uncaught_exceptions() == 0) STD_CUDA_KERNEL_LAUNCH_CHECK();
+  }
+  Context context{nullptr};
+
+ private:
+  torch::stable::accelerator::DeviceGuard guard_;
+};
+#else
+#define SPS_DISPATCH_KEY CPU
+using Context = Cpu;
+
+class DeviceScope {
+ public:
+  explicit DeviceScope(const Tensor&) {}
+  Context context;
+};
+#endif
+
+template <class T>
+struct ScalarTypeOf;
+template <>
+struct ScalarTypeOf<float> {
+  static constexpr ScalarType value = ScalarType::Float;
+};
+template <>
+struct ScalarTypeOf<double> {
+  static constexpr ScalarType value = ScalarType::Double;
+};
+template <>
+struct ScalarTypeOf<std::int32_t> {
+  static constexpr ScalarType value = ScalarType::Int;
+};
+template <>
+struct ScalarTypeOf<std::int64_t> {
+  static constexpr ScalarType value = ScalarType::Long;
+};
+template <>
+struct ScalarTypeOf<bool> {
+  static constexpr ScalarType value = ScalarType::Bool;
+};
+template <>
+struct ScalarTypeOf<std::uint8_t> {
+  static constexpr ScalarType value = ScalarType::Byte;
+};
+
+// Read access. The tensor must be contiguous: take it through contiguous() first.
+template <class T>
+const T* data(const Tensor& tensor) {
+  STD_TORCH_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value,
+                  "spslam: tensor of another dtype than the kernel reads");
+  return static_cast<const T*>(tensor.const_data_ptr());
+}
+
+// Write access to an output or an in-place argument.
+template <class T>
+T* mutable_data(const Tensor& tensor) {
+  STD_TORCH_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value,
+                  "spslam: tensor of another dtype than the kernel writes");
+  STD_TORCH_CHECK(tensor.is_contiguous(), "spslam: an in-place argument must be contiguous");
+  return static_cast<T*>(tensor.mutable_data_ptr());
+}
+
+inline Tensor contiguous(const Tensor& tensor) {
+  return torch::stable::contiguous(tensor);
+}
+
+inline Tensor empty(const Tensor& like, const std::vector<std::int64_t>& sizes, ScalarType dtype) {
+  return torch::stable::new_empty(like, sizes, dtype);
+}
+
+inline Tensor zeros(const Tensor& like, const std::vector<std::int64_t>& sizes, ScalarType dtype) {
+  return torch::stable::new_zeros(like, sizes, dtype);
+}
+
+// Calls f with a value of the element type, float or double.
+template <class F>
+void dispatch_floating(const char* function, const Tensor& tensor, F&& f) {
+  if (tensor.scalar_type() == ScalarType::Float) {
+    f(float{});
+  } else if (tensor.scalar_type() == ScalarType::Double) {
+    f(double{});
+  } else {
+    STD_TORCH_CHECK(false, function, ": tensors must be float32 or float64");
+  }
+}
+
+inline PhiloxKey philox_key(std::int64_t seed, std::int64_t stream, std::int64_t frame, std::int64_t iteration) {
+  return {static_cast<std::uint64_t>(seed), static_cast<std::uint32_t>(stream), static_cast<std::uint32_t>(frame),
+          static_cast<std::uint32_t>(iteration)};
+}
+
+}  // namespace spslam::bindings
+
+#define SPS_LIBRARY_IMPL(m) SPS_LIBRARY_IMPL_(SPS_DISPATCH_KEY, m)
+#define SPS_LIBRARY_IMPL_(key, m) STABLE_TORCH_LIBRARY_IMPL(spslam, key, m)

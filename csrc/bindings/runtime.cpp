@@ -1,0 +1,31 @@
+// Thread count of the CPU kernels. The op takes no tensor, so it is implemented for every backend at once.
+#ifndef SPS_CUDA
+#include "bindings/common.h"
+#include "core/parallel.h"
+
+namespace spslam::bindings {
+namespace {
+
+void set_num_threads_op(std::int64_t count) {
+  STD_TORCH_CHECK(count >= 1, "set_num_threads: count must be at least 1, got ", count);
+  spslam::set_num_threads(static_cast<int>(count));
+}
+
+std::int64_t get_num_threads_op() {
+  return spslam::get_num_threads();
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def("set_num_threads(int count) -> ()");
+  m.def("get_num_threads() -> int");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(spslam, CompositeExplicitAutograd, m) {
+  m.impl("set_num_threads", TORCH_BOX(&set_num_threads_op));
+  m.impl("get_num_threads", TORCH_BOX(&get_num_threads_op));
+}
+
+}  // namespace spslam::bindings
+#endif

@@ -1,0 +1,5 @@
+#include "kernels/ray_sampling_launch.h"
+
+namespace spslam {
+SPS_INSTANTIATE_RAY_SAMPLING(Cuda)
+}  // namespace spslam

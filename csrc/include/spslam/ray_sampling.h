@@ -1,0 +1,19 @@
+// Random pixel draws and samples along rays.
+#pragma once
+
+#include <cstdint>
+
+#include "core/device.h"
+#include "core/philox.h"
+
+namespace spslam {
+
+// out[e] = uniform in [0, 1) for counter element e.
+template <class Device>
+void philox_uniform(Device device, PhiloxKey key, std::int64_t count, float* out);
+
+// out[e] = uniform integer in [0, upper) for counter element e; upper in [1, 2^32].
+template <class Device>
+void sample_indices(Device device, PhiloxKey key, std::int64_t upper, std::int64_t count, std::int64_t* out);
+
+}  // namespace spslam

@@ -1,0 +1,56 @@
+"""Builds the kernel libraries with CMake and puts them into the package; everything else is in pyproject.toml."""
+
+import os
+import pathlib
+import shlex
+import subprocess
+import sys
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent / "cmake"))
+
+from setuptools import Extension, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_ext import build_ext
+
+OPTIONS = ("SPSLAM_CUDA", "SPSLAM_CUDA_ARCHS", "SPSLAM_CPU_ISAS")
+
+
+class CMakeBuild(build_ext):
+    """Runs CMake once for all op libraries."""
+
+    def get_ext_filename(self, fullname):
+        return fullname.replace(".", os.sep) + ".so"
+
+    def get_outputs(self):
+        return [str(path) for path in (pathlib.Path(self.build_lib) / "spslam").glob("_ops_*.so")]
+
+    def run(self):
+        from spslam_build import torch_dir
+
+        torch = torch_dir()
+        if torch is None:
+            raise SystemExit("spslam: torch is not installed; install torch >= 2.11 first, or set SPSLAM_TORCH_DIR")
+        source = pathlib.Path(__file__).parent.resolve()
+        build = pathlib.Path(self.build_temp).resolve()
+        destination = source if self.inplace else pathlib.Path(self.build_lib).resolve()
+        build.mkdir(parents=True, exist_ok=True)
+        arguments = [f"-DSPSLAM_TORCH_DIR={torch}", f"-DCMAKE_INSTALL_PREFIX={destination}"]
+        arguments += [f"-D{name}={os.environ[name]}" for name in OPTIONS if os.environ.get(name)]
+        arguments += shlex.split(os.environ.get("CMAKE_ARGS", ""))
+        subprocess.check_call(["cmake", "-S", str(source), "-B", str(build), "-G", "Ninja", *arguments])
+        jobs = os.environ.get("MAX_JOBS") or os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL")
+        subprocess.check_call(["cmake", "--build", str(build), *(["-j", jobs] if jobs else [])])
+        subprocess.check_call(["cmake", "--install", str(build)])
+
+
+class PlatformWheel(bdist_wheel):
+    """The libraries hold no Python symbol, so one wheel serves every Python 3."""
+
+    def get_tag(self):
+        return "py3", "none", super().get_tag()[2]
+
+
+setup(
+    ext_modules=[Extension("spslam._ops_cpu", sources=[])],
+    cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
+)

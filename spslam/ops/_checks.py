@@ -1,0 +1,51 @@
+"""Argument checks of the public ops, in one wording: `<function>: <argument> must <rule>, got <actual>`."""
+
+from collections.abc import Sequence
+
+import torch
+
+FLOATING = (torch.float32, torch.float64)
+
+
+def check(condition: bool, function: str, argument: str, rule: str, actual: object) -> None:
+    """Raises ValueError in the house's wording unless `condition` holds."""
+    if not condition:
+        raise ValueError(f"{function}: {argument} must {rule}, got {actual}")
+
+
+def check_tensor(
+    function: str,
+    argument: str,
+    tensor: torch.Tensor,
+    shape: Sequence[int | str],
+    dtype: torch.dtype | Sequence[torch.dtype],
+    like: torch.Tensor | None = None,
+) -> None:
+    """Checks that `tensor` is a tensor of that shape and dtype, on the device of `like`.
+
+    Args:
+        function: name of the public function, for the message.
+        argument: name of the argument, for the message.
+        tensor: what the caller passed.
+        shape: an int fixes an axis, a str only names it.
+        dtype: the dtype or dtypes allowed.
+        like: a tensor whose device must be the same.
+
+    Raises:
+        TypeError: not a tensor, or another dtype.
+        ValueError: another shape or device.
+    """
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"{function}: {argument} must be a torch.Tensor, got {type(tensor).__name__}")
+    dtypes = (dtype,) if isinstance(dtype, torch.dtype) else tuple(dtype)
+    if tensor.dtype not in dtypes:
+        names = " or ".join(str(d).removeprefix("torch.") for d in dtypes)
+        raise TypeError(f"{function}: {argument} must be {names}, got {str(tensor.dtype).removeprefix('torch.')}")
+    fits = tensor.dim() == len(shape) and all(
+        not isinstance(axis, int) or tensor.shape[i] == axis for i, axis in enumerate(shape)
+    )
+    if not fits:
+        wanted = "[" + ", ".join(str(axis) for axis in shape) + "]"
+        raise ValueError(f"{function}: {argument} must have shape {wanted}, got {list(tensor.shape)}")
+    if like is not None and tensor.device != like.device:
+        raise ValueError(f"{function}: {argument} must be on {like.device}, got {tensor.device}")

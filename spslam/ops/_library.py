@@ -1,0 +1,52 @@
+"""Loads the compiled op libraries: one for this processor's instruction set, and CUDA's where torch has CUDA.
+
+`SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, for tests and bug reports.
+"""
+
+import os
+import pathlib
+
+import torch
+
+_FOLDER = pathlib.Path(__file__).resolve().parent.parent
+_LIBRARY_OF_ISA = {"avx512": "_ops_cpu_avx512.so", "avx2": "_ops_cpu_avx2.so", "baseline": "_ops_cpu.so"}
+_ISAS_OF_CAPABILITY = {"AVX512": ("avx512", "avx2", "baseline"), "AVX2": ("avx2", "baseline")}
+
+
+def _candidates() -> tuple[str, ...]:
+    chosen = os.environ.get("SPSLAM_CPU_ISA")
+    if chosen:
+        if chosen not in _LIBRARY_OF_ISA:
+            raise ImportError(f"SPSLAM_CPU_ISA must be one of {', '.join(_LIBRARY_OF_ISA)}, got {chosen}")
+        return (chosen,)
+    return _ISAS_OF_CAPABILITY.get(torch.backends.cpu.get_cpu_capability(), ("baseline",))
+
+
+def _load_cpu() -> str:
+    for isa in _candidates():
+        path = _FOLDER / _LIBRARY_OF_ISA[isa]
+        if path.exists():
+            torch.ops.load_library(str(path))
+            return isa
+    raise ImportError(
+        f"spslam: no compiled kernels for {' or '.join(_candidates())} in {_FOLDER}; install the wheel, "
+        "or build in place with `make dev`"
+    )
+
+
+def _load_cuda() -> str | None:
+    """Returns why CUDA is off, or None where it is on."""
+    path = _FOLDER / "_ops_cuda.so"
+    if not path.exists():
+        return "spslam was built without CUDA"
+    if not torch.version.cuda:
+        return "the installed torch is a CPU build"
+    torch.ops.load_library(str(path))
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device"
+    return None
+
+
+CPU_ISA: str = _load_cpu()
+CUDA_OFF_REASON: str | None = _load_cuda()
+torch.ops.spslam.set_num_threads(torch.get_num_threads())
