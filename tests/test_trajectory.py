@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spslam.errors import DatasetError
+from spslam.geometry import pose_from
+from spslam.trajectory import Trajectory
+
+
+def make_trajectory(count: int) -> Trajectory:
+    rotations = Rotation.random(max(count, 1), random_state=0).as_matrix()[:count]
+    translations = np.random.default_rng(0).normal(size=(count, 3))
+    return Trajectory(1305031229.5 + np.arange(count) / 30, pose_from(rotations, translations))
+
+
+def test_round_trip(tmp_path):
+    trajectory = make_trajectory(7)
+    trajectory.lost[[2, 5]] = True
+    trajectory.save_tum(tmp_path / "trajectory.txt")
+    loaded = Trajectory.load_tum(tmp_path / "trajectory.txt")
+    np.testing.assert_allclose(loaded.timestamps, trajectory.timestamps, atol=5.1e-7)
+    np.testing.assert_allclose(loaded.poses, trajectory.poses, atol=1e-8)
+    np.testing.assert_array_equal(loaded.lost, trajectory.lost)
+
+
+def test_the_same_trajectory_gives_the_same_bytes(tmp_path):
+    for name in ("a.txt", "b.txt"):
+        make_trajectory(4).save_tum(tmp_path / name)
+    assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
+    assert (tmp_path / "a.txt").read_text().startswith("# timestamp tx ty tz qx qy qz qw\n1305031229.500000 ")
+
+
+def test_a_line_holds_translation_then_quaternion_with_w_last(tmp_path):
+    quarter_turn = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    Trajectory([0.5], pose_from(quarter_turn, [1, 2, 3])[None]).save_tum(tmp_path / "t.txt")
+    numbers = [float(word) for word in (tmp_path / "t.txt").read_text().splitlines()[1].split()]
+    np.testing.assert_allclose(numbers, [0.5, 1, 2, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
+
+
+def test_empty(tmp_path):
+    Trajectory([], []).save_tum(tmp_path / "t.txt")
+    assert len(Trajectory.load_tum(tmp_path / "t.txt")) == 0
+
+
+def test_broken_files(tmp_path):
+    path = tmp_path / "t.txt"
+    with pytest.raises(DatasetError, match=r"t\.txt: can't be read"):
+        Trajectory.load_tum(path)
+    for line in ("0 1 2 3 0 0 0", "0 1 2 3 0 0 0 0", "0 1 2 nan 0 0 0 1", "0 1 2 x 0 0 0 1"):
+        path.write_text(f"# comment\n{line}\n")
+        with pytest.raises(DatasetError, match=r"t\.txt, line 2: must be `timestamp tx"):
+            Trajectory.load_tum(path)
+
+
+def test_wrong_shapes():
+    with pytest.raises(ValueError, match=r"poses must have shape \(2, 4, 4\), got \(3, 4, 4\)"):
+        Trajectory(np.zeros(2), np.zeros((3, 4, 4)))
+    with pytest.raises(ValueError, match=r"lost must have shape \(1,\), got \(2,\)"):
+        Trajectory(np.zeros(1), np.zeros((1, 4, 4)), np.zeros(2, dtype=bool))
