@@ -1,0 +1,131 @@
+// Rendering weights of the samples of one ray and the loss terms of a ray (equations 5, 6, 8-11), with derivatives.
+// `sdf` is normalised: the signed distance divided by the truncation distance, in [-1, 1].
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "core/macros.h"
+
+namespace spslam {
+
+// Bells below this are taken as zero: a sample that far from the surface is not rendered.
+constexpr double kMinBell = 1e-3;
+// Grazing rays: the cosine between ray and normal is not taken below this.
+constexpr double kMinCosine = 0.15;
+
+// ---- weights (6)
+
+template <class T>
+struct Bell {
+  T value;
+  T slope;  // d value / d sdf
+};
+
+// sigmoid(s / tr) * sigmoid(-s / tr), zero below the floor.
+template <class T>
+SPS_INLINE Bell<T> bell(T sdf, T inverse_truncation) {
+  const T e = std::exp(-std::fabs(sdf) * inverse_truncation);
+  const T d = 1 / (1 + e);
+  const T value = e * d * d;
+  const T slope = inverse_truncation * value * (1 - e) * d;
+  const bool cut = value < T(kMinBell);
+  return {cut ? T(0) : value, cut ? T(0) : (sdf > 0 ? -slope : slope)};
+}
+
+// Depth of a sample if it lies behind a surface, infinity if not: the smallest along a ray is its first crossing.
+template <class T>
+SPS_INLINE T crossing_depth(T sdf, T t, bool valid) {
+  return valid && sdf < 0 ? t : std::numeric_limits<T>::infinity();
+}
+
+// Whether a sample takes part in rendering: inside the volume, and not deeper than the first crossing plus truncation.
+template <class T>
+SPS_INLINE bool sample_visible(T t, bool valid, T first_crossing, T truncation) {
+  return valid && t <= first_crossing + truncation;
+}
+
+// 1 / sum of the bells, by which weights are normalised; 0 for a ray that meets nothing.
+template <class T>
+SPS_INLINE T inverse_weight_sum(T bell_sum) {
+  return bell_sum > 0 || bell_sum != bell_sum ? 1 / bell_sum : T(0);
+}
+
+// d L / d sdf of a sample, from d L / d its normalised weight, the ray's sum of weight * (d L / d weight), the slope of
+// its bell (0 if it is not visible) and the inverse sum of bells.
+template <class T>
+SPS_INLINE T weight_backward(T grad_weight, T weighted_mean_grad, T bell_slope, T inverse_sum) {
+  return (grad_weight - weighted_mean_grad) * bell_slope * inverse_sum;
+}
+
+// ---- losses (8-11)
+
+// Scale from distance along the ray to distance to the surface.
+template <class T>
+SPS_INLINE T target_cosine(T cosine, bool cosine_targets) {
+  return cosine_targets && cosine > 0 ? (cosine > T(kMinCosine) ? cosine : T(kMinCosine)) : T(1);
+}
+
+template <class T>
+struct SampleTarget {
+  T distance;  // to the measured surface (m), positive in front of it
+  bool near;   // supervised by the SDF term (10): within the truncation distance and inside the volume
+  bool free;   // supervised by the free-space term (11): farther in front, inside the volume or not
+};
+
+template <class T>
+SPS_INLINE SampleTarget<T> sample_target(T target_depth, T t, T cosine, T truncation, bool valid) {
+  const T distance = (target_depth - t) * cosine;
+  return {distance, valid && std::fabs(distance) < truncation, distance >= truncation};
+}
+
+// Residual of the SDF term in metres; its derivatives are truncation by sdf and cosine by t.
+template <class T>
+SPS_INLINE T sdf_residual(T sdf, T distance, T truncation) {
+  return sdf * truncation - distance;
+}
+
+// Residual of the free-space term, normalised; its derivative by sdf is 1.
+template <class T>
+SPS_INLINE T free_space_residual(T sdf) {
+  return sdf - 1;
+}
+
+// 1 / count, 0 for none: the mean over a ray's samples of one kind.
+template <class T>
+SPS_INLINE T inverse_count(std::int32_t count) {
+  return count > 0 ? 1 / static_cast<T>(count) : T(0);
+}
+
+// The four terms of one ray, in the order of the public op.
+template <class T>
+struct RayLosses {
+  T rgb, depth, free_space, sdf;
+};
+
+// Mean squared colour error over the channels (8).
+template <class T>
+SPS_INLINE T color_loss(const T* color, const T* target) {
+  T sum = 0;
+  for (int c = 0; c < 3; ++c) sum += (color[c] - target[c]) * (color[c] - target[c]);
+  return sum / 3;
+}
+
+template <class T>
+SPS_INLINE T color_loss_gradient(T color, T target) {
+  return 2 * (color - target) / 3;
+}
+
+// Squared depth error (9), m^2.
+template <class T>
+SPS_INLINE T depth_loss(T depth, T target) {
+  return (depth - target) * (depth - target);
+}
+
+template <class T>
+SPS_INLINE T depth_loss_gradient(T depth, T target) {
+  return 2 * (depth - target);
+}
+
+}  // namespace spslam
