@@ -26,8 +26,7 @@ SPS_INLINE T sample_depth(const RaySampling<T>& sampling, T depth, std::int32_t 
     const T share = (static_cast<T>(s) + static_cast<T>(u)) / static_cast<T>(sampling.num_uniform);
     return depth * (sampling.near + (sampling.far - sampling.near) * share);
   }
-  const T share =
-      (static_cast<T>(s - sampling.num_uniform) + static_cast<T>(u)) / static_cast<T>(sampling.num_surface);
+  const T share = (static_cast<T>(s - sampling.num_uniform) + static_cast<T>(u)) / static_cast<T>(sampling.num_surface);
   return depth + sampling.truncation * (2 * share - 1);
 }
 

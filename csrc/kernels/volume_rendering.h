@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "core/macros.h"
+#include "core/math.h"
 
 namespace spslam {
 
@@ -26,7 +27,7 @@ struct Bell {
 // sigmoid(s / tr) * sigmoid(-s / tr), zero below the floor.
 template <class T>
 SPS_INLINE Bell<T> bell(T sdf, T inverse_truncation) {
-  const T e = std::exp(-std::fabs(sdf) * inverse_truncation);
+  const T e = exponential(-std::fabs(sdf) * inverse_truncation);
   const T d = 1 / (1 + e);
   const T value = e * d * d;
   const T slope = inverse_truncation * value * (1 - e) * d;
