@@ -100,9 +100,7 @@ class Camera:
         """
         depth = np.asarray(depth)
         if depth.shape != (self.height, self.width):
-            raise ValueError(
-                f"Camera.unproject: depth must have shape {(self.height, self.width)}, got {depth.shape}"
-            )
+            raise ValueError(f"Camera.unproject: depth must have shape {(self.height, self.width)}, got {depth.shape}")
         return self.ray_directions() * depth[..., None].astype(np.float32, copy=False)
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -120,6 +118,4 @@ class Camera:
         if points.ndim < 1 or points.shape[-1] != 3:
             raise ValueError(f"Camera.project: points must have shape (..., 3), got {points.shape}")
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-        return np.stack(
-            (points[..., 0] / z * self.fx + self.cx, points[..., 1] / z * self.fy + self.cy), axis=-1
-        )
+        return np.stack((points[..., 0] / z * self.fx + self.cx, points[..., 1] / z * self.fy + self.cy), axis=-1)

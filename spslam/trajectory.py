@@ -29,7 +29,7 @@ class Trajectory:
 
     timestamps: np.ndarray
     poses: np.ndarray
-    lost: np.ndarray = field(default=None)  # type: ignore[assignment]
+    lost: np.ndarray = field(default=None)  # type: ignore[arg-type, assignment]
 
     def __post_init__(self) -> None:
         self.timestamps = np.asarray(self.timestamps, dtype=np.float64)

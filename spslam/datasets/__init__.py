@@ -1,0 +1,1 @@
+"""RGB-D sequences: one loader a format, all giving the same frames."""

@@ -1,0 +1,163 @@
+"""What a dataset is: RGB-D frames by number, their times and, where known, their true poses."""
+
+from __future__ import annotations
+
+import operator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.errors import DatasetError
+
+
+@dataclass
+class RgbdFrame:
+    """One colour image with its depth image, pixel by pixel of the same view.
+
+    Attributes
+    ----------
+    index : the frame's number in the dataset it was read from, counted from 0.
+    timestamp : seconds.
+    color : uint8 [H,W,3], RGB.
+    depth : float32 [H,W], metres along the optical axis; 0 where nothing was measured.
+    pose : float64 [4,4] ``T_world_camera`` in OpenCV axes (x right, y down, z forward), or None where unknown.
+        It is the truth to evaluate against; the system uses no more than the first.
+    """
+
+    index: int
+    timestamp: float
+    color: np.ndarray
+    depth: np.ndarray
+    pose: np.ndarray | None = None
+
+
+class RgbdDataset(ABC):
+    """A sequence of frames of one camera, read one at a time and from any thread.
+
+    ``dataset[i]`` reads frame i (0 <= i < len) and checks it: raises IndexError outside the range and
+    DatasetError, naming the file, for a frame that can't be used. Depth outside ``depth_range`` (metres) comes
+    as 0. Reading the same frame again gives the same values.
+    """
+
+    name: str
+    camera: Camera
+    depth_range: tuple[float, float] = (0.0, float("inf"))
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of frames F."""
+
+    @abstractmethod
+    def timestamps(self) -> np.ndarray:
+        """Times of all frames, float64 [F], seconds, ascending. Reads no image."""
+
+    @abstractmethod
+    def poses(self) -> np.ndarray | None:
+        """True poses of all frames, float64 [F,4,4], NaN where unknown; None if none is known. Reads no image."""
+
+    @abstractmethod
+    def read(self, index: int) -> RgbdFrame:
+        """Frame ``index`` as it is stored, converted to our units and axes; ``dataset[i]`` is what to call."""
+
+    def describe(self, index: int) -> str:
+        """What an error about frame ``index`` should name: its files where it has any."""
+        return f"{self.name}, frame {index}"
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        index = operator.index(index)
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.name}: frame must be in 0..{len(self) - 1}, got {index}")
+        frame = self.read(index)
+        self._check_sizes(frame)
+        _clear_depth_outside(frame.depth, *self.depth_range)
+        return frame
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        return (self[index] for index in range(len(self)))
+
+    def _check_sizes(self, frame: RgbdFrame) -> None:
+        expected = (self.camera.height, self.camera.width)
+        color, depth = frame.color.shape[:2], frame.depth.shape[:2]
+        if color != depth:
+            raise DatasetError(
+                f"{self.describe(frame.index)}: depth must be as large as colour, "
+                f"got depth {_size(depth)} and colour {_size(color)}"
+            )
+        if color != expected:
+            raise DatasetError(
+                f"{self.describe(frame.index)}: images must be as large as the sequence's first, "
+                f"{_size(expected)}, got {_size(color)}"
+            )
+
+
+class Subset(RgbdDataset):
+    """Every ``step``-th frame of a dataset from ``start`` up to but without ``stop``, numbered anew from 0.
+
+    The bounds are taken as in a Python slice: beyond the end they are cut, negative ones count from the end.
+
+    Raises
+    ------
+    ValueError
+        When ``step`` is below 1.
+    DatasetError
+        When no frame is left.
+    """
+
+    def __init__(self, dataset: RgbdDataset, start: int = 0, stop: int | None = None, step: int = 1) -> None:
+        if step < 1:
+            raise ValueError(f"Subset: step must be at least 1, got {step}")
+        self._dataset = dataset
+        self._indices = range(*slice(start, stop, step).indices(len(dataset)))
+        if not self._indices:
+            wanted = f"{start}:{'' if stop is None else stop}:{step}"
+            raise DatasetError(
+                f"{dataset.name}: frames must select at least one of 0..{len(dataset) - 1}, got {wanted}"
+            )
+        self.name = dataset.name
+        self.camera = dataset.camera
+        self.depth_range = dataset.depth_range
+
+    @property
+    def source(self) -> RgbdDataset:
+        """The dataset this is a part of."""
+        return self._dataset
+
+    @property
+    def source_indices(self) -> range:
+        """The numbers that this subset's frames have in ``source``."""
+        return self._indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def timestamps(self) -> np.ndarray:
+        return self._dataset.timestamps()[self._slice()]
+
+    def poses(self) -> np.ndarray | None:
+        poses = self._dataset.poses()
+        return None if poses is None else poses[self._slice()]
+
+    def read(self, index: int) -> RgbdFrame:
+        return replace(self._dataset.read(self._indices[index]), index=index)
+
+    def describe(self, index: int) -> str:
+        return self._dataset.describe(self._indices[index])
+
+    def _slice(self) -> slice:
+        return slice(self._indices.start, self._indices.stop, self._indices.step)
+
+
+def _clear_depth_outside(depth: np.ndarray, nearest: float, farthest: float) -> None:
+    # OpenCV's threshold is some ten times faster than a NumPy mask, and a frame passes here every few ms.
+    if nearest > 0:
+        cv2.threshold(depth, np.nextafter(np.float32(nearest), np.float32(0)), 0, cv2.THRESH_TOZERO, dst=depth)
+    if farthest < float("inf"):
+        cv2.threshold(depth, farthest, 0, cv2.THRESH_TOZERO_INV, dst=depth)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"

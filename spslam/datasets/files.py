@@ -1,0 +1,144 @@
+"""Datasets that are a list of image files: what the formats have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.images import read_color, read_depth
+from spslam.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class FramePaths:
+    """One frame's files and time. ``fault`` says why the frame can't be used, if that is known beforehand."""
+
+    color: Path
+    depth: Path
+    timestamp: float
+    fault: str | None = None
+
+
+@dataclass(frozen=True)
+class Undistortion:
+    """Pixel maps (``cv2.remap``) that turn a distorted image into a pinhole camera's."""
+
+    map_x: np.ndarray
+    map_y: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, coefficients: Sequence[float]) -> Undistortion:
+        """Maps for OpenCV's distortion coefficients (k1, k2, p1, p2, k3); the camera stays the same."""
+        matrix, size = camera.matrix(), (camera.width, camera.height)
+        return cls(*cv2.initUndistortRectifyMap(matrix, np.asarray(coefficients), None, matrix, size, cv2.CV_16SC2))
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """The image without distortion, by linear interpolation; pixels from outside repeat the border."""
+        return cv2.remap(image, self.map_x, self.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@dataclass
+class FileDataset(RgbdDataset):
+    """Frames in image files.
+
+    Attributes
+    ----------
+    frames : the files in order of time.
+    true_poses : float64 [F,4,4], NaN where unknown, or None.
+    units_per_metre, invalid_depth : see :func:`spslam.datasets.images.read_depth`.
+    undistortion : applied to each colour image.
+    """
+
+    name: str
+    camera: Camera
+    frames: Sequence[FramePaths]
+    true_poses: np.ndarray | None
+    units_per_metre: float | None
+    invalid_depth: Sequence[int] = ()
+    undistortion: Undistortion | None = None
+    depth_range: tuple[float, float] = field(default=(0.0, float("inf")))
+
+    def __post_init__(self) -> None:
+        if self.true_poses is not None and not np.isfinite(self.true_poses).any():
+            self.true_poses = None
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def timestamps(self) -> np.ndarray:
+        return np.array([frame.timestamp for frame in self.frames], dtype=np.float64)
+
+    def poses(self) -> np.ndarray | None:
+        return None if self.true_poses is None else self.true_poses.copy()
+
+    def read(self, index: int) -> RgbdFrame:
+        paths = self.frames[index]
+        if paths.fault is not None:
+            raise DatasetError(paths.fault)
+        color = read_color(paths.color)
+        depth = read_depth(paths.depth, self.units_per_metre, self.invalid_depth)
+        if self.undistortion is not None:
+            color = self.undistortion(color)
+        return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index))
+
+    def describe(self, index: int) -> str:
+        return f"{self.frames[index].depth} (colour: {self.frames[index].color.name})"
+
+    def _pose(self, index: int) -> np.ndarray | None:
+        if self.true_poses is None or not np.isfinite(self.true_poses[index]).all():
+            return None
+        return self.true_poses[index].copy()
+
+
+def require_folder(path: Path) -> Path:
+    """The path itself if it is a folder; raises DatasetError otherwise."""
+    if not path.exists():
+        raise DatasetError(f"{path}: no such folder")
+    if not path.is_dir():
+        raise DatasetError(f"{path}: must be a folder, got a file")
+    return path
+
+
+def find_numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """The files of a folder whose whole name matches ``pattern``, by the number in its first group, ascending.
+
+    An empty result for a missing folder. Raises DatasetError when two files have the same number.
+    """
+    expression = re.compile(pattern)
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = expression.fullmatch(path.name)
+        if match is None:
+            continue
+        number = int(match.group(1))
+        if number in found:
+            raise DatasetError(f"{path}: must be the only file of frame {number}, got {found[number].name} as well")
+        found[number] = path
+    return dict(sorted(found.items()))
+
+
+def pair_numbered(
+    colors: Mapping[int, Path], depths: Mapping[int, Path], frames_per_second: float
+) -> dict[int, FramePaths]:
+    """Frames of the numbers that have a colour or a depth image; one without the other is a frame with a fault.
+
+    Times count from the first number at the given rate, so that a gap in the numbers is a gap in time.
+    """
+    frames = {}
+    numbers = sorted({*colors, *depths})
+    for number in numbers:
+        color, depth = colors.get(number), depths.get(number)
+        fault = None
+        if color is None or depth is None:
+            kind, present = ("colour", depth) if color is None else ("depth", color)
+            fault = f"{present}: the {kind} image of this frame is missing"
+        timestamp = (number - numbers[0]) / frames_per_second
+        frames[number] = FramePaths(color or depth, depth or color, timestamp, fault)  # type: ignore[arg-type]
+    return frames

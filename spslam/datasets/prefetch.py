@@ -1,0 +1,116 @@
+"""Reading frames ahead on threads, so that decoding doesn't hold up the system."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+
+from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.errors import DatasetError
+
+
+class Prefetcher(Iterator[RgbdFrame | DatasetError]):
+    """Frames of a dataset in order, read by threads up to ``ahead`` frames in advance.
+
+    A frame that can't be read comes as its DatasetError in the frame's place (not raised): who iterates
+    decides. Any other exception is a bug and is raised in that place. The threads end with the last frame,
+    with ``close()``, on leaving a ``with`` block, and on any exception that passes through, Ctrl-C included.
+
+    Attributes
+    ----------
+    frames_read : frames handed out so far, broken ones included.
+    read_seconds : time spent on reading those, summed over the threads.
+    wait_seconds : time that the caller waited for frames.
+    """
+
+    def __init__(self, dataset: RgbdDataset, workers: int = 2, ahead: int = 8) -> None:
+        if workers < 0:
+            raise ValueError(f"prefetch: workers must be at least 0, got {workers}")
+        if ahead < 1:
+            raise ValueError(f"prefetch: ahead must be at least 1, got {ahead}")
+        self._dataset = dataset
+        self._ahead = ahead
+        self._next = 0
+        self._pending: deque[Future[tuple[RgbdFrame | DatasetError, float]]] = deque()
+        self._threads = ThreadPoolExecutor(workers, thread_name_prefix="spslam-prefetch") if workers else None
+        self.frames_read = 0
+        self.read_seconds = 0.0
+        self.wait_seconds = 0.0
+
+    def __next__(self) -> RgbdFrame | DatasetError:
+        try:
+            return self._take_next()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Drop what was read ahead and wait for the threads to end. May be called again."""
+        self._next = len(self._dataset)
+        self._pending.clear()
+        if self._threads is not None:
+            self._threads.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> Prefetcher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _take_next(self) -> RgbdFrame | DatasetError:
+        started = time.perf_counter()
+        frame, seconds = self._read_in_place() if self._threads is None else self._wait_for_oldest(self._threads)
+        self.wait_seconds += time.perf_counter() - started
+        self.read_seconds += seconds
+        self.frames_read += 1
+        return frame
+
+    def _read_in_place(self) -> tuple[RgbdFrame | DatasetError, float]:
+        if self._next >= len(self._dataset):
+            raise StopIteration
+        self._next += 1
+        return _timed_read(self._dataset, self._next - 1)
+
+    def _wait_for_oldest(self, threads: ThreadPoolExecutor) -> tuple[RgbdFrame | DatasetError, float]:
+        self._submit_reads(threads)
+        if not self._pending:
+            raise StopIteration
+        oldest = self._pending.popleft()
+        result = oldest.result()
+        self._submit_reads(threads)
+        return result
+
+    def _submit_reads(self, threads: ThreadPoolExecutor) -> None:
+        while len(self._pending) < self._ahead and self._next < len(self._dataset):
+            self._pending.append(threads.submit(_timed_read, self._dataset, self._next))
+            self._next += 1
+
+
+def prefetch(dataset: RgbdDataset, workers: int = 2, ahead: int = 8) -> Prefetcher:
+    """Read a dataset's frames in order, ``ahead`` frames in advance, on ``workers`` threads.
+
+    At most ``ahead`` + 1 decoded frames exist at a time. With 0 workers each frame is read when it is asked
+    for. What the frames hold doesn't depend on the number of threads. Example::
+
+        with prefetch(dataset, workers=2, ahead=8) as frames:
+            for frame in frames:
+                if isinstance(frame, DatasetError):
+                    continue
+                ...
+    """
+    return Prefetcher(dataset, workers, ahead)
+
+
+def _timed_read(dataset: RgbdDataset, index: int) -> tuple[RgbdFrame | DatasetError, float]:
+    started = time.perf_counter()
+    frame: RgbdFrame | DatasetError
+    try:
+        frame = dataset[index]
+    except DatasetError as error:
+        frame = error
+    return frame, time.perf_counter() - started

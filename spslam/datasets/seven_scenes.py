@@ -1,0 +1,115 @@
+"""7-Scenes (Shotton et al. 2013): Kinect v1 in seven small rooms.
+
+A scene folder holds ``seq-01``, ``seq-02``, ..., each with ``frame-NNNNNN.color.png`` (or jpg), ``.depth.png``
+(16-bit millimetres; 0 and 65535 are invalid) and ``.pose.txt`` (4x4 camera to world, OpenCV axes). The poses are
+KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Colour and depth were not
+registered to each other by the data set's authors; both are taken as one camera's, as everybody does.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.datasets.files import FileDataset, FramePaths, find_numbered, pair_numbered, require_folder
+from spslam.datasets.images import first_size
+from spslam.datasets.text import read_intrinsics_matrix, read_pose, read_rows
+from spslam.errors import DatasetError
+
+INTRINSICS_FILE = "camera-intrinsics.txt"
+FRAMES_PER_SECOND = 30.0
+# "The default intrinsics for this sensor", as the data set's page gives them for 640x480.
+_DEFAULT_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+_COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
+_DEPTH_NAME = r"frame-(\d+)\.depth\.png"
+
+
+def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDataset:
+    """One sequence of a scene.
+
+    Parameters
+    ----------
+    folder : the scene (with ``seq-XX`` in it) or a sequence itself.
+    sequence : ``seq-03`` or its number. None is the first that is there.
+
+    The camera is that of ``camera-intrinsics.txt`` in the sequence or the scene, else the data set's default
+    (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite pose, has no
+    pose. A frame with an image missing or a malformed pose file is one that raises when it is read.
+
+    Raises
+    ------
+    DatasetError
+        For a missing folder, another layout, an absent sequence, unreadable intrinsics.
+    """
+    sequence_folder = _choose_sequence(require_folder(folder), sequence)
+    colors = find_numbered(sequence_folder, _COLOR_NAME)
+    depths = find_numbered(sequence_folder, _DEPTH_NAME)
+    if not colors and not depths:
+        raise DatasetError(
+            f"{sequence_folder}: must hold 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
+            "a scene holds them in seq-01, seq-02, ..."
+        )
+    camera = _find_camera(sequence_folder, list(colors.values()))
+    frames, poses = _attach_poses(sequence_folder, pair_numbered(colors, depths, FRAMES_PER_SECOND))
+    name = f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}"
+    return FileDataset(name, camera, frames, poses, units_per_metre=1000.0, invalid_depth=(65535,))
+
+
+def list_sequences(scene: Path, split: str | None = None) -> list[str]:
+    """Names of a scene's sequence folders, ascending; of those in TrainSplit.txt or TestSplit.txt if asked.
+
+    Parameters
+    ----------
+    scene : the scene's folder.
+    split : ``train``, ``test`` or None for all that are there.
+    """
+    if split is None:
+        return sorted(path.name for path in require_folder(scene).glob("seq-*") if path.is_dir())
+    if split not in ("train", "test"):
+        raise ValueError(f"list_sequences: split must be 'train' or 'test', got {split!r}")
+    rows = read_rows(scene / f"{split.capitalize()}Split.txt", columns=1)
+    return sorted(_sequence_name("".join(row)) for row in rows)
+
+
+def _choose_sequence(folder: Path, sequence: str | int | None) -> Path:
+    names = list_sequences(folder)
+    if not names:
+        if sequence is not None and folder.name != _sequence_name(sequence):
+            raise DatasetError(f"{folder}: must hold {_sequence_name(sequence)}, got no seq-XX folder")
+        return folder
+    if sequence is None:
+        return folder / names[0]
+    name = _sequence_name(sequence)
+    if name not in names:
+        raise DatasetError(f"{folder}: sequence must be one of {', '.join(names)}, got {sequence}")
+    return folder / name
+
+
+def _sequence_name(sequence: str | int) -> str:
+    digits = re.search(r"\d+$", str(sequence))
+    return f"seq-{int(digits.group()):02d}" if digits else str(sequence)
+
+
+def _find_camera(sequence_folder: Path, colors: list[Path]) -> Camera:
+    width, height = first_size(colors)
+    for folder in (sequence_folder, sequence_folder.parent):
+        if (folder / INTRINSICS_FILE).is_file():
+            return read_intrinsics_matrix(folder / INTRINSICS_FILE, width, height)
+    return _DEFAULT_CAMERA.resized(width, height)
+
+
+def _attach_poses(folder: Path, frames: dict[int, FramePaths]) -> tuple[list[FramePaths], np.ndarray]:
+    poses = np.full((len(frames), 4, 4), np.nan)
+    attached = []
+    for row, (number, frame) in enumerate(frames.items()):
+        path = folder / f"frame-{number:06d}.pose.txt"
+        try:
+            poses[row] = read_pose(path) if path.is_file() else np.nan
+        except DatasetError as error:
+            frame = replace(frame, fault=frame.fault or str(error))
+        attached.append(frame)
+    return attached, poses

@@ -1,0 +1,80 @@
+"""The layout of Neural RGB-D (Azinovic et al. 2022), which "Synthetic RGB-D" is distributed in.
+
+``images/imgN.png`` (or jpg), ``depth_filtered/depthN.png`` (noisy and filtered) and ``depth/depthN.png`` (exact),
+16-bit millimetres, ``poses.txt`` with four lines a frame (4x4 camera to world, OpenGL camera axes: x right, y up,
+z backward) and ``focal.txt`` with one number. The principal point is the image's middle.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
+from spslam.datasets.images import first_size
+from spslam.datasets.text import camera_from_matrix, read_numbers, read_pose_table
+from spslam.errors import DatasetError
+
+FRAMES_PER_SECOND = 30.0
+DEPTH_FOLDERS = {"filtered": "depth_filtered", "exact": "depth"}
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileDataset:
+    """A scene of the Neural RGB-D layout.
+
+    Parameters
+    ----------
+    folder : the scene.
+    depth_variant : ``filtered`` (noisy) or ``exact``. None is filtered if it is there, else exact.
+
+    A pose with NaN, or none for a frame, leaves that frame without one; ``poses.txt`` may be missing altogether.
+
+    Raises
+    ------
+    DatasetError
+        For a missing folder, another layout, the variant's folder missing, unreadable focal length or poses.
+    """
+    colors = find_numbered(require_folder(folder) / "images", r"img(\d+)\.(?:png|jpg|jpeg)")
+    depths = find_numbered(_depth_folder(folder, depth_variant), r"depth(\d+)\.png")
+    if not colors:
+        raise DatasetError(f"{folder}: must hold images/img0.png (or jpg) and so on, got none")
+    frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
+    camera = _read_camera(folder / "focal.txt", *first_size(colors.values()))
+    poses = _read_poses(folder / "poses.txt", np.array(list(frames)))
+    return FileDataset(f"synthetic_rgbd/{folder.name}", camera, list(frames.values()), poses, units_per_metre=1000.0)
+
+
+def _depth_folder(folder: Path, variant: str | None) -> Path:
+    present = [name for name, subfolder in DEPTH_FOLDERS.items() if (folder / subfolder).is_dir()]
+    if variant is not None and variant not in DEPTH_FOLDERS:
+        raise DatasetError(f"depth_variant must be one of {', '.join(DEPTH_FOLDERS)}, got {variant}")
+    if not present:
+        raise DatasetError(f"{folder}: must hold a folder depth_filtered or depth, got neither")
+    if variant is not None and variant not in present:
+        raise DatasetError(
+            f"{folder / DEPTH_FOLDERS[variant]}: no such folder; "
+            f"there is {DEPTH_FOLDERS[present[0]]} (depth_variant: {present[0]})"
+        )
+    return folder / DEPTH_FOLDERS[variant or present[0]]
+
+
+def _read_camera(path: Path, width: int, height: int) -> Camera:
+    numbers = read_numbers(path)
+    if numbers.size != 1:
+        raise DatasetError(f"{path}: must hold one number, the focal length in pixels, got {numbers.size}")
+    focal = numbers[0]
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return camera_from_matrix(matrix, width, height, str(path))
+
+
+def _read_poses(path: Path, numbers: np.ndarray) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    table = read_pose_table(path) @ _OPENCV_FROM_OPENGL
+    poses = np.full((len(numbers), 4, 4), np.nan)
+    known = numbers < len(table)
+    poses[known] = table[numbers[known]]
+    return poses

@@ -1,0 +1,122 @@
+"""Small datasets in each layout, written by the tests themselves."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spslam.geometry import matrix_to_quaternion, pose_from
+
+WIDTH, HEIGHT = 32, 24
+CAMERA_MATRIX = np.array([[30.0, 0, 15.5], [0, 31.0, 11.5], [0, 0, 1]])
+
+
+def color_image(index: int) -> np.ndarray:
+    """RGB with a red left half, so that swapped channels show; smooth, so that JPEG keeps it."""
+    image = np.full((HEIGHT, WIDTH, 3), (0, 40, 120), dtype=np.uint8)
+    image[:, : WIDTH // 2] = (200, 30, index % 100)
+    return image
+
+
+def depth_metres(index: int) -> np.ndarray:
+    rows = np.linspace(1, 2, HEIGHT)[:, None] + np.linspace(0, 0.5, WIDTH) + 0.01 * index
+    return np.round(rows, 3)
+
+
+def poses(count: int) -> np.ndarray:
+    rotations = Rotation.from_rotvec(np.outer(np.arange(count), [0.01, 0.02, -0.01])).as_matrix()
+    return pose_from(rotations, np.outer(np.arange(count), [0.1, 0, 0.05]))
+
+
+def write_color(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def write_depth(path: Path, metres: np.ndarray, units_per_metre: float = 1000.0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.round(metres * units_per_metre).astype(np.uint16))
+
+
+def matrix_text(matrix: np.ndarray) -> str:
+    return "\n".join(" ".join(f"{value:.9e}" for value in row) for row in matrix) + "\n"
+
+
+def write_seven_scenes(scene: Path, count: int = 4, sequences: tuple[str, ...] = ("seq-01",)) -> Path:
+    for name in sequences:
+        for i, pose in enumerate(poses(count)):
+            stem = scene / name / f"frame-{i:06d}"
+            write_color(Path(f"{stem}.color.png"), color_image(i))
+            write_depth(Path(f"{stem}.depth.png"), depth_metres(i))
+            Path(f"{stem}.pose.txt").write_text(matrix_text(pose))
+    (scene / "camera-intrinsics.txt").write_text(matrix_text(CAMERA_MATRIX))
+    return scene
+
+
+def write_synthetic_rgbd(scene: Path, count: int = 12) -> Path:
+    flip = np.diag([1, -1, -1, 1])
+    for i in range(count):
+        write_color(scene / "images" / f"img{i}.png", color_image(i))
+        write_depth(scene / "depth" / f"depth{i}.png", depth_metres(i))
+        write_depth(scene / "depth_filtered" / f"depth{i}.png", depth_metres(i) + 0.1)
+    (scene / "poses.txt").write_text("".join(matrix_text(pose @ flip) for pose in poses(count)))
+    (scene / "focal.txt").write_text("30.0\n")
+    return scene
+
+
+def write_replica(scene: Path, count: int = 3) -> Path:
+    for i in range(count):
+        write_color(scene / "results" / f"frame{i:06d}.jpg", color_image(i))
+        write_depth(scene / "results" / f"depth{i:06d}.png", depth_metres(i), 6553.5)
+    lines = (" ".join(f"{value:.9e}" for value in pose.ravel()) for pose in poses(count))
+    (scene / "traj.txt").write_text("\n".join(lines) + "\n")
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": 30.0, "fy": 31.0, "cx": 15.5, "cy": 11.5, "scale": 6553.5}
+    (scene / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return scene
+
+
+def write_tum(folder: Path, count: int = 5, depth_delay: float = 0.004) -> Path:
+    start = 1000.0
+    rgb, depth = ["# color images"], ["# depth maps"]
+    for i in range(count):
+        time, depth_time = start + i / 30, start + i / 30 + depth_delay
+        write_color(folder / "rgb" / f"{time:.6f}.png", color_image(i))
+        write_depth(folder / "depth" / f"{depth_time:.6f}.png", depth_metres(i), 5000.0)
+        rgb.append(f"{time:.6f} rgb/{time:.6f}.png")
+        depth.append(f"{depth_time:.6f} depth/{depth_time:.6f}.png")
+    (folder / "rgb.txt").write_text("\n".join(rgb) + "\n")
+    (folder / "depth.txt").write_text("\n".join(depth) + "\n")
+    truth = ["# timestamp tx ty tz qx qy qz qw"]
+    for i, pose in enumerate(poses(40)):
+        w, x, y, z = matrix_to_quaternion(pose[:3, :3])
+        numbers = [*pose[:3, 3], x, y, z, w]
+        truth.append(f"{start - 0.05 + 0.01 * i:.4f} " + " ".join(f"{value:.9f}" for value in numbers))
+    (folder / "groundtruth.txt").write_text("\n".join(truth) + "\n")
+    return folder
+
+
+def write_folder(folder: Path, count: int = 3, units_per_metre: float = 1000.0) -> Path:
+    for i in range(count):
+        write_color(folder / "color" / f"{i}.jpg", color_image(i))
+        write_depth(folder / "depth" / f"{i}.png", depth_metres(i), units_per_metre)
+    (folder / "intrinsics.txt").write_text(matrix_text(CAMERA_MATRIX))
+    return folder
+
+
+def truncate(path: Path, keep: float = 0.5) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * keep)])
+
+
+def shared_data(name: str) -> Path:
+    """A folder of the recordings beside the repository; skips the test where it is absent."""
+    root = Path(os.environ.get("SPSLAM_TEST_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+    if not (root / name).is_dir():
+        pytest.skip(f"{root / name} is absent; SPSLAM_TEST_DATA names the folder of the test recordings")
+    return root / name
