@@ -26,6 +26,7 @@
 namespace spslam::bindings {
 
 using torch::headeronly::ScalarType;
+using torch::stable::contiguous;
 using torch::stable::Tensor;
 
 #ifdef SPS_CUDA
@@ -100,10 +101,6 @@ T* mutable_data(const Tensor& tensor) {
                   "spslam: tensor of another dtype than the kernel writes");
   STD_TORCH_CHECK(tensor.is_contiguous(), "spslam: an in-place argument must be contiguous");
   return static_cast<T*>(tensor.mutable_data_ptr());
-}
-
-inline Tensor contiguous(const Tensor& tensor) {
-  return torch::stable::contiguous(tensor);
 }
 
 inline Tensor empty(const Tensor& like, const std::vector<std::int64_t>& sizes, ScalarType dtype) {
