@@ -1,6 +1,16 @@
 """Kernels for sparse neural reconstruction: the public op library, independent of the rest of spslam."""
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON
+from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_indices
 
-__all__ = ["CPU_ISA", "CUDA_OFF_REASON", "Stream", "philox_uniform", "sample_indices"]
+__all__ = [
+    "CPU_ISA",
+    "CUDA_OFF_REASON",
+    "Stream",
+    "normal_equations",
+    "philox_uniform",
+    "sample_indices",
+    "solve_normal_equations",
+    "sparse_adam_",
+]

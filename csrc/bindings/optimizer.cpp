@@ -1,0 +1,83 @@
+#include "spslam/optimizer.h"
+
+#include "bindings/common.h"
+
+namespace spslam::bindings {
+namespace {
+
+void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, std::optional<Tensor> stamps,
+                  std::int64_t stamp, double lr, double beta1, double beta2, double eps, std::int64_t step) {
+  DeviceScope scope(param);
+  const std::int64_t count = param.numel();
+  STD_TORCH_CHECK(grad.numel() == count && exp_avg.numel() == count && exp_avg_sq.numel() == count,
+                  "sparse_adam_: grad, exp_avg and exp_avg_sq must have as many entries as param");
+  STD_TORCH_CHECK(step >= 1, "sparse_adam_: step must be at least 1, got ", step);
+  if (count == 0) return;
+  std::optional<Tensor> flat_stamps;
+  if (stamps.has_value()) flat_stamps = contiguous(*stamps);
+  const std::int64_t rows = stamps.has_value() ? stamps->numel() : 1;
+  STD_TORCH_CHECK(rows >= 1 && count % rows == 0, "sparse_adam_: stamps must have one entry a row of param");
+  dispatch_floating("sparse_adam_", param, [&](auto zero) {
+    using T = decltype(zero);
+    sparse_adam(scope.context, AdamStep{lr, beta1, beta2, eps, step}, rows, count / rows,
+                flat_stamps.has_value() ? data<std::int32_t>(*flat_stamps) : nullptr, static_cast<std::int32_t>(stamp),
+                mutable_data<T>(param), mutable_data<T>(grad), mutable_data<T>(exp_avg), mutable_data<T>(exp_avg_sq));
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> normal_equations(Tensor residuals, Tensor jacobians, Tensor weights) {
+  DeviceScope scope(residuals);
+  STD_TORCH_CHECK(residuals.dim() == 2, "normal_equations: residuals must have shape [F, N]");
+  const std::int64_t frames = residuals.size(0), count = residuals.size(1);
+  STD_TORCH_CHECK(jacobians.numel() == frames * count * 6 && weights.numel() == frames * count,
+                  "normal_equations: jacobians and weights must fit residuals");
+  residuals = contiguous(residuals);
+  jacobians = contiguous(jacobians);
+  weights = contiguous(weights);
+  Tensor partials = empty(residuals, {normal_equations_partials(frames, count)}, ScalarType::Double);
+  Tensor hessian = empty(residuals, {frames, 6, 6}, residuals.scalar_type());
+  Tensor gradient = empty(residuals, {frames, 6}, residuals.scalar_type());
+  Tensor cost = empty(residuals, {frames}, residuals.scalar_type());
+  dispatch_floating("normal_equations", residuals, [&](auto zero) {
+    using T = decltype(zero);
+    spslam::normal_equations(scope.context, frames, count, data<T>(residuals), data<T>(jacobians), data<T>(weights),
+                             mutable_data<double>(partials), mutable_data<T>(hessian), mutable_data<T>(gradient),
+                             mutable_data<T>(cost));
+  });
+  return {hessian, gradient, cost};
+}
+
+Tensor solve_normal_equations(Tensor hessian, Tensor gradient, double damping, double absolute_damping) {
+  DeviceScope scope(hessian);
+  STD_TORCH_CHECK(gradient.dim() == 2 && gradient.size(1) == 6 && hessian.numel() == gradient.size(0) * 36,
+                  "solve_normal_equations: hessian and gradient must have shapes [F, 6, 6] and [F, 6]");
+  hessian = contiguous(hessian);
+  gradient = contiguous(gradient);
+  Tensor delta = empty(gradient, {gradient.size(0), 6}, gradient.scalar_type());
+  dispatch_floating("solve_normal_equations", hessian, [&](auto zero) {
+    using T = decltype(zero);
+    spslam::solve_normal_equations(scope.context, gradient.size(0), data<T>(hessian), data<T>(gradient), damping,
+                                   absolute_damping, mutable_data<T>(delta));
+  });
+  return delta;
+}
+
+}  // namespace
+
+#ifndef SPS_CUDA
+STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def(
+      "sparse_adam_(Tensor(a!) param, Tensor(b!) grad, Tensor(c!) exp_avg, Tensor(d!) exp_avg_sq, Tensor? stamps, "
+      "int stamp, float lr, float beta1, float beta2, float eps, int step) -> ()");
+  m.def("normal_equations(Tensor residuals, Tensor jacobians, Tensor weights) -> (Tensor, Tensor, Tensor)");
+  m.def("solve_normal_equations(Tensor hessian, Tensor gradient, float damping, float absolute_damping) -> Tensor");
+}
+#endif
+
+SPS_LIBRARY_IMPL(m) {
+  m.impl("sparse_adam_", TORCH_BOX(&sparse_adam_));
+  m.impl("normal_equations", TORCH_BOX(&normal_equations));
+  m.impl("solve_normal_equations", TORCH_BOX(&solve_normal_equations));
+}
+
+}  // namespace spslam::bindings

@@ -1,0 +1,92 @@
+// The maths of one parameter, one residual and one 6x6 system.
+#pragma once
+
+#include <cmath>
+
+#include "core/macros.h"
+
+namespace spslam {
+
+// Adam's constants for one step, as torch.optim.Adam forms them.
+template <class T>
+struct AdamCoefficients {
+  T one_minus_beta1, beta2, one_minus_beta2, step_size, inverse_sqrt_correction, epsilon;
+};
+
+template <class T>
+SPS_INLINE void adam_update(const AdamCoefficients<T>& c, T& param, T& grad, T& exp_avg, T& exp_avg_sq) {
+  const T g = grad;
+  const T m = exp_avg + c.one_minus_beta1 * (g - exp_avg);
+  const T v = c.beta2 * exp_avg_sq + c.one_minus_beta2 * g * g;
+  exp_avg = m;
+  exp_avg_sq = v;
+  param -= c.step_size * m / (std::sqrt(v) * c.inverse_sqrt_correction + c.epsilon);
+  grad = T(0);
+}
+
+// Adds one residual's share to the 21 + 6 + 1 terms. `T` may be a number or a row of them.
+// A residual of weight 0 adds nothing, whatever it and its jacobian hold.
+template <class T>
+SPS_INLINE void add_normal_terms(const T* jacobian, T residual, T weight, T* terms) {
+  T j[6];
+  const bool used = weight != T(0);
+  for (int a = 0; a < 6; ++a) j[a] = used ? jacobian[a] : T(0);
+  const T r = used ? residual : T(0);
+  int term = 0;
+  for (int a = 0; a < 6; ++a) {
+    const T wj = weight * j[a];
+    for (int b = a; b < 6; ++b) terms[term++] += wj * j[b];
+  }
+  const T wr = weight * r;
+  for (int a = 0; a < 6; ++a) terms[term++] += wr * j[a];
+  terms[term] += wr * r;
+}
+
+// Unpacks the 28 terms into a full symmetric hessian, a gradient and a cost.
+template <class T>
+SPS_INLINE void store_normal_terms(const double* terms, T* hessian, T* gradient, T* cost) {
+  int term = 0;
+  for (int a = 0; a < 6; ++a) {
+    for (int b = a; b < 6; ++b) hessian[a * 6 + b] = hessian[b * 6 + a] = static_cast<T>(terms[term++]);
+  }
+  for (int a = 0; a < 6; ++a) gradient[a] = static_cast<T>(terms[term++]);
+  *cost = static_cast<T>(terms[term]);
+}
+
+// delta = -(H + damping diag(H) + absolute_damping I)^-1 g by LDL^T without pivoting. `tolerance` is the share of a
+// diagonal entry that must be left after elimination for the matrix to count as positive definite.
+template <class T>
+SPS_INLINE void solve_damped_6x6(const T* hessian, const T* gradient, double damping, double absolute_damping,
+                                 double tolerance, T* delta) {
+  double l[6][6], d[6], x[6];
+  bool solvable = true;
+  for (int a = 0; a < 6; ++a) {
+    for (int b = 0; b <= a; ++b) {
+      double sum = static_cast<double>(hessian[a * 6 + b]);
+      double bound = 0.0;
+      if (a == b) {
+        sum += damping * sum + absolute_damping;
+        bound = tolerance * sum;
+      }
+      for (int k = 0; k < b; ++k) sum -= l[a][k] * l[b][k] * d[k];
+      if (a == b) {
+        d[a] = sum;
+        solvable = solvable && sum > bound && std::isfinite(sum);
+      } else {
+        l[a][b] = sum / d[b];
+      }
+    }
+  }
+  for (int a = 0; a < 6; ++a) {
+    x[a] = -static_cast<double>(gradient[a]);
+    for (int k = 0; k < a; ++k) x[a] -= l[a][k] * x[k];
+  }
+  for (int a = 5; a >= 0; --a) {
+    x[a] /= d[a];
+    for (int k = a + 1; k < 6; ++k) x[a] -= l[k][a] * x[k];
+    solvable = solvable && std::isfinite(x[a]);
+  }
+  for (int a = 0; a < 6; ++a) delta[a] = solvable ? static_cast<T>(x[a]) : T(0);
+}
+
+}  // namespace spslam
