@@ -50,28 +50,35 @@ void update_stamped_rows(const AdamCoefficients<T>& c, std::int64_t rows, std::i
   });
 }
 
-// Sums of one chunk. Lanes hold every kLanes-th residual, so that the loop over them is a vector operation.
+template <class T>
+struct Vector;
+template <>
+struct Vector<float> {
+  typedef float type __attribute__((vector_size(64)));
+};
+template <>
+struct Vector<double> {
+  typedef double type __attribute__((vector_size(64)));
+};
+
+// Sums of one chunk, with every kLanes-th residual in the same lane of a vector register. A residual of weight 0 is
+// left out rather than multiplied by it, because it may not be finite.
 template <class T>
 void accumulate_chunk(std::int64_t count, const T* residuals, const T* jacobians, const T* weights, double* out) {
-  constexpr int kLanes = 64 / sizeof(T);
-  T sums[kNormalTerms][kLanes] = {};
+  using V = typename Vector<T>::type;
+  constexpr int kLanes = sizeof(V) / sizeof(T);
+  V sums[kNormalTerms] = {};
   for (std::int64_t base = 0; base < count; base += kLanes) {
     const int filled = static_cast<int>(std::min<std::int64_t>(kLanes, count - base));
-    T r[kLanes] = {}, w[kLanes] = {}, j[6][kLanes] = {};
+    V r = {}, w = {}, j[6] = {};
     for (int lane = 0; lane < filled; ++lane) {
-      const bool used = weights[base + lane] != T(0);
-      w[lane] = weights[base + lane];
-      r[lane] = used ? residuals[base + lane] : T(0);
-      for (int a = 0; a < 6; ++a) j[a][lane] = used ? jacobians[(base + lane) * 6 + a] : T(0);
+      const std::int64_t at = base + lane;
+      if (weights[at] == T(0)) continue;
+      w[lane] = weights[at];
+      r[lane] = residuals[at];
+      for (int a = 0; a < 6; ++a) j[a][lane] = jacobians[at * 6 + a];
     }
-#pragma omp simd
-    for (int lane = 0; lane < kLanes; ++lane) {
-      T terms[kNormalTerms], jacobian[6];
-      for (int t = 0; t < kNormalTerms; ++t) terms[t] = sums[t][lane];
-      for (int a = 0; a < 6; ++a) jacobian[a] = j[a][lane];
-      add_normal_terms(jacobian, r[lane], w[lane], terms);
-      for (int t = 0; t < kNormalTerms; ++t) sums[t][lane] = terms[t];
-    }
+    add_normal_terms(j, r, w, sums);
   }
   for (int t = 0; t < kNormalTerms; ++t) {
     out[t] = 0.0;

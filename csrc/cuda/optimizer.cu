@@ -14,8 +14,9 @@ __global__ void accumulate_chunks(std::int64_t count, std::int64_t chunks, const
   const std::int64_t frame = blockIdx.x / chunks;
   const std::int64_t i = (blockIdx.x % chunks) * kNormalChunk + threadIdx.x;
   T terms[kNormalTerms] = {};
-  if (i < count) {
-    const std::int64_t at = frame * count + i;
+  const std::int64_t at = frame * count + i;
+  // A residual of weight 0 is left out rather than multiplied by it, because it may not be finite.
+  if (i < count && weights[at] != T(0)) {
     add_normal_terms(jacobians + at * 6, residuals[at], weights[at], terms);
   }
   for (int t = 0; t < kNormalTerms; ++t) {

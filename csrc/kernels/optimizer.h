@@ -24,22 +24,17 @@ SPS_INLINE void adam_update(const AdamCoefficients<T>& c, T& param, T& grad, T& 
   grad = T(0);
 }
 
-// Adds one residual's share to the 21 + 6 + 1 terms. `T` may be a number or a row of them.
-// A residual of weight 0 adds nothing, whatever it and its jacobian hold.
-template <class T>
-SPS_INLINE void add_normal_terms(const T* jacobian, T residual, T weight, T* terms) {
-  T j[6];
-  const bool used = weight != T(0);
-  for (int a = 0; a < 6; ++a) j[a] = used ? jacobian[a] : T(0);
-  const T r = used ? residual : T(0);
+// Adds one residual's share to the 21 + 6 + 1 terms. `V` is a number, or a vector register of them.
+template <class V>
+SPS_INLINE void add_normal_terms(const V* jacobian, const V& residual, const V& weight, V* terms) {
   int term = 0;
   for (int a = 0; a < 6; ++a) {
-    const T wj = weight * j[a];
-    for (int b = a; b < 6; ++b) terms[term++] += wj * j[b];
+    const V wj = weight * jacobian[a];
+    for (int b = a; b < 6; ++b) terms[term++] += wj * jacobian[b];
   }
-  const T wr = weight * r;
-  for (int a = 0; a < 6; ++a) terms[term++] += wr * j[a];
-  terms[term] += wr * r;
+  const V wr = weight * residual;
+  for (int a = 0; a < 6; ++a) terms[term++] += wr * jacobian[a];
+  terms[term] += wr * residual;
 }
 
 // Unpacks the 28 terms into a full symmetric hessian, a gradient and a cost.
