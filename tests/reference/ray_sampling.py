@@ -1,4 +1,4 @@
-"""Independent formulas in plain torch and NumPy that the kernels are tested against."""
+"""Philox and the samples along a ray, in NumPy and torch."""
 
 import numpy as np
 

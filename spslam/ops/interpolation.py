@@ -1,0 +1,199 @@
+"""Interpolation in sparse volumes, images and tri-planes, differentiable by the table and by the coordinates.
+
+All of them take float32 and float64, accept non-contiguous and empty input, and give the same bits for the same input:
+gradients of a table are summed in the order of the points on the CPU, whatever the number of threads, and in 64-bit
+fixed point on CUDA. First derivatives only.
+"""
+
+from collections.abc import Sequence
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._autograd import forbid_second_derivatives
+from spslam.ops._checks import FLOATING, check, check_tensor
+
+
+def trilinear_interpolate(
+    embeddings: torch.Tensor, corner_ids: torch.Tensor, local_coords: torch.Tensor
+) -> torch.Tensor:
+    """Features of points inside the cells of a sparse volume (TriLerp of equation 2).
+
+    Args:
+        embeddings: [V, C] float32 or float64, a feature vector for each voxel vertex.
+        corner_ids: int32 [N, 8], rows of `embeddings` at the corners of each point's cell; corner k lies at offset
+            (k & 1, k >> 1 & 1, k >> 2 & 1) from the lowest one. A point with an id outside [0, V), such as the -1 of a
+            missing vertex, gets the value 0 and no gradient.
+        local_coords: [N, 3] of the dtype of `embeddings`, position inside the cell in [0, 1], as x, y, z.
+
+    Returns:
+        [N, C]. Differentiable by `embeddings` and `local_coords`. N = 0 gives an empty tensor.
+
+    Raises:
+        TypeError: a dtype is wrong.
+        ValueError: a shape or device does not fit.
+
+    Example:
+        >>> embeddings = torch.arange(8.0)[:, None]
+        >>> corners = torch.arange(8, dtype=torch.int32)[None]
+        >>> trilinear_interpolate(embeddings, corners, torch.tensor([[0.5, 0.25, 0.0]]))
+        tensor([[1.]])
+    """
+    name = "trilinear_interpolate"
+    check_tensor(name, "embeddings", embeddings, ("V", "C"), FLOATING)
+    check_tensor(name, "corner_ids", corner_ids, ("N", 8), torch.int32, like=embeddings)
+    check_tensor(name, "local_coords", local_coords, (corner_ids.shape[0], 3), embeddings.dtype, like=embeddings)
+    return torch.ops.spslam.trilinear_interpolate(embeddings, corner_ids, local_coords)
+
+
+def bilinear_interpolate(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
+    """Values of an image or plane between its texels.
+
+    Args:
+        texels: [H, W, C] float32 or float64; H and W at least 1 unless N is 0.
+        uv: [N, 2] of the same dtype, positions in texels, u along W and v along H: (0, 0) is the centre of the first
+            texel, (W - 1, H - 1) that of the last. Positions outside are clamped to the border, with zero gradient.
+
+    Returns:
+        [N, C]. Differentiable by `texels` and `uv`. N = 0 gives an empty tensor.
+
+    Raises:
+        TypeError: a dtype is wrong.
+        ValueError: a shape or device does not fit.
+
+    Example:
+        >>> bilinear_interpolate(torch.tensor([[[0.0], [1.0]], [[2.0], [3.0]]]), torch.tensor([[0.5, 1.0]]))
+        tensor([[2.5000]])
+    """
+    name = "bilinear_interpolate"
+    check_tensor(name, "texels", texels, ("H", "W", "C"), FLOATING)
+    check_tensor(name, "uv", uv, ("N", 2), texels.dtype, like=texels)
+    has_texels = texels.shape[0] > 0 and texels.shape[1] > 0
+    check(has_texels or uv.shape[0] == 0, name, "texels", "have at least one texel", list(texels.shape))
+    return torch.ops.spslam.bilinear_interpolate(texels, uv)
+
+
+def tri_plane_interpolate(
+    texels: torch.Tensor, points: torch.Tensor, cell_size: float, layout: Sequence[int]
+) -> torch.Tensor:
+    """Features of points as the sum of three axis-aligned planes (equation 3).
+
+    Args:
+        texels: [P, C] float32 or float64, the texels of all planes as rows of one table.
+        points: [N, 3] of the same dtype, metres.
+        cell_size: distance between texels, metres; texel (iu, iv) lies at (iu, iv) * cell_size.
+        layout: 15 integers, (offset, origin_u, origin_v, size_u, size_v) for each of the planes with axes (u, v) =
+            (x, y), (x, z), (y, z). Texel (iu, iv) is row offset + (iu - origin_u) * size_v + (iv - origin_v).
+            Points outside a plane are clamped to its border, with zero gradient by that coordinate. While a plane
+            has no texel, all values are 0.
+
+    Returns:
+        [N, C]. Differentiable by `texels` and `points`. N = 0 gives an empty tensor.
+
+    Raises:
+        TypeError: a dtype is wrong.
+        ValueError: a shape or device does not fit, `cell_size` is not positive, or `layout` exceeds the texels.
+
+    Example:
+        >>> layout = (0, 0, 0, 2, 2, 4, 0, 0, 2, 2, 8, 0, 0, 2, 2)
+        >>> tri_plane_interpolate(torch.ones(12, 1), torch.tensor([[0.01, 0.02, 0.03]]), 0.04, layout)
+        tensor([[3.]])
+    """
+    name = "tri_plane_interpolate"
+    check_tensor(name, "texels", texels, ("P", "C"), FLOATING)
+    check_tensor(name, "points", points, ("N", 3), texels.dtype, like=texels)
+    check(cell_size > 0, name, "cell_size", "be positive", cell_size)
+    check_plane_layout(name, layout, texels.shape[0])
+    return torch.ops.spslam.tri_plane_interpolate(texels, points, cell_size, list(layout))
+
+
+def check_plane_layout(function: str, layout: Sequence[int], num_rows: int) -> None:
+    """Checks that a tri-plane layout is 15 integers that stay inside a table of `num_rows` texels."""
+    check(len(layout) == 15, function, "layout", "have 15 numbers", len(layout))
+    for plane in range(3):
+        offset, _, _, size_u, size_v = layout[5 * plane : 5 * plane + 5]
+        fits = offset >= 0 and size_u >= 0 and size_v >= 0 and offset + size_u * size_v <= num_rows
+        check(fits, function, "layout", f"lie within the {num_rows} texels", list(layout[5 * plane : 5 * plane + 5]))
+
+
+@torch.library.register_fake("spslam::trilinear_interpolate")
+def _(embeddings, corner_ids, local_coords):
+    return embeddings.new_empty(corner_ids.shape[0], embeddings.shape[1])
+
+
+@torch.library.register_fake("spslam::bilinear_interpolate")
+def _(texels, uv):
+    return texels.new_empty(uv.shape[0], texels.shape[2])
+
+
+@torch.library.register_fake("spslam::tri_plane_interpolate")
+def _(texels, points, cell_size, layout):
+    return texels.new_empty(points.shape[0], texels.shape[1])
+
+
+def _fake_gradients(table, coords, need_table, need_coords):
+    return (
+        table.new_empty(table.shape if need_table else (0,)),
+        coords.new_empty(coords.shape if need_coords else (0,)),
+    )
+
+
+@torch.library.register_fake("spslam::trilinear_interpolate_backward")
+def _(grad, embeddings, corner_ids, local_coords, need_embeddings=True, need_local_coords=True):
+    return _fake_gradients(embeddings, local_coords, need_embeddings, need_local_coords)
+
+
+@torch.library.register_fake("spslam::bilinear_interpolate_backward")
+def _(grad, texels, uv, need_texels=True, need_uv=True):
+    return _fake_gradients(texels, uv, need_texels, need_uv)
+
+
+@torch.library.register_fake("spslam::tri_plane_interpolate_backward")
+def _(grad, texels, points, cell_size, layout, need_texels=True, need_points=True):
+    return _fake_gradients(texels, points, need_texels, need_points)
+
+
+def _save_trilinear(ctx, inputs, output):
+    ctx.save_for_backward(*inputs)
+
+
+def _trilinear_backward(ctx, grad):
+    need_embeddings, _, need_local_coords = ctx.needs_input_grad
+    grad_embeddings, grad_local_coords = torch.ops.spslam.trilinear_interpolate_backward(
+        grad, *ctx.saved_tensors, need_embeddings, need_local_coords
+    )
+    return grad_embeddings if need_embeddings else None, None, grad_local_coords if need_local_coords else None
+
+
+def _save_bilinear(ctx, inputs, output):
+    ctx.save_for_backward(*inputs)
+
+
+def _bilinear_backward(ctx, grad):
+    need_texels, need_uv = ctx.needs_input_grad
+    grad_texels, grad_uv = torch.ops.spslam.bilinear_interpolate_backward(
+        grad, *ctx.saved_tensors, need_texels, need_uv
+    )
+    return grad_texels if need_texels else None, grad_uv if need_uv else None
+
+
+def _save_tri_plane(ctx, inputs, output):
+    texels, points, ctx.cell_size, ctx.layout = inputs
+    ctx.save_for_backward(texels, points)
+
+
+def _tri_plane_backward(ctx, grad):
+    need_texels, need_points = ctx.needs_input_grad[:2]
+    grad_texels, grad_points = torch.ops.spslam.tri_plane_interpolate_backward(
+        grad, *ctx.saved_tensors, ctx.cell_size, ctx.layout, need_texels, need_points
+    )
+    return grad_texels if need_texels else None, grad_points if need_points else None, None, None
+
+
+for _op, _save, _backward in (
+    ("trilinear_interpolate", _save_trilinear, _trilinear_backward),
+    ("bilinear_interpolate", _save_bilinear, _bilinear_backward),
+    ("tri_plane_interpolate", _save_tri_plane, _tri_plane_backward),
+):
+    torch.library.register_autograd(f"spslam::{_op}", _backward, setup_context=_save)
+    forbid_second_derivatives(_op)
