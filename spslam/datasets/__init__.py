@@ -1,1 +1,7 @@
 """RGB-D sequences: one loader a format, all giving the same frames."""
+
+from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
+from spslam.datasets.prefetch import Prefetcher, prefetch
+from spslam.datasets.registry import dataset_types, open_dataset
+
+__all__ = ["Prefetcher", "RgbdDataset", "RgbdFrame", "Subset", "dataset_types", "open_dataset", "prefetch"]

@@ -1,0 +1,94 @@
+"""The kinds of dataset by name, and how each takes its options from a configuration."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from spslam.datasets.base import RgbdDataset, Subset
+from spslam.datasets.folder import open_folder
+from spslam.datasets.generated import GeneratedDataset
+from spslam.datasets.replica import open_replica
+from spslam.datasets.seven_scenes import open_seven_scenes
+from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
+from spslam.datasets.tum import open_tum
+from spslam.errors import DatasetError
+
+
+def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> RgbdDataset:
+    """The dataset that a configuration's ``dataset`` section names.
+
+    Parameters
+    ----------
+    config : any object with the attribute ``type`` (one of :func:`dataset_types`) and, each optional or None:
+        ``path``, ``stride`` (every n-th frame), ``min_depth_m``, ``max_depth_m`` (depth outside comes as 0), and the
+        options of the kind: ``sequence`` (7scenes), ``depth_variant`` (synthetic_rgbd), ``depth_scale`` (folder),
+        ``frames``, ``width``, ``height``, ``noise``, ``seed`` (generated).
+    data_dir : the data's folder; overrides ``config.path``. Not needed by ``generated``.
+
+    Raises
+    ------
+    DatasetError
+        For an unknown type, no folder given, and whatever is wrong with the data.
+    """
+    opener = _OPENERS.get(config.type)
+    if opener is None:
+        raise DatasetError(f"dataset.type must be one of {', '.join(dataset_types())}, got {config.type}")
+    dataset = opener(config, _option(config, "path") if data_dir is None else data_dir)
+    dataset.depth_range = (_option(config, "min_depth_m", 0.0), _option(config, "max_depth_m", float("inf")))
+    stride = _option(config, "stride", 1)
+    return dataset if stride == 1 else Subset(dataset, step=stride)
+
+
+def dataset_types() -> list[str]:
+    """Names that ``dataset.type`` may have."""
+    return list(_OPENERS)
+
+
+def _open_seven_scenes(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    return open_seven_scenes(_folder(config, path), _option(config, "sequence"))
+
+
+def _open_synthetic_rgbd(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    return open_synthetic_rgbd(_folder(config, path), _option(config, "depth_variant"))
+
+
+def _open_tum(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    return open_tum(_folder(config, path))
+
+
+def _open_replica(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    return open_replica(_folder(config, path))
+
+
+def _open_folder(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    return open_folder(_folder(config, path), _option(config, "depth_scale"))
+
+
+def _open_generated(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    names = ("frames", "width", "height", "noise", "seed")
+    options = {name: _option(config, name) for name in names}
+    return GeneratedDataset(**{name: value for name, value in options.items() if value is not None})
+
+
+_OPENERS: dict[str, Callable[[Any, str | os.PathLike | None], RgbdDataset]] = {
+    "7scenes": _open_seven_scenes,
+    "synthetic_rgbd": _open_synthetic_rgbd,
+    "tum": _open_tum,
+    "replica": _open_replica,
+    "folder": _open_folder,
+    "generated": _open_generated,
+}
+
+
+def _folder(config: Any, path: str | os.PathLike | None) -> Path:
+    if path is None or str(path) == "":
+        raise DatasetError(f"dataset.path must name the folder of the {config.type} data (--data), got none")
+    return Path(path)
+
+
+def _option(config: Any, name: str, default: Any = None) -> Any:
+    value = getattr(config, name, None)
+    return default if value is None else value

@@ -1,0 +1,181 @@
+"""A closed furnished room of known shape: ray casting, colours, signed distance and surface samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from spslam.camera import Camera
+from spslam.datasets.furniture import ROOM_SIZE, Material, Piece, furnish, make_material
+from spslam.datasets.primitives import Box, Primitive
+from spslam.geometry import inverse
+
+# The shell's faces, two an axis (low, high): walls, floor and ceiling with colours of their own.
+_SHELL_COLORS = (
+    (0.82, 0.76, 0.64),
+    (0.64, 0.71, 0.76),
+    (0.68, 0.74, 0.62),
+    (0.80, 0.66, 0.58),
+    (0.60, 0.45, 0.31),
+    (0.88, 0.87, 0.84),
+)
+_LIGHT = np.array([0.40, 0.29, 0.87])
+_AMBIENT, _DIRECT = 0.76, 0.24
+# How hard the pattern's edges are, and the share of the broad wave.
+_SHARPNESS, _BROAD = 3.0, 0.12
+# A sampled point this far inside another solid is hidden; double precision on coordinates of metres.
+_HIDDEN_M = 1e-9
+# The middles of a round surface's triangles lie this much under it at most.
+_SAGITTA_M = 5e-4
+
+
+class Room:
+    """The room of a seed: 5 x 4 x 2.6 m, floor at z = 0, z up, with the furniture of :mod:`furniture`."""
+
+    def __init__(self, seed: int = 0) -> None:
+        generator = np.random.default_rng([seed, 2])
+        self.pieces = furnish(seed)
+        self._shell = Box((0.0, 0.0, ROOM_SIZE[2] / 2), 0.0, ROOM_SIZE)
+        self._shell_materials = [make_material(generator, color, 0.2, 0.5) for color in _SHELL_COLORS]
+
+    def render(self, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What a camera inside sees: colour uint8 [H,W,3] and exact depth float32 [H,W] in metres.
+
+        One ray through each pixel centre is intersected with every solid; ``pose`` is ``T_world_camera`` [4,4].
+        """
+        origin = pose[:3, 3]
+        directions = np.tensordot(pose[:3, :3].astype(np.float32), camera.ray_directions(), axes=(1, 2))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth, owner = self._cast(camera, pose, origin, directions)
+        points = (directions * depth).reshape(3, -1).T + origin.astype(np.float32)
+        return self._colors(points, owner.reshape(-1)).reshape(camera.height, camera.width, 3), depth
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance [N] in metres of points [N,3] to the nearest surface.
+
+        Positive and exact in free space; negative inside furniture and behind the walls, where it is the distance
+        to leave the solid the point is deepest in (a lower bound of the distance to free space).
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        distance = -self._shell.signed_distance(points)
+        for piece in self.pieces:
+            np.minimum(distance, piece.solid.signed_distance(points), out=distance)
+        return distance
+
+    def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
+        """Points [count,3] spread evenly by area over the surfaces that face free space; float64, metres.
+
+        The same count and seed give the same points. ``count`` 0 gives an empty array.
+        """
+        generator = np.random.default_rng([seed, 3])
+        solids = [self._shell, *(piece.solid for piece in self.pieces)]
+        areas = np.array([solid.area for solid in solids])
+        kept: list[np.ndarray] = [np.zeros((0, 3))]
+        missing = count
+        while missing > 0:
+            # Some are hidden, so a few more are drawn than needed.
+            drawn = generator.multinomial(missing + missing // 2 + 16, areas / areas.sum())
+            points = np.concatenate([solid.sample(generator, n) for solid, n in zip(solids, drawn, strict=True)])
+            visible = points[~self._is_hidden(points, _HIDDEN_M)]
+            kept.append(generator.permutation(visible)[:missing])
+            missing -= len(kept[-1])
+        return np.concatenate(kept)
+
+    def mesh(self, longest_edge_m: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The room's surface as triangles: vertices float64 [V,3], faces int64 [F,3], colours uint8 [V,3].
+
+        Faces point into free space. Triangles whose middle is hidden in another solid are left out, so that along
+        contacts the mesh ends within one triangle of the true line. Round surfaces deviate by under 0.5 mm.
+        """
+        vertices, faces, colors = [], [], []
+        first = 0
+        for owner, solid in enumerate([self._shell, *(piece.solid for piece in self.pieces)], start=-1):
+            points, triangles = self._visible_triangles(solid, longest_edge_m)
+            vertices.append(points)
+            faces.append(first + (triangles if owner >= 0 else triangles[:, ::-1]))
+            colors.append(self._colors(points.astype(np.float32), np.full(len(points), owner)))
+            first += len(points)
+        return np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors)
+
+    def _visible_triangles(self, solid: Primitive, longest_edge_m: float) -> tuple[np.ndarray, np.ndarray]:
+        surface = solid.local_mesh()
+        points, triangles = trimesh.remesh.subdivide_to_size(surface.vertices, surface.faces, longest_edge_m)
+        points = solid.to_world(points)
+        visible = triangles[~self._is_hidden(points[triangles].mean(axis=1), _SAGITTA_M)]
+        used, renumbered = np.unique(visible, return_inverse=True)
+        return points[used], renumbered.reshape(-1, 3)
+
+    def _is_hidden(self, points: np.ndarray, deeper_than: float) -> np.ndarray:
+        """Whether points [N,3] lie in furniture or behind a wall by more than a distance; bool [N]."""
+        hidden = self._shell.signed_distance(points) > deeper_than
+        if not len(points):
+            return hidden
+        lowest, highest = points.min(axis=0), points.max(axis=0)
+        for piece in self.pieces:
+            corners = piece.solid.corners()
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            if np.any(highest < low) or np.any(lowest > high):
+                continue
+            near = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
+            hidden[near] |= piece.solid.signed_distance(points[near]) < -deeper_than
+        return hidden
+
+    def _cast(
+        self, camera: Camera, pose: np.ndarray, origin: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        depth = self._shell.local_interval(self._shell.to_local(origin), directions)[1].astype(np.float32)
+        owner = np.full(depth.shape, -1, dtype=np.int16)
+        for number, piece in enumerate(self.pieces):
+            window = _window(piece, camera, pose)
+            if window is None:
+                continue
+            hit = piece.solid.intersect(origin, directions[(slice(None), *window)])
+            nearer = hit < depth[window]
+            np.copyto(depth[window], hit, where=nearer)
+            np.copyto(owner[window], np.int16(number), where=nearer)
+        return depth, owner
+
+    def _colors(self, points: np.ndarray, owner: np.ndarray) -> np.ndarray:
+        colors = np.empty((len(points), 3), dtype=np.float32)
+        order = np.argsort(owner, kind="stable")
+        numbers, starts = np.unique(owner[order], return_index=True)
+        for number, rows in zip(numbers, np.split(order, starts[1:]), strict=True):
+            if number < 0:
+                colors[rows] = self._shell_colors(points[rows])
+            else:
+                piece = self.pieces[number]
+                colors[rows] = _shaded(points[rows], piece.solid.normals(points[rows]), piece.material)
+        return np.clip(colors * 255 + 0.5, 0, 255).astype(np.uint8)
+
+    def _shell_colors(self, points: np.ndarray) -> np.ndarray:
+        normals = -self._shell.normals(points)
+        axis = np.argmax(np.abs(normals), axis=1)
+        face = 2 * axis + (normals[np.arange(len(points)), axis] < 0)
+        colors = np.empty((len(points), 3), dtype=np.float32)
+        for number in np.unique(face):
+            rows = face == number
+            colors[rows] = _shaded(points[rows], normals[rows], self._shell_materials[number])
+        return colors
+
+
+def _window(piece: Piece, camera: Camera, pose: np.ndarray) -> tuple[slice, slice] | None:
+    corners = piece.solid.corners() @ pose[:3, :3] + inverse(pose)[:3, 3]
+    in_front = corners[:, 2] > 0
+    if not in_front.any():
+        return None
+    if not in_front.all():
+        return slice(None), slice(None)
+    pixels = camera.project(corners)
+    left, top = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
+    right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + 1
+    if left >= camera.width or top >= camera.height or right <= 0 or bottom <= 0:
+        return None
+    return slice(top, bottom), slice(left, right)
+
+
+def _shaded(points: np.ndarray, normals: np.ndarray, material: Material) -> np.ndarray:
+    waves = np.sin(points @ material.waves.T.astype(np.float32) + material.phases.astype(np.float32))
+    pattern = np.clip(np.float32(_SHARPNESS) * waves[:, 0] * waves[:, 1], -1, 1)
+    brightness = _AMBIENT + _DIRECT * (normals @ _LIGHT.astype(np.float32))
+    brightness = brightness * (1 + np.float32(material.contrast) * pattern + np.float32(_BROAD) * waves[:, 2])
+    return brightness[:, None] * material.color.astype(np.float32)

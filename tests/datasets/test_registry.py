@@ -1,0 +1,73 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from spslam.datasets import dataset_types, open_dataset
+from spslam.datasets.base import Subset
+from spslam.errors import DatasetError
+from tests.datasets.layouts import (
+    depth_metres,
+    write_folder,
+    write_replica,
+    write_seven_scenes,
+    write_synthetic_rgbd,
+    write_tum,
+)
+
+WRITERS = {
+    "7scenes": write_seven_scenes,
+    "synthetic_rgbd": write_synthetic_rgbd,
+    "replica": write_replica,
+    "tum": write_tum,
+    "folder": write_folder,
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_every_format_gives_the_same_frames(tmp_path, kind):
+    folder = WRITERS[kind](tmp_path / "data")
+    dataset = open_dataset(SimpleNamespace(type=kind, depth_variant="exact"), folder)
+    assert len(dataset.timestamps()) == len(dataset) >= 3
+    assert (np.diff(dataset.timestamps()) > 0).all()
+    for index, frame in enumerate(dataset):
+        assert frame.index == index
+        assert frame.timestamp == dataset.timestamps()[index]
+        assert frame.color.dtype == np.uint8
+        assert frame.depth.dtype == np.float32
+        assert frame.color.flags.c_contiguous
+        np.testing.assert_allclose(frame.depth, depth_metres(index), atol=2e-4)
+
+
+def test_generated_needs_no_folder():
+    config = SimpleNamespace(type="generated", path=None, frames=3, width=48, height=32, noise=None, seed=7)
+    dataset = open_dataset(config)
+    assert (len(dataset), dataset.camera.width) == (3, 48)
+    assert dataset[0].depth.shape == (32, 48)
+
+
+def test_common_options(tmp_path):
+    folder = write_seven_scenes(tmp_path, count=5, sequences=("seq-01", "seq-02"))
+    config = SimpleNamespace(type="7scenes", path=folder, stride=2, min_depth_m=1.2, max_depth_m=2.0, sequence="seq-02")
+    dataset = open_dataset(config)
+    assert isinstance(dataset, Subset)
+    assert dataset.name.endswith("seq-02")
+    assert list(dataset.source_indices) == [0, 2, 4]
+    depth = dataset[1].depth
+    expected = depth_metres(2)
+    np.testing.assert_allclose(depth, np.where((expected >= 1.2) & (expected <= 2.0), expected, 0), atol=1e-6)
+
+
+def test_the_argument_overrides_the_path(tmp_path):
+    folder = write_folder(tmp_path / "data")
+    assert len(open_dataset(SimpleNamespace(type="folder", path="elsewhere"), str(folder))) == 3
+
+
+def test_errors():
+    assert dataset_types() == ["7scenes", "synthetic_rgbd", "tum", "replica", "folder", "generated"]
+    with pytest.raises(DatasetError, match="dataset.type must be one of 7scenes, .*, generated, got kitti"):
+        open_dataset(SimpleNamespace(type="kitti"))
+    with pytest.raises(DatasetError, match="dataset.path must name the folder of the tum data"):
+        open_dataset(SimpleNamespace(type="tum"))
+    with pytest.raises(DatasetError, match="nowhere: no such folder"):
+        open_dataset(SimpleNamespace(type="tum"), "nowhere")
