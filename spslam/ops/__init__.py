@@ -3,13 +3,24 @@
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
+from spslam.ops.prior_fusion import fuse_prior_
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_indices
+from spslam.ops.voxel_hash import (
+    new_voxel_hash,
+    voxel_hash_build_,
+    voxel_hash_find,
+    voxel_hash_insert,
+    voxel_hash_lookup,
+    voxel_hash_update_corner_ids,
+)
 
 __all__ = [
     "CPU_ISA",
     "CUDA_OFF_REASON",
     "Stream",
     "bilinear_interpolate",
+    "fuse_prior_",
+    "new_voxel_hash",
     "normal_equations",
     "philox_uniform",
     "sample_indices",
@@ -17,4 +28,9 @@ __all__ = [
     "sparse_adam_",
     "tri_plane_interpolate",
     "trilinear_interpolate",
+    "voxel_hash_build_",
+    "voxel_hash_find",
+    "voxel_hash_insert",
+    "voxel_hash_lookup",
+    "voxel_hash_update_corner_ids",
 ]

@@ -1,0 +1,133 @@
+#include "spslam/voxel_hash.h"
+
+#include "bindings/common.h"
+
+namespace spslam::bindings {
+namespace {
+
+std::int64_t checked_capacity(const char* function, const Tensor& hash_keys, const Tensor& hash_values) {
+  const std::int64_t capacity = hash_keys.numel();
+  STD_TORCH_CHECK(capacity >= 2 && (capacity & (capacity - 1)) == 0, function,
+                  ": hash_keys must have a power of two of slots, got ", capacity);
+  STD_TORCH_CHECK(hash_values.numel() == capacity, function, ": hash_values must have as many slots as hash_keys, got ",
+                  hash_values.numel());
+  return capacity;
+}
+
+// A table is kept half empty at least: every probe then ends, and soon.
+void check_room(const char* function, std::int64_t capacity, std::int64_t voxels) {
+  STD_TORCH_CHECK(voxels <= capacity / 2, function, ": hash table must stay at most half full, got ", voxels,
+                  " voxels for ", capacity, " slots");
+}
+
+Tensor voxel_hash_insert(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, std::int64_t first_id) {
+  const char* name = "voxel_hash_insert";
+  const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
+  voxel_coords = contiguous(voxel_coords);
+  const std::int64_t n = voxel_coords.size(0);
+  DeviceScope scope(hash_keys);
+  const Tensor absent = empty(hash_keys, {n}, ScalarType::Long);
+  const Tensor workspace = empty(hash_keys, {voxel_hash_workspace_bytes(scope.context, n)}, ScalarType::Byte);
+  const AbsentVoxels found = voxel_hash_absent(
+      scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values), capacity,
+      data<std::int32_t>(voxel_coords), n, mutable_data<std::uint8_t>(workspace), mutable_data<std::int64_t>(absent));
+  STD_TORCH_CHECK(found.out_of_range == 0, name, ": voxel_coords must lie in [-2^20, 2^20 - 1], got ",
+                  found.out_of_range, " rows outside");
+  check_room(name, capacity, first_id + found.count);
+  voxel_hash_assign(scope.context, mutable_data<std::int64_t>(hash_keys), mutable_data<std::int32_t>(hash_values),
+                    capacity, data<std::int64_t>(absent), found.count, static_cast<std::int32_t>(first_id));
+  const Tensor new_voxel_coords = empty(hash_keys, {found.count, 3}, ScalarType::Int);
+  voxel_hash_unpack(scope.context, data<std::int64_t>(absent), found.count,
+                    mutable_data<std::int32_t>(new_voxel_coords));
+  return new_voxel_coords;
+}
+
+void voxel_hash_build(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords) {
+  const char* name = "voxel_hash_build_";
+  const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
+  voxel_coords = contiguous(voxel_coords);
+  const std::int64_t n = voxel_coords.size(0);
+  check_room(name, capacity, n);
+  DeviceScope scope(hash_keys);
+  const Tensor keys = empty(hash_keys, {n}, ScalarType::Long);
+  voxel_hash_pack(scope.context, data<std::int32_t>(voxel_coords), n, mutable_data<std::int64_t>(keys));
+  torch::stable::fill_(hash_keys, -1);
+  voxel_hash_assign(scope.context, mutable_data<std::int64_t>(hash_keys), mutable_data<std::int32_t>(hash_values),
+                    capacity, data<std::int64_t>(keys), n, 0);
+}
+
+Tensor voxel_hash_find(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords) {
+  const std::int64_t capacity = checked_capacity("voxel_hash_find", hash_keys, hash_values);
+  hash_keys = contiguous(hash_keys);
+  hash_values = contiguous(hash_values);
+  voxel_coords = contiguous(voxel_coords);
+  DeviceScope scope(hash_keys);
+  const Tensor voxel_ids = empty(hash_keys, {voxel_coords.size(0)}, ScalarType::Int);
+  spslam::voxel_hash_find(scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values), capacity,
+                          data<std::int32_t>(voxel_coords), voxel_ids.numel(), mutable_data<std::int32_t>(voxel_ids));
+  return voxel_ids;
+}
+
+void voxel_hash_update_corner_ids(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, Tensor corner_ids,
+                                  std::int64_t first_new) {
+  const char* name = "voxel_hash_update_corner_ids";
+  const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
+  hash_keys = contiguous(hash_keys);
+  hash_values = contiguous(hash_values);
+  voxel_coords = contiguous(voxel_coords);
+  const std::int64_t voxels = voxel_coords.size(0);
+  STD_TORCH_CHECK(corner_ids.size(0) == voxels, name, ": corner_ids must have a row a voxel");
+  STD_TORCH_CHECK(first_new >= 0 && first_new <= voxels, name, ": first_new must be in [0, ", voxels, "], got ",
+                  first_new);
+  DeviceScope scope(hash_keys);
+  spslam::voxel_hash_update_corner_ids(scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values),
+                                       capacity, data<std::int32_t>(voxel_coords), voxels, first_new,
+                                       mutable_data<std::int32_t>(corner_ids));
+}
+
+std::tuple<Tensor, Tensor> voxel_hash_lookup(Tensor hash_keys, Tensor hash_values, Tensor corner_ids, Tensor points,
+                                             double voxel_size) {
+  const char* name = "voxel_hash_lookup";
+  const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
+  hash_keys = contiguous(hash_keys);
+  hash_values = contiguous(hash_values);
+  corner_ids = contiguous(corner_ids);
+  points = contiguous(points);
+  const std::int64_t n = points.size(0);
+  DeviceScope scope(hash_keys);
+  const Tensor rows = empty(hash_keys, {n, 8}, ScalarType::Int);
+  const Tensor local_coords = empty(points, {n, 3}, points.scalar_type());
+  dispatch_floating(name, points, [&](auto zero) {
+    using T = decltype(zero);
+    spslam::voxel_hash_lookup(scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values), capacity,
+                              data<std::int32_t>(corner_ids), data<T>(points), n, static_cast<T>(voxel_size),
+                              mutable_data<std::int32_t>(rows), mutable_data<T>(local_coords));
+  });
+  return {local_coords, rows};
+}
+
+}  // namespace
+
+#ifndef SPS_CUDA
+STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def("voxel_hash_insert(Tensor(a!) hash_keys, Tensor(b!) hash_values, Tensor voxel_coords, int first_id) -> Tensor");
+  m.def("voxel_hash_build_(Tensor(a!) hash_keys, Tensor(b!) hash_values, Tensor voxel_coords) -> ()");
+  m.def("voxel_hash_find(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords) -> Tensor");
+  m.def(
+      "voxel_hash_update_corner_ids(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, Tensor(a!) corner_ids, "
+      "int first_new) -> ()");
+  m.def(
+      "voxel_hash_lookup(Tensor hash_keys, Tensor hash_values, Tensor corner_ids, Tensor points, float voxel_size) -> "
+      "(Tensor, Tensor)");
+}
+#endif
+
+SPS_LIBRARY_IMPL(m) {
+  m.impl("voxel_hash_insert", TORCH_BOX(&voxel_hash_insert));
+  m.impl("voxel_hash_build_", TORCH_BOX(&voxel_hash_build));
+  m.impl("voxel_hash_find", TORCH_BOX(&voxel_hash_find));
+  m.impl("voxel_hash_update_corner_ids", TORCH_BOX(&voxel_hash_update_corner_ids));
+  m.impl("voxel_hash_lookup", TORCH_BOX(&voxel_hash_lookup));
+}
+
+}  // namespace spslam::bindings

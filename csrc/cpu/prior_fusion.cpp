@@ -1,0 +1,5 @@
+#include "kernels/prior_fusion_launch.h"
+
+namespace spslam {
+SPS_INSTANTIATE_PRIOR_FUSION(Cpu)
+}  // namespace spslam

@@ -1,0 +1,121 @@
+// The voxel hash: packed coordinates, open addressing with linear probing, and the cell around a point.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/macros.h"
+#include "core/vec.h"
+
+namespace spslam {
+
+constexpr int kVoxelCoordBits = 21;
+constexpr std::int32_t kVoxelCoordMax = (1 << (kVoxelCoordBits - 1)) - 1;
+constexpr std::int32_t kVoxelCoordMin = -kVoxelCoordMax - 1;
+constexpr std::int64_t kEmptyVoxelKey = -1;
+constexpr std::int32_t kNoVoxel = -1;
+constexpr int kCellCorners = 8;
+
+// A hash table that is only read: slot i holds keys[i] -> values[i]. mask is its capacity, a power of two, minus one.
+struct VoxelTable {
+  const std::int64_t* keys;
+  const std::int32_t* values;
+  std::int64_t mask;
+};
+
+struct VoxelCoord {
+  std::int32_t x, y, z;
+};
+
+SPS_INLINE VoxelCoord load_voxel(const std::int32_t* coords, std::int64_t i) {
+  return {coords[3 * i], coords[3 * i + 1], coords[3 * i + 2]};
+}
+
+// Corner k of the cell whose lowest corner is c.
+SPS_INLINE VoxelCoord cell_corner(VoxelCoord c, int k) {
+  return {c.x + (k & 1), c.y + ((k >> 1) & 1), c.z + ((k >> 2) & 1)};
+}
+
+SPS_INLINE bool voxel_in_range(VoxelCoord c) {
+  return c.x >= kVoxelCoordMin && c.x <= kVoxelCoordMax && c.y >= kVoxelCoordMin && c.y <= kVoxelCoordMax &&
+         c.z >= kVoxelCoordMin && c.z <= kVoxelCoordMax;
+}
+
+// 21 bits an axis, so that the order of keys is the lexicographic order of (x, y, z). c must be in range.
+SPS_INLINE std::int64_t pack_voxel(VoxelCoord c) {
+  return (static_cast<std::int64_t>(c.x - kVoxelCoordMin) << (2 * kVoxelCoordBits)) |
+         (static_cast<std::int64_t>(c.y - kVoxelCoordMin) << kVoxelCoordBits) |
+         static_cast<std::int64_t>(c.z - kVoxelCoordMin);
+}
+
+SPS_INLINE VoxelCoord unpack_voxel(std::int64_t key) {
+  constexpr std::int64_t kAxisMask = (1 << kVoxelCoordBits) - 1;
+  return {static_cast<std::int32_t>(key >> (2 * kVoxelCoordBits)) + kVoxelCoordMin,
+          static_cast<std::int32_t>((key >> kVoxelCoordBits) & kAxisMask) + kVoxelCoordMin,
+          static_cast<std::int32_t>(key & kAxisMask) + kVoxelCoordMin};
+}
+
+// Folds the x bits down before the multiplication: the slot is taken from the middle of the product, which the top
+// bits of the key would not reach.
+SPS_INLINE std::int64_t voxel_slot(std::int64_t key, std::int64_t mask) {
+  std::uint64_t h = static_cast<std::uint64_t>(key);
+  h ^= h >> 32;
+  h *= 0xFF51AFD7ED558CCDull;
+  return static_cast<std::int64_t>(h >> 32) & mask;
+}
+
+// Id of a packed coordinate, or kNoVoxel. Ends because a table is at most half full.
+SPS_INLINE std::int32_t find_voxel_key(const VoxelTable& table, std::int64_t key) {
+  for (std::int64_t slot = voxel_slot(key, table.mask);; slot = (slot + 1) & table.mask) {
+    const std::int64_t found = table.keys[slot];
+    if (found == key) return table.values[slot];
+    if (found == kEmptyVoxelKey) return kNoVoxel;
+  }
+}
+
+// Id of a coordinate, or kNoVoxel where it is absent or out of range.
+SPS_INLINE std::int32_t find_voxel(const VoxelTable& table, VoxelCoord c) {
+  return voxel_in_range(c) ? find_voxel_key(table, pack_voxel(c)) : kNoVoxel;
+}
+
+// Writes the ids of the eight corners of the cell at c; returns whether all exist. Where one is missing all are
+// written as kNoVoxel, so that a reader need look at the first only.
+SPS_INLINE bool gather_corners(const VoxelTable& table, VoxelCoord c, std::int32_t* corners) {
+  bool complete = true;
+  for (int k = 0; k < kCellCorners; ++k) {
+    corners[k] = complete ? find_voxel(table, cell_corner(c, k)) : kNoVoxel;
+    complete = complete && corners[k] != kNoVoxel;
+  }
+  if (complete) return true;
+  for (int k = 0; k < kCellCorners; ++k) corners[k] = kNoVoxel;
+  return false;
+}
+
+// Where a point lies: corner_ids is null outside the allocated cells, else the row of its cell's eight corners; local
+// is the position within the cell, in [0, 1].
+template <class T>
+struct Cell {
+  const std::int32_t* corner_ids;
+  Vec3<T> local;
+};
+
+// The cell around a point given in voxel units (world point / voxel size). One probe: the row beside the lowest corner
+// names the other seven. NaN and far away points are outside.
+template <class T>
+SPS_INLINE Cell<T> find_cell(const VoxelTable& table, const std::int32_t* corner_ids, const Vec3<T>& point_vox) {
+  const Vec3<T> base{std::floor(point_vox.x), std::floor(point_vox.y), std::floor(point_vox.z)};
+  Cell<T> cell{nullptr, {T(0), T(0), T(0)}};
+  constexpr T kLow = static_cast<T>(kVoxelCoordMin), kHigh = static_cast<T>(kVoxelCoordMax);
+  const bool in_range =
+      base.x >= kLow && base.x <= kHigh && base.y >= kLow && base.y <= kHigh && base.z >= kLow && base.z <= kHigh;
+  if (!in_range) return cell;
+  const VoxelCoord coord{static_cast<std::int32_t>(base.x), static_cast<std::int32_t>(base.y),
+                         static_cast<std::int32_t>(base.z)};
+  const std::int32_t id = find_voxel_key(table, pack_voxel(coord));
+  if (id == kNoVoxel) return cell;
+  const std::int32_t* row = corner_ids + static_cast<std::int64_t>(kCellCorners) * id;
+  if (row[0] == kNoVoxel) return cell;
+  return {row, point_vox - base};
+}
+
+}  // namespace spslam
