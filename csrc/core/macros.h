@@ -8,3 +8,14 @@
 #define SPS_HOST_DEVICE
 #define SPS_INLINE inline __attribute__((always_inline))
 #endif
+
+// SPS_SIMD, or SPS_SIMD_SUM(a, b) to name the sums it carries: the loop that follows may run in vector lanes on the
+// host.
+#define SPS_PRAGMA(text) _Pragma(#text)
+#if defined(__CUDACC__)
+#define SPS_SIMD
+#define SPS_SIMD_SUM(...)
+#else
+#define SPS_SIMD SPS_PRAGMA(omp simd)
+#define SPS_SIMD_SUM(...) SPS_PRAGMA(omp simd reduction(+ : __VA_ARGS__))
+#endif

@@ -19,8 +19,12 @@ void sample_indices(Device device, PhiloxKey key, std::int64_t upper, std::int64
   });
 }
 
-#define SPS_INSTANTIATE_RAY_SAMPLING(Device)                                     \
-  template void philox_uniform<Device>(Device, PhiloxKey, std::int64_t, float*); \
-  template void sample_indices<Device>(Device, PhiloxKey, std::int64_t, std::int64_t, std::int64_t*);
+#define SPS_INSTANTIATE_RAY_SAMPLING(Device)                                                                    \
+  template void philox_uniform<Device>(Device, PhiloxKey, std::int64_t, float*);                                \
+  template void sample_indices<Device>(Device, PhiloxKey, std::int64_t, std::int64_t, std::int64_t*);           \
+  template void sample_along_rays<Device, float>(Device, PhiloxKey, const RaySampling<float>&, const float*,    \
+                                                 std::int64_t, float*);                                         \
+  template void sample_along_rays<Device, double>(Device, PhiloxKey, const RaySampling<double>&, const double*, \
+                                                  std::int64_t, double*);
 
 }  // namespace spslam

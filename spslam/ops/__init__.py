@@ -4,7 +4,7 @@ from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.prior_fusion import fuse_prior_
-from spslam.ops.ray_sampling import Stream, philox_uniform, sample_indices
+from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.voxel_hash import (
     new_voxel_hash,
     voxel_hash_build_,
@@ -23,6 +23,7 @@ __all__ = [
     "new_voxel_hash",
     "normal_equations",
     "philox_uniform",
+    "sample_along_rays",
     "sample_indices",
     "solve_normal_equations",
     "sparse_adam_",

@@ -5,7 +5,10 @@ from enum import IntEnum
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check
+from spslam.ops._checks import FLOATING, check, check_tensor
+
+_MAX_SAMPLES = 2**20
+_COUNTER_RANGE = 2**32
 
 
 class Stream(IntEnum):
@@ -61,3 +64,72 @@ def sample_indices(
     out = torch.empty(count, dtype=torch.int64, device=device)
     torch.ops.spslam.sample_indices(seed, stream, frame, iteration, upper, out)
     return out
+
+
+def sample_along_rays(
+    depth: torch.Tensor,
+    num_uniform: int,
+    num_surface: int,
+    near: float,
+    far: float,
+    truncation: float,
+    seed: int,
+    stream: int,
+    frame: int,
+    iteration: int,
+) -> torch.Tensor:
+    """Depths of the samples along each ray, guided by its measured depth D (section III-B).
+
+    `num_uniform` samples are stratified over [near * D, far * D], `num_surface` over [D - truncation, D + truncation]:
+    one random place in each of as many equal parts. Both come merged in ascending order.
+
+    Args:
+        depth: [R] float32 or float64, measured depth of each ray, metres. Rays whose depth is
+            not positive and finite get zeros.
+        num_uniform: samples between camera and surface (N_c), 0 to 2^20.
+        num_surface: samples around the surface (N_f), 0 to 2^20.
+        near: start of the uniform samples as a share of the depth (n_1).
+        far: their end (n_2), at least `near`.
+        truncation: half width of the interval around the surface, metres.
+        seed, stream, frame, iteration: the key of the draw, as in `philox_uniform`. Sample s of ray r, with the uniform
+            samples first, uses counter element r * S + s, which must stay below 2^32.
+
+    Returns:
+        [R, S] with S = num_uniform + num_surface, of the dtype of `depth`, metres, ascending in each row. Not
+        differentiable. The same on every run; devices differ by rounding only. R = 0 or S = 0 gives an empty tensor.
+
+    Raises:
+        TypeError: a dtype is wrong.
+        ValueError: a shape does not fit, a number is out of range, or R * S exceeds 2^32.
+
+    Example:
+        >>> sample_along_rays(torch.tensor([2.0]), 2, 1, 0.0, 1.0, 0.1, 0, Stream.TRACKING_RAYS, 0, 0).shape
+        torch.Size([1, 3])
+    """
+    name = "sample_along_rays"
+    check_tensor(name, "depth", depth, ("R",), FLOATING)
+    check(0 <= num_uniform <= _MAX_SAMPLES, name, "num_uniform", "be in [0, 2^20]", num_uniform)
+    check(0 <= num_surface <= _MAX_SAMPLES, name, "num_surface", "be in [0, 2^20]", num_surface)
+    check(near >= 0, name, "near", "be at least 0", near)
+    check(near <= far, name, "far", f"be at least near ({near})", far)
+    check(truncation >= 0, name, "truncation", "be at least 0", truncation)
+    elements = depth.shape[0] * (num_uniform + num_surface)
+    check(elements <= _COUNTER_RANGE, name, "depth", "have at most 2^32 / S rays", depth.shape[0])
+    return torch.ops.spslam.sample_along_rays(
+        depth.detach(), num_uniform, num_surface, near, far, truncation, seed, stream, frame, iteration
+    )
+
+
+@torch.library.register_fake("spslam::sample_along_rays")
+def _(depth, num_uniform, num_surface, near, far, truncation, seed, stream, frame, iteration):
+    return depth.new_empty(depth.shape[0], num_uniform + num_surface)
+
+
+@torch.library.register_fake("spslam::philox_uniform")
+def _(seed, stream, frame, iteration, out):
+    pass
+
+
+@torch.library.register_fake("spslam::sample_indices")
+def _(seed, stream, frame, iteration, upper, out):
+    pass
