@@ -1,6 +1,7 @@
 """Kernels for sparse neural reconstruction: the public op library, independent of the rest of spslam."""
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON
+from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.prior_fusion import fuse_prior_
@@ -17,9 +18,12 @@ from spslam.ops.voxel_hash import (
 __all__ = [
     "CPU_ISA",
     "CUDA_OFF_REASON",
+    "Activation",
     "Stream",
     "bilinear_interpolate",
     "fuse_prior_",
+    "mlp",
+    "mlp_num_params",
     "new_voxel_hash",
     "normal_equations",
     "philox_uniform",

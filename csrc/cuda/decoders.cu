@@ -1,0 +1,123 @@
+// One thread a unit: layer after layer through global memory.
+#include "core/for_each.h"
+#include "kernels/decoders.h"
+
+namespace spslam {
+namespace {
+
+// Samples whose parameter gradients one thread adds up, and the most partial sums a parameter has.
+constexpr std::int64_t kMinGradientChunk = 256, kMaxGradientChunks = 256;
+
+std::int64_t gradient_chunk(std::int64_t n) {
+  const std::int64_t share = chunk_count(n, kMaxGradientChunks);
+  return share > kMinGradientChunk ? share : kMinGradientChunk;
+}
+
+// Where the matrices lie in the flat parameters.
+template <class P>
+struct Parameters {
+  P *w1, *b1, *w2, *b2, *w3, *b3;
+
+  __host__ __device__ Parameters(const MlpShape& s, P* params)
+      : w1(params),
+        b1(w1 + s.hidden * s.input),
+        w2(b1 + s.hidden),
+        b2(w2 + s.hidden * s.hidden),
+        w3(b2 + s.hidden),
+        b3(w3 + s.output * s.hidden) {}
+};
+
+// out[n, o] = relu or activation of w[o] . x[n] + b[o]
+template <class T>
+void layer(Cuda device, std::int64_t n, const T* x, std::int64_t inputs, const T* w, const T* b, std::int64_t outputs,
+           bool rectify, MlpActivation activation, T* out) {
+  for_each(device, n * outputs, [=] __device__(std::int64_t i) {
+    const std::int64_t row = i / outputs, o = i % outputs;
+    const T y = unit(w + o * inputs, x + row * inputs, inputs, b[o]);
+    out[i] = rectify ? rectified(y) : activate(activation, y);
+  });
+}
+
+// out[n, i] = sum_o g[n, o] w[o, i], through the ReLU before it where `active` is given.
+template <class T>
+void layer_backward(Cuda device, std::int64_t n, const T* g, std::int64_t outputs, const T* w, std::int64_t inputs,
+                    const T* active, T* out) {
+  for_each(device, n * inputs, [=] __device__(std::int64_t i) {
+    const std::int64_t row = i / inputs, column = i % inputs;
+    const T grad = input_gradient(g + row * outputs, w + column, outputs, inputs);
+    out[i] = active ? rectified_gradient(active[i], grad) : grad;
+  });
+}
+
+// Partial gradients of a layer's weights and biases: thread (chunk, o, i) sums over the samples of a chunk, in order.
+template <class T>
+void layer_weight_gradients(Cuda device, std::int64_t n, const T* g, std::int64_t outputs, const T* x,
+                            std::int64_t inputs, std::int64_t num_params, T* weights, T* biases) {
+  const std::int64_t chunk = gradient_chunk(n), columns = inputs + 1;
+  for_each(device, chunk_count(n, chunk) * outputs * columns, [=] __device__(std::int64_t i) {
+    const std::int64_t c = i / (outputs * columns), o = i / columns % outputs, column = i % columns;
+    const std::int64_t end = (c + 1) * chunk < n ? (c + 1) * chunk : n;
+    T sum = 0;
+    for (std::int64_t row = c * chunk; row < end; ++row) {
+      sum += g[row * outputs + o] * (column < inputs ? x[row * inputs + column] : T(1));
+    }
+    T* out = column < inputs ? weights + o * inputs + column : biases + o;
+    out[c * num_params] = sum;
+  });
+}
+
+}  // namespace
+
+template <>
+std::int64_t mlp_workspace_size(Cuda, const MlpShape& shape, std::int64_t n) {
+  return 2 * n * shape.hidden;
+}
+template <>
+std::int64_t mlp_backward_workspace_size(Cuda, const MlpShape& shape, std::int64_t n) {
+  return n * (4 * shape.hidden + shape.output) + chunk_count(n, gradient_chunk(n)) * shape.num_params();
+}
+
+template <class Device, class T>
+void mlp(Device device, const MlpShape& shape, const T* input, std::int64_t n, const T* params, T* workspace, T* out) {
+  const Parameters<const T> p(shape, params);
+  T *h1 = workspace, *h2 = h1 + n * shape.hidden;
+  layer(device, n, input, shape.input, p.w1, p.b1, shape.hidden, true, shape.activation, h1);
+  layer(device, n, h1, shape.hidden, p.w2, p.b2, shape.hidden, true, shape.activation, h2);
+  layer(device, n, h2, shape.hidden, p.w3, p.b3, shape.output, false, shape.activation, out);
+}
+
+template <class Device, class T>
+void mlp_backward(Device device, const MlpShape& shape, const T* grad, const T* input, std::int64_t n, const T* params,
+                  T* workspace, T* grad_input, T* grad_params) {
+  const Parameters<const T> p(shape, params);
+  const std::int64_t units = n * shape.hidden, num_params = shape.num_params();
+  T *h1 = workspace, *h2 = h1 + units, *g1 = h2 + units, *g2 = g1 + units, *g3 = g2 + units,
+    *partials = g3 + n * shape.output;
+  mlp(device, shape, input, n, params, workspace, g3);
+  for_each(device, n * shape.output,
+           [=] __device__(std::int64_t i) { g3[i] = grad[i] * activation_slope(shape.activation, g3[i]); });
+  layer_backward(device, n, g3, shape.output, p.w3, shape.hidden, h2, g2);
+  layer_backward(device, n, g2, shape.hidden, p.w2, shape.hidden, h1, g1);
+  if (grad_input) {
+    layer_backward(device, n, g1, shape.hidden, p.w1, shape.input, static_cast<const T*>(nullptr), grad_input);
+  }
+  if (!grad_params) return;
+  const Parameters<T> partial(shape, partials);
+  layer_weight_gradients(device, n, g1, shape.hidden, input, shape.input, num_params, partial.w1, partial.b1);
+  layer_weight_gradients(device, n, g2, shape.hidden, h1, shape.hidden, num_params, partial.w2, partial.b2);
+  layer_weight_gradients(device, n, g3, shape.output, h2, shape.hidden, num_params, partial.w3, partial.b3);
+  const std::int64_t chunks = chunk_count(n, gradient_chunk(n));
+  for_each(device, num_params, [=] __device__(std::int64_t i) {
+    T sum = 0;
+    for (std::int64_t c = 0; c < chunks; ++c) sum += partials[c * num_params + i];
+    grad_params[i] = sum;
+  });
+}
+
+#define SPS_INSTANTIATE_DECODERS(T)                                                            \
+  template void mlp<Cuda, T>(Cuda, const MlpShape&, const T*, std::int64_t, const T*, T*, T*); \
+  template void mlp_backward<Cuda, T>(Cuda, const MlpShape&, const T*, const T*, std::int64_t, const T*, T*, T*, T*);
+SPS_INSTANTIATE_DECODERS(float)
+SPS_INSTANTIATE_DECODERS(double)
+
+}  // namespace spslam
