@@ -178,15 +178,23 @@ def test_the_kitchen():
 
 def test_reading_costs_little_more_than_decoding():
     dataset = open_seven_scenes(shared_data("7scenes-redkitchen"))
-    ours, decoding = [], []
-    for index in range(40):
-        paths = dataset.frames[index]
-        started = time.perf_counter()
-        cv2.imread(str(paths.color))
-        cv2.imread(str(paths.depth), cv2.IMREAD_UNCHANGED)
-        decoded = time.perf_counter()
-        dataset[index]
-        ours.append(time.perf_counter() - decoded)
-        decoding.append(decoded - started)
-    # About 0.6 ms on an idle machine; three times that leaves room for a busy one.
-    assert statistics.median(a - b for a, b in zip(ours, decoding, strict=True)) < 0.002
+
+    def decode(index):
+        cv2.imread(str(dataset.frames[index].color))
+        cv2.imread(str(dataset.frames[index].depth), cv2.IMREAD_UNCHANGED)
+
+    def least_seconds(function, index):
+        # Time of this thread alone and the best of five, because other processes share the machine.
+        seconds = []
+        for _ in range(5):
+            started = time.thread_time()
+            function(index)
+            seconds.append(time.thread_time() - started)
+        return min(seconds)
+
+    ours, decoding = (
+        statistics.median(least_seconds(function, i) for i in range(0, 50, 5))
+        for function in (dataset.__getitem__, decode)
+    )
+    # Some 0.6 ms more than 4.6 ms, most of it for fresh memory; as a ratio, because both grow on a busy machine.
+    assert ours < 1.5 * decoding
