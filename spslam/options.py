@@ -51,10 +51,10 @@ class DatasetOptions(Section):
         "synthetic_rgbd: the noisy depth or the exact one; null is the noisy one where it is there"
     )
     depth_scale: float | None = _option("folder: depth units a metre; null is what the files say", "1/m", gt=0)
-    frames: int = _option("generated: length of the sequence", "frames", ge=2)
+    frames: int = _option("generated: length of the sequence; 300 go round the room once", "frames", ge=1)
     width: int = _option("generated: width of the images", "px", ge=16)
     height: int = _option("generated: height of the images", "px", ge=16)
-    noise: bool = _text("generated: depth with a Kinect's noise and holes instead of exact depth")
+    noise: float = _option("generated: 0 is exact depth and clean colour, 1 the noise and holes of a Kinect", ge=0)
     seed: int = _option("generated: seed of the room, the path and the noise", ge=0)
 
     def check(self) -> None:

@@ -1,0 +1,1 @@
+"""The ``spslam`` command: the only part that prints, parses arguments or exits."""

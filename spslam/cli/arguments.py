@@ -1,0 +1,97 @@
+"""Arguments that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from spslam.errors import OutputError
+from spslam.options import PRESETS
+
+_FRAMES = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
+
+
+def parse_frames(text: str) -> slice:
+    """``START:STOP[:STEP]`` as a slice; each of the first two may be left out, negative ones count from the end."""
+    match = _FRAMES.fullmatch(text)
+    try:
+        start, stop, step = (int(part) if part else None for part in match.groups()) if match else (None, None, 0)
+    except ValueError:  # a lone minus sign
+        step = 0
+    if step == 0:
+        raise argparse.ArgumentTypeError(f"must be START:STOP[:STEP] with STEP at least 1, got {text!r}")
+    if start is not None and stop is not None and (start < 0) == (stop < 0) and stop <= start:
+        raise argparse.ArgumentTypeError(f"must select at least one frame, got {text!r}")
+    return slice(start, stop, step)
+
+
+def at_least_one(text: str) -> int:
+    """A whole number from 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def positive_metres(text: str) -> float:
+    """A length above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be a length in metres above 0, got {text!r}")
+    return value
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """CONFIG and what changes it."""
+    parser.add_argument("config", metavar="CONFIG", help="a configuration file, or the name of a shipped one: 7scenes")
+    parser.add_argument("--data", metavar="DIR", type=Path, help="folder of the data")
+    parser.add_argument(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        dest="changes",
+        action="append",
+        default=[],
+        help="change an option; may be given several times",
+    )
+
+
+def add_preset(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--preset", choices=PRESETS, help="paper, balanced (the default) or fast")
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", metavar="auto|cpu|cuda", help="where to run; auto takes the GPU if there is one")
+
+
+def add_quiet(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+
+def add_run_folder(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("output", metavar="OUTPUT", type=Path, help="output folder of a finished run")
+
+
+def overrides(args: argparse.Namespace) -> list[str | tuple[str, Any]]:
+    """What the command line changes in the configuration; options of their own win over ``--set``."""
+    changes: list[str | tuple[str, Any]] = list(getattr(args, "changes", []))
+    for option in ("device", "seed"):
+        if getattr(args, option, None) is not None:
+            changes.append((option, getattr(args, option)))
+    if getattr(args, "data", None) is not None:
+        changes.append(("dataset.path", str(args.data.resolve())))
+    return changes
+
+
+def require_run_file(output: Path, name: str) -> Path:
+    """A file of a run's output folder; raises OutputError where there is none."""
+    if not output.exists():
+        raise OutputError(f"{output}: no such folder")
+    if not output.is_dir():
+        raise OutputError(f"{output}: must be the output folder of a run, got a file")
+    if not (output / name).is_file():
+        raise OutputError(f"{output}: must be the output folder of a finished run, but has no {name}")
+    return output / name

@@ -1,0 +1,60 @@
+"""``spslam check-data``: what is in a data set, and what looks wrong with it."""
+
+from __future__ import annotations
+
+import argparse
+
+from spslam.cli.arguments import add_config, overrides
+from spslam.config import load_config
+from spslam.datasets.inspection import Inspection
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_config(parser)
+
+
+def execute(args: argparse.Namespace) -> None:
+    from spslam.datasets import open_dataset
+    from spslam.datasets.inspection import inspect_dataset
+
+    config = load_config(args.config, None, overrides(args))
+    found = inspect_dataset(open_dataset(config.dataset))
+    for name, text in _rows(found):
+        print(f"{name:<14}{text}")
+    for problem in found.problems:
+        print(f"! {problem}")
+    if not found.problems:
+        print("nothing looks wrong")
+
+
+def _rows(found: Inspection) -> list[tuple[str, str]]:
+    camera = found.camera
+    rows = [
+        ("data", found.name),
+        ("frames", f"{found.frames}, {found.frames_per_second:.1f} a second; depth of {found.frames_read} looked at"),
+        ("size", f"{camera.width}x{camera.height} px"),
+        ("intrinsics", f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f} px"),
+    ]
+    if found.depth is not None:
+        depth = found.depth
+        rows.append(("depth", f"{depth.near_m:.2f} to {depth.far_m:.2f} m (1 to 99 %), median {depth.median_m:.2f} m"))
+        rows.append(("holes", f"{depth.holes:.1%} of the pixels, {depth.most_holes:.1%} in the worst frame"))
+    return [*rows, *_pose_rows(found)]
+
+
+def _pose_rows(found: Inspection) -> list[tuple[str, str]]:
+    poses = found.poses
+    if poses is None:
+        return [("true poses", "none")]
+    rows = [
+        ("true poses", f"{poses.count} of {found.frames}"),
+        (
+            "motion",
+            f"median {poses.step_cm:.2f} cm and {poses.step_deg:.2f} deg a frame, "
+            f"at most {poses.max_step_cm:.1f} cm and {poses.max_step_deg:.1f} deg",
+        ),
+    ]
+    if poses.agreement is not None:
+        text = f"depth carried between views by the true poses agrees to {poses.agreement.median_cm:.2f} cm (median)"
+        rows.append(("poses, depth", text))
+    return rows

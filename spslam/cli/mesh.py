@@ -1,0 +1,31 @@
+"""``spslam mesh``: a mesh from the map of a finished run."""
+
+from __future__ import annotations
+
+import argparse
+
+from spslam.cli.arguments import add_quiet, add_run_folder, positive_metres, require_run_file
+from spslam.config import load_config
+
+FORMATS = ("ply", "glb", "obj")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_folder(parser)
+    parser.add_argument("--resolution", metavar="M", type=positive_metres, help="edge of a cell in metres")
+    parser.add_argument("--format", choices=FORMATS, default="ply", help="file format, ply if not given")
+    add_quiet(parser)
+
+
+def execute(args: argparse.Namespace) -> None:
+    map_file = require_run_file(args.output, "map.safetensors")
+    resolution = args.resolution or load_config(require_run_file(args.output, "config.yaml")).mesh.resolution_m
+
+    from spslam.meshing import extract_mesh, save_mesh
+    from spslam.scene import Scene
+
+    mesh = extract_mesh(Scene.load(map_file), resolution)
+    path = args.output / f"mesh.{args.format}"
+    save_mesh(mesh, path)
+    if not args.quiet:
+        print(f"{path}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")

@@ -1,0 +1,119 @@
+"""What a run shows while it goes on, and the table at its end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+SECONDS_BETWEEN_LINES = 5.0
+
+
+def make_progress(quiet: bool) -> Callable[[int, int, Any], None] | None:
+    """A callback for ``run_sequence``: a bar on a terminal, a line every few seconds elsewhere, None if quiet."""
+    if quiet:
+        return None
+    return ProgressBar() if sys.stderr.isatty() else ProgressLines()
+
+
+class ProgressBar:
+    """Frames done, frames a second, the map's loss and whether the camera is lost, on one line of a terminal."""
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+
+    def __call__(self, done: int, total: int, report: Any) -> None:
+        if self._bar is None:
+            from tqdm import tqdm
+
+            bar = (
+                "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
+            )
+            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", file=sys.stderr, bar_format=bar)
+        self._bar.set_postfix_str(describe(report), refresh=False)
+        self._bar.update(done - self._bar.n)
+        if done == total:
+            self._bar.close()
+
+
+class ProgressLines:
+    """The same as plain lines, one every few seconds and one at the end."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+        self._rate = Rate()
+
+    def __call__(self, done: int, total: int, report: Any) -> None:
+        self._rate.count()
+        now = time.monotonic()
+        if done < total and now - self._last < SECONDS_BETWEEN_LINES:
+            return
+        self._last = now
+        print(
+            f"{done}/{total} frames, {self._rate.fps():.1f} frames/s, {describe(report)}", file=sys.stderr, flush=True
+        )
+
+
+class Rate:
+    """Frames a second since the first one counted."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._frames = 0
+
+    def count(self) -> None:
+        self._frames += 1
+
+    def fps(self) -> float:
+        return self._frames / max(time.monotonic() - self._started, 1e-9)
+
+
+def describe(report: Any) -> str:
+    """A frame in a few words: ok, lost or skipped, and the map's loss where it was just optimised."""
+    if report is None:
+        return "unreadable frame skipped"
+    parts = ["LOST" if report.lost else "ok"]
+    if report.residual_cm is not None:
+        parts.append(f"{report.residual_cm:.2f} cm off")
+    if report.loss is not None:
+        parts.append(f"loss {report.loss:.3f}")
+    return ", ".join(parts)
+
+
+def print_summary(metrics: Mapping[str, Any], output: Path) -> None:
+    """The figures that matter, and where the rest is."""
+    for name, value in summarize(metrics, output):
+        print(f"{name:<14}{value}")
+
+
+def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]:
+    """Rows of the table at the end of a run; figures that weren't measured are left out."""
+    rows = [("frames", _frames(metrics))]
+    for name, key, form in (
+        ("speed", "fps", "{:.1f} frames/s"),
+        ("ATE RMSE", "ate_rmse_cm", "{:.2f} cm"),
+        ("RPE", "rpe_cm", "{:.2f} cm a frame"),
+        ("accuracy", "accuracy_cm", "{:.2f} cm"),
+        ("completeness", "completeness_cm", "{:.2f} cm"),
+        ("F1 at 5 cm", "f1_5cm", "{:.1f} %"),
+        ("F1 at 1 cm", "f1_1cm", "{:.1f} %"),
+        ("memory", "peak_rss_mb", "{:.0f} MB"),
+        ("GPU memory", "peak_gpu_mb", "{:.0f} MB"),
+    ):
+        if metrics.get(key) is not None:
+            rows.append((name, form.format(metrics[key])))
+    for name in ("trajectory.txt", "mesh.ply", "report.html"):
+        if (output / name).is_file():
+            rows.append((name.partition(".")[0], str(output / name)))
+    return rows
+
+
+def _frames(metrics: Mapping[str, Any]) -> str:
+    details = [
+        f"{metrics[key]} {word}"
+        for key, word in (("lost_frames", "lost"), ("skipped_frames", "skipped"))
+        if metrics.get(key)
+    ]
+    return f"{metrics.get('frames', 0)}" + (f" ({', '.join(details)})" if details else "")

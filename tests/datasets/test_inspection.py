@@ -1,0 +1,137 @@
+"""The look through a data set: an analytic room whose data is then spoilt in the ways that happen."""
+
+import numpy as np
+import pytest
+
+from spslam.camera import Camera
+from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.inspection import inspect_dataset
+from spslam.errors import DatasetError
+from spslam.geometry import inverse, pose_from
+
+CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
+HALF_SIZE = np.array([3.0, 2.0, 2.5])
+
+
+class BoxRoom(RgbdDataset):
+    """A walk through an empty box, depth exact; attributes can be replaced to spoil it."""
+
+    name = "box"
+    camera = CAMERA
+
+    def __init__(self, frames=40):
+        self.true_poses = np.stack([walk(i / frames) for i in range(frames)])
+        self.given_poses = self.true_poses.copy()
+        self.times = np.arange(frames) / 30
+        self.scale = 1.0
+        self.holes = 0
+        self.broken = ()
+
+    def __len__(self):
+        return len(self.true_poses)
+
+    def timestamps(self):
+        return self.times
+
+    def poses(self):
+        return self.given_poses
+
+    def read(self, index):
+        if index in self.broken:
+            raise DatasetError(f"frame {index} is broken")
+        depth = self.scale * cast(self.true_poses[index])
+        depth[: self.holes] = 0
+        color = np.zeros((*depth.shape, 3), np.uint8)
+        return RgbdFrame(index, self.times[index], color, depth.astype(np.float32))
+
+
+def walk(fraction):
+    angle = 1.5 * fraction
+    c, s = np.cos(angle), np.sin(angle)
+    tilt = 0.3 * np.sin(5 * fraction)
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    nod = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    return pose_from(turn @ nod, np.array([2.0 * fraction - 0.7, 0.4 * np.sin(3 * fraction), 0.8 * fraction]))
+
+
+def cast(pose):
+    directions = CAMERA.ray_directions().astype(np.float64) @ pose[:3, :3].T
+    with np.errstate(divide="ignore"):
+        walls = (np.sign(directions) * HALF_SIZE - pose[:3, 3]) / directions
+    return np.min(np.where(directions != 0, walls, np.inf), axis=-1)
+
+
+def test_sound_data_has_no_problem():
+    found = inspect_dataset(BoxRoom())
+    assert found.problems == []
+    assert (found.frames, found.frames_read, found.camera) == (40, 40, CAMERA)
+    assert found.frames_per_second == pytest.approx(30)
+    assert found.poses.count == 40
+    assert found.poses.agreement.median_cm < 3
+    assert found.depth.holes == 0
+    assert 0 < found.depth.near_m < found.depth.median_m < found.depth.far_m < 8
+
+
+SPOILERS = {
+    "world-to-camera; camera": inverse,
+    "OpenGL axes (y up": lambda poses: poses @ np.diag([1.0, -1, -1, 1]),
+    "world-to-camera in OpenGL": lambda poses: inverse(poses @ np.diag([1.0, -1, -1, 1])),
+    "sorted as text": lambda poses: poses[sorted(range(len(poses)), key=str)],
+}
+
+
+@pytest.mark.parametrize("words", SPOILERS)
+def test_wrong_poses_are_explained(words):
+    room = BoxRoom()
+    room.given_poses = SPOILERS[words](room.true_poses)
+    assert any(words in problem for problem in inspect_dataset(room).problems)
+
+
+@pytest.mark.parametrize(("scale", "fix"), [(5, 0.2), (0.2, 5), (10, 0.1), (0.1, 10)])
+def test_wrong_depth_scale_is_named(scale, fix):
+    room = BoxRoom()
+    room.scale = scale
+    assert any(f"depths {fix:g} times as large would fit" in problem for problem in inspect_dataset(room).problems)
+
+
+def test_implausible_depth_is_reported_without_poses():
+    room = BoxRoom()
+    room.scale, room.given_poses = 1000, None
+    found = inspect_dataset(room)
+    assert found.poses is None
+    assert len(found.problems) == 1
+    assert "the depth scale looks wrong" in found.problems[0]
+
+
+def test_holes_and_missing_poses_and_broken_frames_are_reported():
+    room = BoxRoom()
+    room.holes, room.broken = 30, (3,)
+    room.given_poses[5:9] = np.nan
+    problems = inspect_dataset(room).problems
+    assert problems == [
+        "unreadable: frame 3 is broken",
+        "62% of the pixels have no depth",
+        "4 of 40 frames have no true pose",
+    ]
+
+
+def test_no_depth_at_all_is_reported():
+    room = BoxRoom()
+    room.holes = 48
+    found = inspect_dataset(room)
+    assert found.depth is None
+    assert "no depth at all in the frames looked at" in found.problems
+
+
+def test_jumps_and_gaps_are_reported():
+    room = BoxRoom()
+    room.given_poses = None
+    room.times[20:] += 3
+    assert inspect_dataset(room).problems == ["1 gaps in time, the longest 3.03 s after frame 19"]
+    room = BoxRoom()
+    room.given_poses[20:, 0, 3] += 1
+    assert any("1 jumps over 30 cm or 20 deg after frame 19" in problem for problem in inspect_dataset(room).problems)
+
+
+def test_one_frame_is_enough_to_look_at():
+    assert inspect_dataset(BoxRoom(1)).problems == ["only one frame"]
