@@ -1,0 +1,88 @@
+#include "spslam/gauss_newton.h"
+
+#include "bindings/scene.h"
+
+namespace spslam::bindings {
+namespace {
+
+Intrinsics load_intrinsics(const std::vector<double>& intrinsics) {
+  STD_TORCH_CHECK(intrinsics.size() == 4, "spslam: intrinsics must be fx, fy, cx, cy");
+  return {static_cast<float>(intrinsics[0]), static_cast<float>(intrinsics[1]), static_cast<float>(intrinsics[2]),
+          static_cast<float>(intrinsics[3])};
+}
+
+std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> tensors, std::vector<double> scalars,
+                                                      std::vector<std::int64_t> layout, Tensor pixels, Tensor pose,
+                                                      std::vector<double> intrinsics, std::int64_t num_pixels,
+                                                      std::int64_t iterations, double truncation, double kernel_start,
+                                                      double kernel_end, double damping, std::int64_t seed,
+                                                      std::int64_t stream, std::int64_t frame) {
+  STD_TORCH_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
+                  "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
+  STD_TORCH_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
+  STD_TORCH_CHECK(num_pixels >= 1 && iterations >= 1, "track_gauss_newton: num_pixels and iterations must be >= 1");
+  DeviceScope scope(pixels);
+  const SceneArgument scene(tensors, scalars, layout);
+  pixels = torch::stable::contiguous(pixels);
+  Tensor result = torch::stable::clone(torch::stable::contiguous(pose));
+  Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
+  Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
+  Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, 1, num_pixels)}, ScalarType::Byte);
+  const TrackingOptions options{load_intrinsics(intrinsics),
+                                num_pixels,
+                                iterations,
+                                static_cast<float>(truncation),
+                                static_cast<float>(kernel_start),
+                                static_cast<float>(kernel_end),
+                                damping,
+                                philox_key(seed, stream, frame, 0)};
+  spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
+                             workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
+                             mutable_data<float>(hessian));
+  return {result, stats, hessian};
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor> tensors, std::vector<double> scalars,
+                                                              std::vector<std::int64_t> layout, Tensor pixels,
+                                                              Tensor poses, std::vector<double> intrinsics,
+                                                              double truncation, double kernel) {
+  STD_TORCH_CHECK(pixels.dim() == 3 && pixels.size(2) == 3, "gauss_newton_poses: pixels must have shape [F, N, 3]");
+  STD_TORCH_CHECK(poses.dim() == 2 && poses.size(0) == pixels.size(0) && poses.size(1) == kPoseSize,
+                  "gauss_newton_poses: poses must have shape [F, 7]");
+  DeviceScope scope(pixels);
+  const SceneArgument scene(tensors, scalars, layout);
+  pixels = torch::stable::contiguous(pixels);
+  poses = torch::stable::contiguous(poses);
+  const std::int64_t frames = pixels.size(0), count = pixels.size(1);
+  Tensor hessian = empty(poses, {frames, 6, 6}, ScalarType::Float);
+  Tensor gradient = empty(poses, {frames, 6}, ScalarType::Float);
+  Tensor cost = empty(poses, {frames}, ScalarType::Float);
+  Tensor inliers = empty(poses, {frames}, ScalarType::Float);
+  Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, frames, count)}, ScalarType::Byte);
+  spslam::gauss_newton_poses(scope.context, scene.view, data<std::int32_t>(pixels), data<float>(poses), frames, count,
+                             load_intrinsics(intrinsics), static_cast<float>(truncation), static_cast<float>(kernel),
+                             workspace.mutable_data_ptr(), mutable_data<float>(hessian), mutable_data<float>(gradient),
+                             mutable_data<float>(cost), mutable_data<float>(inliers));
+  return {hessian, gradient, cost, inliers};
+}
+
+}  // namespace
+
+#ifndef SPS_CUDA
+STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
+        ", Tensor pixels, Tensor pose, float[] intrinsics, int num_pixels, int iterations, float truncation, "
+        "float kernel_start, float kernel_end, float damping, int seed, int stream, int frame) "
+        "-> (Tensor, Tensor, Tensor)");
+  m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
+        ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
+        "-> (Tensor, Tensor, Tensor, Tensor)");
+}
+#endif
+
+SPS_LIBRARY_IMPL(m) {
+  m.impl("track_gauss_newton", TORCH_BOX(&track_gauss_newton));
+  m.impl("gauss_newton_poses", TORCH_BOX(&gauss_newton_poses));
+}
+
+}  // namespace spslam::bindings

@@ -1,0 +1,113 @@
+#include "spslam/gauss_newton.h"
+
+#include "core/parallel.h"
+#include "cpu/scene_tile.h"
+#include "kernels/gauss_newton.h"
+
+namespace spslam {
+namespace {
+
+// Pixels summed by one worker before its sums are added to the others', in order.
+constexpr std::int64_t kPixelGrain = 2 * kTileRows;
+
+// Sums over pixels [begin, end), whose records `record(i)` gives.
+template <class Record>
+void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intrinsics& camera, const Pose<float>& pose,
+                float truncation, float kernel, std::int64_t begin, std::int64_t end, const Record& record,
+                double* terms) {
+  GeometryTile tile(net);
+  Vec3<float> offsets[kTileRows], gradients[kTileRows];
+  float sdf[kTileRows];
+  const float inverse_voxel = 1.0f / scene.voxel_size;
+  const auto flush = [&] {
+    tile.decode(sdf);
+    tile.position_gradient(scene, gradients);
+    for (std::int64_t i = 0; i < tile.size(); ++i) {
+      if (!is_tracking_inlier(1.0f, true, sdf[i])) continue;
+      add_tracking_residual(offsets[i], sdf[i], gradients[i], truncation, kernel, terms);
+    }
+    tile.clear();
+  };
+  for (std::int64_t i = begin; i < end; ++i) {
+    const Pixel pixel = unpack_pixel(record(i));
+    if (!(pixel.depth > 0.0f)) continue;
+    const SurfacePoint point = surface_point(pixel, pose, camera.fx, camera.fy, camera.cx, camera.cy);
+    const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
+    if (!cell.corner_ids) continue;
+    offsets[tile.size()] = point.offset;
+    tile.add(scene, point.world, cell);
+    if (tile.full()) flush();
+  }
+  if (tile.size()) flush();
+}
+
+// terms[kTrackingTerms] = sums over all n pixels, chunk by chunk in order, whatever the number of threads.
+template <class Record>
+void sum_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intrinsics& camera, const Pose<float>& pose,
+                float truncation, float kernel, std::int64_t n, const Record& record, double* partials, double* terms) {
+  parallel_chunks(n, kPixelGrain, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {
+    double* own = partials + chunk * kTrackingTerms;
+    for (int t = 0; t < kTrackingTerms; ++t) own[t] = 0.0;
+    add_pixels(scene, net, camera, pose, truncation, kernel, begin, end, record, own);
+  });
+  for (int t = 0; t < kTrackingTerms; ++t) terms[t] = 0.0;
+  for (std::int64_t chunk = 0; chunk < chunk_count(n, kPixelGrain); ++chunk) {
+    for (int t = 0; t < kTrackingTerms; ++t) terms[t] += partials[chunk * kTrackingTerms + t];
+  }
+}
+
+}  // namespace
+
+template <>
+std::int64_t gauss_newton_workspace_size<Cpu>(Cpu, std::int64_t frames, std::int64_t pixels) {
+  const std::int64_t chunks = chunk_count(pixels, kPixelGrain);
+  return (frames > 0 ? frames : 1) * (chunks > 0 ? chunks : 1) * kTrackingTerms *
+         static_cast<std::int64_t>(sizeof(double));
+}
+
+template <>
+void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
+                             const TrackingOptions& options, void* workspace, float* pose, float* stats,
+                             float* hessian) {
+  const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
+  double terms[kTrackingTerms];
+  for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
+    PhiloxKey key = options.key;
+    key.iteration = static_cast<std::uint32_t>(iteration);
+    const auto record = [&](std::int64_t i) {
+      return pixels +
+             kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
+    };
+    const float kernel = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
+    sum_pixels(scene, net, options.intrinsics, load_pose(pose), options.truncation, kernel, options.num_pixels, record,
+               static_cast<double*>(workspace), terms);
+    tracking_step(terms, options.damping, options.num_pixels, pose, stats + kTrackingStatSize * iteration, hessian);
+  }
+}
+
+template <>
+void gauss_newton_poses<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pixels, const float* poses,
+                             std::int64_t frames, std::int64_t pixels_per_frame, const Intrinsics& intrinsics,
+                             float truncation, float kernel, void* workspace, float* hessian, float* gradient,
+                             float* cost, float* inliers) {
+  const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
+  double* partials = static_cast<double*>(workspace);
+  // Frames run side by side; within one, the loop over its pixels is nested and so runs in place.
+  const std::int64_t share = chunk_count(pixels_per_frame, kPixelGrain) * kTrackingTerms;
+  parallel_for(frames, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t f = begin; f < end; ++f) {
+      const auto record = [&](std::int64_t i) { return pixels + kPixelWords * (f * pixels_per_frame + i); };
+      double terms[kTrackingTerms], total;
+      sum_pixels(scene, net, intrinsics, load_pose(poses + kPoseSize * f), truncation, kernel, pixels_per_frame, record,
+                 partials + f * share, terms);
+      double h[36], g[6];
+      store_normal_terms<double>(terms, h, g, &total);
+      for (int i = 0; i < 36; ++i) hessian[36 * f + i] = static_cast<float>(h[i]);
+      for (int i = 0; i < 6; ++i) gradient[6 * f + i] = static_cast<float>(g[i]);
+      cost[f] = static_cast<float>(tracking_cost(terms));
+      inliers[f] = pixels_per_frame ? static_cast<float>(terms[kNormalTerms + 1] / double(pixels_per_frame)) : 0.0f;
+    }
+  });
+}
+
+}  // namespace spslam

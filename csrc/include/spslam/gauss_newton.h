@@ -1,0 +1,42 @@
+// Camera poses by Gauss-Newton on the SDF at back-projected surface points, the scene frozen.
+#pragma once
+
+#include <cstdint>
+
+#include "core/device.h"
+#include "core/philox.h"
+#include "spslam/scene_view.h"
+
+namespace spslam {
+
+constexpr int kPoseSize = 7;          // unit quaternion (w, x, y, z), translation (m)
+constexpr int kTrackingStatSize = 4;  // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad)
+
+struct TrackingOptions {
+  Intrinsics intrinsics;
+  std::int64_t num_pixels, iterations;
+  float truncation;                // m
+  float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
+  double damping;
+  PhiloxKey key;  // its iteration is replaced by the running one
+};
+
+// Bytes of scratch for the launches below.
+template <class Device>
+std::int64_t gauss_newton_workspace_size(Device device, std::int64_t frames, std::int64_t pixels);
+
+// One frame. pixels [num_records, 3] are drawn from anew in each iteration; pose [7] is read and overwritten; stats
+// [iterations, 4]; hessian [36] of the last iteration, before damping.
+template <class Device>
+void track_gauss_newton(Device device, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
+                        const TrackingOptions& options, void* workspace, float* pose, float* stats, float* hessian);
+
+// Normal equations of F frames with N pixels each: pixels [F, N, 3], poses [F, 7]; hessian [F, 36], gradient [F, 6],
+// cost [F] (weighted mean squared residual, m^2), inliers [F] (share of the pixels).
+template <class Device>
+void gauss_newton_poses(Device device, const SceneView& scene, const std::int32_t* pixels, const float* poses,
+                        std::int64_t frames, std::int64_t pixels_per_frame, const Intrinsics& intrinsics,
+                        float truncation, float kernel, void* workspace, float* hessian, float* gradient, float* cost,
+                        float* inliers);
+
+}  // namespace spslam

@@ -1,0 +1,44 @@
+// A pixel of the pixel database, packed into three 32-bit words.
+//
+// u | v << 16; the bits of the float32 depth (m); r | g << 8 | b << 16 | c << 24, where c is 128 times the
+// foreshortening n . d of the surface normal n and the ray direction d with camera z = 1, 0 where unknown.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#include "core/macros.h"
+#include "core/vec.h"
+
+namespace spslam {
+
+constexpr int kPixelWords = 3;
+constexpr float kForeshorteningStep = 1.0f / 128.0f;
+// Grazing surfaces: below this the normal is too uncertain to scale a distance by.
+constexpr float kMinForeshortening = 0.15f;
+
+struct Pixel {
+  float u, v;            // px
+  float depth;           // m, 0 where invalid
+  float color[3];        // in [0, 1]
+  float foreshortening;  // 1 where unknown
+};
+
+SPS_INLINE Pixel unpack_pixel(const std::int32_t* words) {
+  const std::uint32_t uv = static_cast<std::uint32_t>(words[0]), rgbc = static_cast<std::uint32_t>(words[2]);
+  Pixel pixel;
+  pixel.u = static_cast<float>(uv & 0xFFFFu);
+  pixel.v = static_cast<float>(uv >> 16);
+  memcpy(&pixel.depth, words + 1, sizeof(float));
+  for (int k = 0; k < 3; ++k) pixel.color[k] = static_cast<float>((rgbc >> (8 * k)) & 0xFFu) * (1.0f / 255.0f);
+  const float c = static_cast<float>(rgbc >> 24) * kForeshorteningStep;
+  pixel.foreshortening = c == 0.0f ? 1.0f : (c < kMinForeshortening ? kMinForeshortening : c);
+  return pixel;
+}
+
+// Direction of a pixel's ray in camera axes, with z = 1, so that a sample's depth is its factor.
+SPS_INLINE Vec3<float> pixel_ray(const Pixel& pixel, float fx, float fy, float cx, float cy) {
+  return {(pixel.u - cx) / fx, (pixel.v - cy) / fy, 1.0f};
+}
+
+}  // namespace spslam

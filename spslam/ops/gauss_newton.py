@@ -1,0 +1,139 @@
+"""Camera poses by Gauss-Newton on the SDF at back-projected surface points. Not differentiable.
+
+A pixel of depth z is the world point x = R (z d) + t. Its residual is r = truncation * s(x), its weight
+1 / (1 + (r / k)^2)^2 (Geman-McClure's), and the increment (dt, domega) moves the camera by dt and turns it by
+exp(domega) about its centre, so that dr = truncation * grad s . (dt + domega x (x - t)).
+"""
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._checks import check, check_tensor
+from spslam.ops.scene_view import Intrinsics, SceneView
+
+
+def track_gauss_newton(
+    scene: SceneView,
+    pixels: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    *,
+    num_pixels: int,
+    iterations: int,
+    truncation: float,
+    kernel_start: float,
+    kernel_end: float,
+    damping: float,
+    seed: int,
+    stream: int,
+    frame: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Tracks one frame against a frozen scene; all iterations in one call.
+
+    Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the
+    step to a norm of 0.15. The kernel width k goes geometrically from `kernel_start` to `kernel_end`, which it reaches one
+    iteration before the last. Points outside the map, or where |s| >= 0.98, take no part.
+
+    Args:
+        scene: the map.
+        pixels: int32 [P, 3] packed pixel records of the frame, P >= 1 (see csrc/kernels/pixel_record.h).
+        pose: float32 [7] start, unit quaternion (w, x, y, z) and translation (m), T_world_camera.
+        intrinsics: of the camera.
+        num_pixels: drawn in each iteration, with replacement.
+        iterations: how many.
+        truncation: of the scene's SDF, m.
+        kernel_start: first width k of the robust kernel, m.
+        kernel_end: last width, m.
+        damping: relative Levenberg damping.
+        seed, stream, frame: keys of the draws, see `philox_uniform`.
+
+    Returns:
+        float32 [7] pose; float32 [iterations, 4] with the weighted mean squared residual (m^2), the share of pixels on
+        mapped surface, and the norms of the step in translation (m) and rotation (rad); float32 [6, 6] H of the last
+        iteration. The same to the bit for any number of threads.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+    """
+    name = "track_gauss_newton"
+    scene.check(name)
+    check_tensor(name, "pixels", pixels, ("P", 3), torch.int32, like=scene.embeddings)
+    check(len(pixels) > 0, name, "pixels", "have at least one row", 0)
+    check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
+    check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
+    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
+    check(truncation > 0, name, "truncation", "be positive", truncation)
+    check(
+        kernel_start > 0 and kernel_end > 0,
+        name,
+        "kernel_start and kernel_end",
+        "be positive",
+        (kernel_start, kernel_end),
+    )
+    check(damping >= 0, name, "damping", "be at least 0", damping)
+    return torch.ops.spslam.track_gauss_newton(
+        *scene.arguments(),
+        pixels,
+        pose,
+        list(intrinsics),
+        num_pixels,
+        iterations,
+        truncation,
+        kernel_start,
+        kernel_end,
+        damping,
+        seed,
+        stream,
+        frame,
+    )
+
+
+def gauss_newton_poses(
+    scene: SceneView,
+    pixels: torch.Tensor,
+    poses: torch.Tensor,
+    intrinsics: Intrinsics,
+    *,
+    truncation: float,
+    kernel: float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Normal equations of many frames' poses against a frozen scene, all given pixels used.
+
+    Args:
+        scene: the map.
+        pixels: int32 [F, N, 3] packed pixel records.
+        poses: float32 [F, 7].
+        intrinsics: of the camera.
+        truncation: of the scene's SDF, m.
+        kernel: width k of the robust kernel, m.
+
+    Returns:
+        H float32 [F, 6, 6], gradient float32 [F, 6], weighted mean squared residual float32 [F] (m^2), share of pixels on
+        mapped surface float32 [F]. F = 0 or N = 0 gives empty tensors or zeros.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+    """
+    name = "gauss_newton_poses"
+    scene.check(name)
+    check_tensor(name, "pixels", pixels, ("F", "N", 3), torch.int32, like=scene.embeddings)
+    check_tensor(name, "poses", poses, (len(pixels), 7), torch.float32, like=scene.embeddings)
+    check(truncation > 0, name, "truncation", "be positive", truncation)
+    check(kernel > 0, name, "kernel", "be positive", kernel)
+    return torch.ops.spslam.gauss_newton_poses(*scene.arguments(), pixels, poses, list(intrinsics), truncation, kernel)
+
+
+@torch.library.register_fake("spslam::track_gauss_newton")
+def _(scene, scene_scalars, plane_layout, pixels, pose, intrinsics, num_pixels, iterations, *_):
+    return pose.new_empty(7), pose.new_empty((iterations, 4)), pose.new_empty((6, 6))
+
+
+@torch.library.register_fake("spslam::gauss_newton_poses")
+def _(scene, scene_scalars, plane_layout, pixels, poses, *_):
+    frames = poses.shape[0]
+    return (
+        poses.new_empty((frames, 6, 6)),
+        poses.new_empty((frames, 6)),
+        poses.new_empty(frames),
+        poses.new_empty(frames),
+    )

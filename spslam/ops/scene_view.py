@@ -1,0 +1,91 @@
+"""The scene as the fused ops take it: the tensors of a map, its sizes, and where its planes lie."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+
+from spslam.ops._checks import check, check_tensor
+
+GEOMETRY_PARAMS = 32 * 12 + 32 * 33 + 33  # of the 11 -> 32 -> 32 -> 1 decoder
+COLOR_PARAMS = 32 * 33 + 32 * 33 + 3 * 33  # of the 32 -> 32 -> 32 -> 3 decoder
+
+
+class Intrinsics(NamedTuple):
+    """A pinhole camera's focal lengths and principal point, px."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """A map with V vertices and P texels, all tensors on one device.
+
+    Attributes:
+        hash_keys: int64 [capacity] packed voxel coordinates, capacity a power of two.
+        hash_values: int32 [capacity] voxel ids.
+        corner_ids: int32 [V, 8] ids of the corners of the cell above each vertex, -1 where it is incomplete.
+        embeddings: float32 [V, 8].
+        geometry_params: float32 [1473] of the decoder (scaled position, embedding) -> SDF / truncation, tanh.
+        texels: float32 [P, 32] rows of the three feature planes.
+        color_params: float32 [2211] of the decoder tri-plane feature -> RGB, sigmoid.
+        voxel_size: m.
+        origin: world point (m) that positions entering the decoder are relative to.
+        position_scale: factor on them, 1/m.
+        plane_cell_size: m.
+        plane_layout: 15 ints, (row offset, origin u, origin v, size u, size v) of the xy, xz and yz planes.
+    """
+
+    hash_keys: torch.Tensor
+    hash_values: torch.Tensor
+    corner_ids: torch.Tensor
+    embeddings: torch.Tensor
+    geometry_params: torch.Tensor
+    texels: torch.Tensor
+    color_params: torch.Tensor
+    voxel_size: float
+    origin: Sequence[float]
+    position_scale: float
+    plane_cell_size: float
+    plane_layout: Sequence[int]
+
+    def check(self, function: str) -> None:
+        """Raises TypeError or ValueError, naming `function`, where a tensor does not fit."""
+        keys = self.hash_keys
+        check_tensor(function, "hash_keys", keys, ("capacity",), torch.int64)
+        capacity = len(keys)
+        check(
+            capacity > 0 and capacity & (capacity - 1) == 0,
+            function,
+            "hash_keys",
+            "have a power of two elements",
+            capacity,
+        )
+        check_tensor(function, "hash_values", self.hash_values, (capacity,), torch.int32, like=keys)
+        check_tensor(function, "embeddings", self.embeddings, ("V", 8), torch.float32, like=keys)
+        check_tensor(function, "corner_ids", self.corner_ids, (len(self.embeddings), 8), torch.int32, like=keys)
+        check_tensor(function, "geometry_params", self.geometry_params, (GEOMETRY_PARAMS,), torch.float32, like=keys)
+        check_tensor(function, "texels", self.texels, ("P", 32), torch.float32, like=keys)
+        check_tensor(function, "color_params", self.color_params, (COLOR_PARAMS,), torch.float32, like=keys)
+        check(self.voxel_size > 0, function, "voxel_size", "be positive", self.voxel_size)
+        check(self.plane_cell_size > 0, function, "plane_cell_size", "be positive", self.plane_cell_size)
+        check(len(self.origin) == 3, function, "origin", "have 3 numbers", len(self.origin))
+        check(len(self.plane_layout) == 15, function, "plane_layout", "have 15 numbers", len(self.plane_layout))
+
+    def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
+        """The three lists that the op schemas take."""
+        tensors = [
+            self.hash_keys,
+            self.hash_values,
+            self.corner_ids,
+            self.embeddings,
+            self.geometry_params,
+            self.texels,
+            self.color_params,
+        ]
+        scalars = [self.voxel_size, *self.origin, self.position_scale, self.plane_cell_size]
+        return tensors, scalars, list(self.plane_layout)

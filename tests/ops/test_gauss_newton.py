@@ -1,0 +1,147 @@
+"""Gauss-Newton tracking: normal equations against autograd, recovery of a known pose, determinism."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
+from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
+
+
+def _look_at_corner():
+    """A pose (float64 [4, 4]) from which all three walls of the corner fill the view."""
+    center = np.array([0.02, -0.1, 0.05])
+    forward = np.array([0.9, 0.5, 1.1]) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.2, 1.0, -0.1], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = center
+    return pose
+
+
+POSE = _look_at_corner()
+OPTIONS = dict(
+    num_pixels=1024, iterations=8, truncation=0.16, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=3, stream=1
+)
+
+
+def _pose7(matrix, device="cpu"):
+    return torch.from_numpy(matrix_to_pose7(matrix)).float().to(device)
+
+
+def _moved(matrix, shift, angle):
+    axis = np.array([0.3, -0.8, 0.52])
+    axis /= np.linalg.norm(axis)
+    quaternion = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+    moved = matrix.copy()
+    moved[:3, :3] = pose7_to_matrix(np.concatenate([quaternion, np.zeros(3)]))[:3, :3] @ matrix[:3, :3]
+    moved[:3, 3] += shift
+    return moved
+
+
+def _exp(omega):
+    x, y, z = omega
+    zero = torch.zeros((), dtype=omega.dtype)
+    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+
+
+def test_normal_equations_are_those_of_autograd(device, generator):
+    """H and g from the Jacobian that autograd finds through the SDF's own gradient."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    records = corner_pixels(POSE, generator, 400)
+    u, v = (records[:, 0] & 0xFFFF).double(), (records[:, 0] >> 16).double()
+    depth = records[:, 1].contiguous().view(torch.float32).double()
+    rays = torch.stack([(u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy, torch.ones(400)], 1)
+    local = rays * depth[:, None]
+    rotation, translation = torch.from_numpy(POSE[:3, :3]), torch.from_numpy(POSE[:3, 3])
+
+    def moved(increment):
+        return local @ (_exp(increment[3:]) @ rotation).T + translation + increment[:3]
+
+    zero = torch.zeros(6, dtype=torch.float64)
+    points_by_increment = torch.func.jacfwd(moved)(zero)
+    sdf, valid, gradient = (t.cpu() for t in ops.query_sdf_gradient(scene, moved(zero).float().to(device)))
+    jacobian = TRUNCATION * torch.einsum("ni,nij->nj", gradient.double(), points_by_increment)
+    residual = TRUNCATION * sdf.double()
+    weight = (1 / (1 + (residual / 0.03) ** 2)) ** 2 * valid * (sdf.abs() < 0.98)
+    h, g, cost, inliers = (
+        t.cpu()
+        for t in ops.gauss_newton_poses(
+            scene, records[None].to(device), _pose7(POSE, device)[None], INTRINSICS, truncation=TRUNCATION, kernel=0.03
+        )
+    )
+    want = torch.einsum("n,ni,nj->ij", weight, jacobian, jacobian)
+    # A point that rounding puts on the other side of a voxel's face has another gradient: allow the share of a few.
+    assert torch.allclose(h[0].double(), want, rtol=0, atol=2e-3 * want.abs().max())
+    want_g = torch.einsum("n,n,ni->i", weight, residual, jacobian)
+    assert torch.allclose(g[0].double(), want_g, rtol=0, atol=5e-3 * want_g.abs().max())
+    assert torch.isclose(cost[0].double(), (weight * residual**2).sum() / weight.sum(), rtol=1e-3)
+    assert torch.isclose(inliers[0].double(), (valid & (sdf.abs() < 0.98)).double().mean(), atol=0.01)
+
+
+@pytest.mark.parametrize("shift_m, angle_deg", [(0.0, 0.0), (0.02, 2.0), (0.04, 3.0)])
+def test_recovers_the_pose(device, generator, shift_m, angle_deg):
+    scene = make_scene(generator, random_decoder=False, device=device)
+    records = corner_pixels(POSE, generator).to(device)
+    start = _moved(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
+    pose, stats, hessian = ops.track_gauss_newton(scene, records, _pose7(start, device), INTRINSICS, **OPTIONS, frame=4)
+    found = pose7_to_matrix(pose.cpu().double().numpy())
+    assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 2e-3
+    assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.1
+    assert stats.shape == (8, 4) and float(stats[-1, 1]) > 0.8
+    assert torch.linalg.eigvalsh(hessian.cpu().double()).min() > 0
+
+
+def test_same_bits_for_any_number_of_threads(generator):
+    scene = make_scene(generator, random_decoder=False)
+    records = corner_pixels(POSE, generator)
+    start = _pose7(_moved(POSE, 0.01, 0.02))
+    results = []
+    threads = torch.ops.spslam.get_num_threads()
+    try:
+        for count in (1, 2, 3):
+            torch.ops.spslam.set_num_threads(count)
+            results.append(ops.track_gauss_newton(scene, records, start, INTRINSICS, **OPTIONS, frame=0))
+    finally:
+        torch.ops.spslam.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_outside_the_map_nothing_moves(device, generator):
+    scene = make_scene(generator, random_decoder=False, device=device)
+    far = POSE.copy()
+    far[:3, 3] += 50
+    records = corner_pixels(POSE, generator).to(device)
+    start = _pose7(far, device)
+    pose, stats, _ = ops.track_gauss_newton(scene, records, start, INTRINSICS, **OPTIONS, frame=0)
+    assert torch.allclose(pose, start, atol=1e-6)
+    assert bool((stats[:, 1] == 0).all())
+
+
+def test_no_frames(device, generator):
+    scene = make_scene(generator, random_decoder=False, device=device)
+    pixels, poses = torch.zeros(0, 5, 3, dtype=torch.int32, device=device), torch.zeros(0, 7, device=device)
+    h, g, cost, inliers = ops.gauss_newton_poses(scene, pixels, poses, INTRINSICS, truncation=0.08, kernel=0.02)
+    assert h.shape == (0, 6, 6) and g.shape == (0, 6) and cost.shape == inliers.shape == (0,)
+
+
+def test_arguments_are_named(generator):
+    scene = make_scene(generator, random_decoder=False)
+    records = corner_pixels(POSE, generator)
+    with pytest.raises(ValueError, match="track_gauss_newton: iterations must be at least 1, got 0"):
+        ops.track_gauss_newton(scene, records, _pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
+    with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):
+        ops.track_gauss_newton(scene, records[:0], _pose7(POSE), INTRINSICS, **OPTIONS, frame=0)
+
+
+def test_opcheck(generator):
+    scene = make_scene(generator, random_decoder=False)
+    records, pose = corner_pixels(POSE, generator, 50), _pose7(POSE)
+    arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4, 0, 1, 0)
+    torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, (*scene.arguments(), *arguments))
+    arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)
+    torch.library.opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments))
