@@ -1,0 +1,270 @@
+"""Pictures of a mesh: a z-buffer rasteriser in NumPy, for reports and for masks of what a camera sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.geometry import inverse
+
+NEAREST_M = 0.02
+# Fragments held at once; some 40 bytes each.
+_FRAGMENTS = 2_000_000
+_BACKGROUND = 255
+# Light from the camera, a little from above, on top of light from everywhere.
+_LIGHT = np.array([0.25, -0.5, -1.0]) / np.linalg.norm([0.25, -0.5, -1.0])
+_AMBIENT, _DIFFUSE = 0.55, 0.55
+
+
+@dataclass(frozen=True)
+class Raster:
+    """What each pixel shows.
+
+    Attributes
+    ----------
+    depth : float32 [H,W], metres along the optical axis; 0 where nothing is.
+    face_ids : int32 [H,W], -1 where nothing is.
+    """
+
+    depth: np.ndarray
+    face_ids: np.ndarray
+
+
+def render_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray | None,
+    camera: Camera,
+    T_world_camera: np.ndarray,
+    cull_back: bool = False,
+    supersampling: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A shaded picture of a mesh and its depth.
+
+    Parameters
+    ----------
+    vertices : [V,3], metres, world axes.
+    faces : integers [L,3].
+    colors : uint8 [V,3] RGB of the vertices; None is plain grey.
+    camera : whose view it is.
+    T_world_camera : [4,4].
+    cull_back : leave out faces seen from behind (counter-clockwise is the front), to look into a room from outside.
+    supersampling : samples a pixel along each axis, for smooth edges.
+
+    Returns
+    -------
+    uint8 [H,W,3] RGB on white, and float32 [H,W] depth in metres, 0 where nothing is. An empty mesh gives an empty
+    picture. Deterministic; a million small faces at 640x480 take about a second.
+    """
+    fine = camera.resized(camera.width * supersampling, camera.height * supersampling)
+    raster = rasterize(vertices, faces, fine, T_world_camera, cull_back)
+    picture = _shade(np.asarray(vertices), np.asarray(faces), colors, fine, T_world_camera, raster)
+    if supersampling == 1:
+        return picture, raster.depth
+    size = camera.width, camera.height
+    smooth = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    middle = supersampling // 2
+    return smooth, np.ascontiguousarray(raster.depth[middle::supersampling, middle::supersampling])
+
+
+def rasterize(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, T_world_camera: np.ndarray, cull_back: bool = False
+) -> Raster:
+    """The nearest face behind each pixel centre; faces are cut at 2 cm before the camera.
+
+    Arguments as for :func:`render_mesh`. Of faces at the same depth the one with the highest number wins.
+    """
+    points = _to_camera(np.asarray(vertices), T_world_camera)
+    corners, ids = _clip(points, _in_view(points, np.asarray(faces).reshape(-1, 3), camera))
+    setup = _Setup.of(corners, ids, camera, cull_back)
+    inverse_depth = np.zeros(camera.height * camera.width, dtype=np.float32)
+    winners = np.full(camera.height * camera.width, -1, dtype=np.int32)
+    for chunk in setup.chunks():
+        pixels, nearness, owners = setup.fragments(chunk, camera.width)
+        np.maximum.at(inverse_depth, pixels, nearness)
+        front = nearness == inverse_depth[pixels]
+        winners[pixels[front]] = owners[front]
+    depth = np.divide(1, inverse_depth, out=np.zeros_like(inverse_depth), where=inverse_depth > 0)
+    shape = camera.height, camera.width
+    return Raster(depth.reshape(shape), winners.reshape(shape))
+
+
+@dataclass
+class _Setup:
+    """Triangles in the image: pixel boxes, and functions a + b x + c y of the offset from the box's corner."""
+
+    ids: np.ndarray
+    left: np.ndarray
+    top: np.ndarray
+    width: np.ndarray
+    height: np.ndarray
+    # [T,3,3]: two barycentric coordinates and the inverse depth; all three are linear in the image.
+    planes: np.ndarray
+
+    @classmethod
+    def of(cls, corners: np.ndarray, ids: np.ndarray, camera: Camera, cull_back: bool) -> _Setup:
+        inverse_z = 1 / corners[..., 2]
+        u = corners[..., 0] * inverse_z * camera.fx + camera.cx
+        v = corners[..., 1] * inverse_z * camera.fy + camera.cy
+        left, right = _pixel_range(u, camera.width)
+        top, bottom = _pixel_range(v, camera.height)
+        u0, v0 = u[:, 0], v[:, 0]
+        du1, dv1, du2, dv2 = u[:, 1] - u0, v[:, 1] - v0, u[:, 2] - u0, v[:, 2] - v0
+        area = du1 * dv2 - du2 * dv1
+        # Counter-clockwise in a world with y up is clockwise in an image with v down.
+        visible = (area < 0) if cull_back else (area != 0)
+        keep = np.flatnonzero(visible & (right >= left) & (bottom >= top))
+        # Small ones first, so that triangles of a chunk are alike.
+        pixels = (right[keep] - left[keep] + 1) * (bottom[keep] - top[keep] + 1)
+        keep = keep[np.argsort(pixels, kind="stable")]
+        scale = 1 / area[keep]
+        x0, y0 = left[keep] - u0[keep], top[keep] - v0[keep]
+        b1, c1 = dv2[keep] * scale, -du2[keep] * scale
+        b2, c2 = -dv1[keep] * scale, du1[keep] * scale
+        first = np.stack([b1 * x0 + c1 * y0, b1, c1], axis=-1)
+        second = np.stack([b2 * x0 + c2 * y0, b2, c2], axis=-1)
+        z0, z1, z2 = inverse_z[keep].T[..., None]
+        depth = first * (z1 - z0) + second * (z2 - z0)
+        depth[:, 0] += z0[:, 0]
+        planes = np.stack([first, second, depth], axis=1).astype(np.float32)
+        width, height = right[keep] - left[keep] + 1, bottom[keep] - top[keep] + 1
+        return cls(ids[keep], left[keep], top[keep], width, height, planes)
+
+    def chunks(self) -> list[slice]:
+        """Runs of triangles whose boxes hold about ``_FRAGMENTS`` pixels together."""
+        if not len(self.ids):
+            return []
+        total = np.cumsum(self.width * self.height)
+        bounds = np.searchsorted(total, np.arange(_FRAGMENTS, total[-1] + _FRAGMENTS, _FRAGMENTS), side="right")
+        edges = np.unique(np.concatenate([[0], bounds, [len(self.ids)]]))
+        return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+    def fragments(self, chunk: slice, image_width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixel index, inverse depth and face id of all pixels inside the chunk's triangles."""
+        width, counts = self.width[chunk], self.width[chunk] * self.height[chunk]
+        owner = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        offset = np.arange(len(owner), dtype=np.int32) - np.repeat(
+            (np.cumsum(counts) - counts).astype(np.int32), counts
+        )
+        y, x = np.divmod(offset, width.astype(np.int32)[owner])
+        planes = self.planes[chunk].reshape(-1, 9)[owner]
+        # float32 all the way: the winner of a pixel is found by equality.
+        fx, fy = x.astype(np.float32), y.astype(np.float32)
+        first = planes[:, 0] + planes[:, 1] * fx + planes[:, 2] * fy
+        second = planes[:, 3] + planes[:, 4] * fx + planes[:, 5] * fy
+        inside = np.flatnonzero((first >= 0) & (second >= 0) & (first + second <= 1))
+        owner, x, y, planes = owner[inside], x[inside], y[inside], planes[inside, 6:]
+        nearness = planes[:, 0] + planes[:, 1] * fx[inside] + planes[:, 2] * fy[inside]
+        pixels = (self.top[chunk][owner] + y) * image_width + self.left[chunk][owner] + x
+        # Rounding can carry the rim of a thin triangle that is seen edge-on through infinity.
+        return pixels, np.clip(nearness, 1e-6, 1 / NEAREST_M), self.ids[chunk][owner]
+
+
+def _to_camera(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    T_camera_world = inverse(T_world_camera)
+    return (points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).reshape(-1, 3)
+
+
+def _in_view(points: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Faces, and their numbers, that aren't wholly beyond one side of the view."""
+    x, y, z = points.T
+    sides = (
+        z < NEAREST_M,
+        x * camera.fx + (camera.cx + 0.5) * z < 0,
+        x * camera.fx + (camera.cx + 0.5 - camera.width) * z > 0,
+        y * camera.fy + (camera.cy + 0.5) * z < 0,
+        y * camera.fy + (camera.cy + 0.5 - camera.height) * z > 0,
+    )
+    codes = np.zeros(len(points), dtype=np.uint8)
+    for bit, outside in enumerate(sides):
+        codes |= outside.astype(np.uint8) << bit
+    kept = np.flatnonzero((codes[faces[:, 0]] & codes[faces[:, 1]] & codes[faces[:, 2]]) == 0).astype(np.int32)
+    return faces[kept], kept
+
+
+def _clip(points: np.ndarray, faces: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners [T,3,3] of the faces' parts beyond ``NEAREST_M``, and the faces' numbers."""
+    corners, ids = points[faces[0]], faces[1]
+    behind = corners[..., 2] < NEAREST_M
+    count = behind.sum(axis=1)
+    if not count.any():
+        return corners, ids
+    whole, one, two = (np.flatnonzero(count == number) for number in range(3))
+    # Turned so that the odd corner comes first; order, and so the front, stays.
+    odd_one, odd_two = _turned(corners[one], behind[one].argmax(1)), _turned(corners[two], (~behind[two]).argmax(1))
+    left, right = _cut(odd_one[:, 0], odd_one[:, 1]), _cut(odd_one[:, 0], odd_one[:, 2])
+    tip = np.stack([odd_two[:, 0], _cut(odd_two[:, 1], odd_two[:, 0]), _cut(odd_two[:, 2], odd_two[:, 0])], axis=1)
+    parts = [
+        corners[whole],
+        np.stack([left, odd_one[:, 1], odd_one[:, 2]], axis=1),
+        np.stack([left, odd_one[:, 2], right], axis=1),
+        tip,
+    ]
+    return np.concatenate(parts), np.concatenate([ids[whole], ids[one], ids[one], ids[two]])
+
+
+def _turned(corners: np.ndarray, first: np.ndarray) -> np.ndarray:
+    order = (first[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(corners, order[..., None], axis=1)
+
+
+def _cut(behind: np.ndarray, before: np.ndarray) -> np.ndarray:
+    share = (NEAREST_M - behind[:, 2:]) / (before[:, 2:] - behind[:, 2:])
+    return behind + share * (before - behind)
+
+
+def _pixel_range(coordinates: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """First and last pixel centre between a triangle's corners, inside the image; first > last if there is none."""
+    first = np.clip(np.ceil(coordinates.min(axis=1)), 0, size)
+    last = np.clip(np.floor(coordinates.max(axis=1)), -1, size - 1)
+    return first.astype(np.int64), last.astype(np.int64)
+
+
+def _shade(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray | None,
+    camera: Camera,
+    T_world_camera: np.ndarray,
+    raster: Raster,
+) -> np.ndarray:
+    hit = raster.face_ids >= 0
+    picture = np.full((*hit.shape, 3), _BACKGROUND, dtype=np.uint8)
+    if not hit.any():
+        return picture
+    corners = _to_camera(vertices[faces[raster.face_ids[hit]]].reshape(-1, 3), T_world_camera).reshape(-1, 3, 3)
+    points = (camera.ray_directions() * raster.depth[..., None])[hit]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    light = _lighting(normals, points, hit)
+    if colors is None:
+        base: np.ndarray | float = 200.0
+    else:
+        weights = _barycentric(corners, points, normals)
+        base = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[faces[raster.face_ids[hit]], :3].astype(np.float32))
+    picture[hit] = np.clip(base * light[:, None], 0, 255).astype(np.uint8)
+    return picture
+
+
+def _lighting(normals: np.ndarray, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """Brightness of each hit pixel; normals are turned to the viewer and blurred a little, against facets."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    normals = np.where((normals * points).sum(axis=1, keepdims=True) > 0, -normals, normals)
+    image = np.zeros((*hit.shape, 3), dtype=np.float32)
+    image[hit] = normals
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)[hit]
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-6)
+    return _AMBIENT + _DIFFUSE * np.clip(smooth @ _LIGHT.astype(np.float32), 0, 1)
+
+
+def _barycentric(corners: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Weights [N,3] of a triangle's corners at a point in its plane."""
+    area = np.maximum((normals * normals).sum(axis=1), 1e-30)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    wb = (np.cross(points - a, c - a) * normals).sum(axis=1) / area
+    wc = (np.cross(b - a, points - a) * normals).sum(axis=1) / area
+    weights = np.clip(np.stack([1 - wb - wc, wb, wc], axis=1), 0, 1)
+    return (weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)).astype(np.float32)

@@ -1,0 +1,124 @@
+"""The rasteriser against analytic depth."""
+
+import time
+
+import numpy as np
+import pytest
+
+from spslam.camera import Camera
+from spslam.geometry import pose_from
+from spslam.meshing.render import NEAREST_M, rasterize, render_mesh
+
+CAMERA = Camera(80, 60, 70.0, 65.0, 41.0, 28.5)
+HALF_SIZE = np.array([3.0, 2.0, 2.5])
+# float32 inverse depth, evaluated from a corner of the triangle's box.
+DEPTH_TOLERANCE = 1e-4
+
+
+def box(half_size=HALF_SIZE, center=(0, 0, 0)):
+    """Twelve triangles, counter-clockwise seen from outside."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [[a, b, c] for a, b, c, _ in quads] + [[a, c, d] for a, _, c, d in quads]
+    return corners * half_size + center, np.array(faces)
+
+
+def turned(angle, position):
+    c, s = np.cos(angle), np.sin(angle)
+    return pose_from(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array(position, dtype=float))
+
+
+def cast_inside(pose):
+    """Depth of the box's walls from inside it."""
+    directions = CAMERA.ray_directions().astype(np.float64) @ pose[:3, :3].T
+    with np.errstate(divide="ignore"):
+        walls = (np.sign(directions) * HALF_SIZE - pose[:3, 3]) / directions
+    return np.min(np.where(directions != 0, walls, np.inf), axis=-1)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.1, 2.5, -2.0])
+def test_depth_from_inside_a_box_is_exact(angle):
+    # The walls' triangles reach behind the camera, so this tests the clipping as well.
+    vertices, faces = box()
+    pose = turned(angle, (0.7, -0.4, 0.9))
+    raster = rasterize(vertices, faces, CAMERA, pose)
+    np.testing.assert_allclose(raster.depth, cast_inside(pose), rtol=DEPTH_TOLERANCE)
+    assert (raster.face_ids >= 0).all()
+
+
+def test_nearest_face_wins_whatever_the_order():
+    vertices, faces = np.concatenate([box()[0], box((0.2, 0.2, 0.2), (0, 0, 1.5))[0]]), box()[1]
+    both = np.concatenate([faces, faces + 8])
+    pose = np.eye(4)
+    first = rasterize(vertices, both, CAMERA, pose)
+    second = rasterize(vertices, both[::-1], CAMERA, pose)
+    np.testing.assert_array_equal(first.depth, second.depth)
+    assert first.depth[28, 41] == pytest.approx(1.3, rel=DEPTH_TOLERANCE)
+    assert first.face_ids[28, 41] >= 12
+    assert first.depth[0, 0] == pytest.approx(2.5, rel=DEPTH_TOLERANCE)
+
+
+def test_culling_looks_into_a_box_from_outside():
+    vertices, faces = box((1, 1, 1), (0, 0, 4))
+    inward = faces[:, ::-1]
+    near, far = 3.0, 5.0
+    for facing, depth in ((faces, near), (inward, far)):
+        raster = rasterize(vertices, facing, CAMERA, np.eye(4), cull_back=True)
+        assert raster.depth[28, 41] == pytest.approx(depth, rel=DEPTH_TOLERANCE)
+    assert rasterize(vertices, inward, CAMERA, np.eye(4)).depth[28, 41] == pytest.approx(near, rel=DEPTH_TOLERANCE)
+
+
+def test_colors_are_interpolated_in_space_not_in_the_image():
+    # A floor-like triangle pair going away from the camera: red grows with z.
+    vertices = np.array([[-9, 1, 1], [9, 1, 1], [9, 1, 9], [-9, 1, 9]], dtype=float)
+    colors = np.array([[0, 100, 0], [0, 100, 0], [200, 100, 0], [200, 100, 0]], dtype=np.uint8)
+    picture, depth = render_mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), colors, CAMERA, np.eye(4))
+    hit = (depth > 1.1) & (depth < 8.9)
+    ratio = picture[hit][:, 0] / picture[hit][:, 1].astype(float)
+    np.testing.assert_allclose(ratio, 2 * (depth[hit] - 1) / 8, atol=0.04)  # of 8-bit colours
+
+
+@pytest.mark.parametrize("colors", [None, np.zeros((0, 3), np.uint8)])
+def test_empty_mesh_gives_an_empty_picture(colors):
+    picture, depth = render_mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), colors, CAMERA, np.eye(4))
+    assert picture.shape == (60, 80, 3)
+    assert (picture == 255).all()
+    assert not depth.any()
+
+
+def test_faces_behind_beside_or_without_area_are_left_out():
+    vertices = np.array(
+        [[0, 0, -1], [1, 0, -1], [0, 1, -1], [99, 0, 1], [98, 0, 1], [99, 1, 1], [0, 0, 1]], dtype=float
+    )
+    faces = np.array([[0, 1, 2], [3, 4, 5], [6, 6, 6]])
+    assert not rasterize(vertices, faces, CAMERA, np.eye(4)).depth.any()
+
+
+def test_camera_on_a_face_sees_no_nonsense():
+    vertices, faces = box((1, 1, 1))
+    raster = rasterize(vertices, faces, CAMERA, turned(0.2, (0, 0, -1)))
+    assert np.isfinite(raster.depth).all()
+    assert raster.depth[raster.face_ids >= 0].min() >= NEAREST_M
+
+
+def test_supersampling_keeps_size_and_depth():
+    vertices, faces = box()
+    picture, depth = render_mesh(vertices, faces, None, CAMERA, turned(0.4, (0, 0, 0)), supersampling=2)
+    assert picture.shape == (60, 80, 3)
+    assert picture.dtype == np.uint8
+    np.testing.assert_allclose(depth, cast_inside(turned(0.4, (0, 0, 0))), atol=0.05)  # half a pixel aside
+
+
+def test_a_million_faces_take_seconds():
+    side = 708
+    u, v = np.meshgrid(np.linspace(-1.5, 1.5, side), np.linspace(-1.2, 1.2, side))
+    vertices = np.stack([u, v, 2 + 0.2 * np.sin(4 * u) * np.cos(5 * v)], axis=-1).reshape(-1, 3)
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).reshape(-1, 1)
+    faces = np.concatenate([corner + [0, 1, side], corner + [1, side + 1, side]])
+    camera = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    colors = np.full((len(vertices), 3), 128, np.uint8)
+    started = time.thread_time()
+    _, depth = render_mesh(vertices, faces, colors, camera, np.eye(4))
+    assert len(faces) > 999_000
+    assert (depth > 0).mean() > 0.9
+    assert time.thread_time() - started < 6  # 1 s on the machine it was written on
