@@ -4,6 +4,7 @@ from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.gauss_newton import gauss_newton_poses, track_gauss_newton
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
+from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.prior_fusion import fuse_prior_
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
@@ -19,15 +20,16 @@ from spslam.ops.voxel_hash import (
 )
 
 __all__ = [
-    "Activation",
     "CPU_ISA",
     "CUDA_OFF_REASON",
+    "Activation",
     "Intrinsics",
     "SceneView",
     "Stream",
     "bilinear_interpolate",
     "fuse_prior_",
     "gauss_newton_poses",
+    "marching_cubes",
     "mlp",
     "mlp_num_params",
     "new_voxel_hash",
