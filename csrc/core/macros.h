@@ -15,7 +15,9 @@
 #if defined(__CUDACC__)
 #define SPS_SIMD
 #define SPS_SIMD_SUM(...)
+#define SPS_SIMD_MIN(...)
 #else
 #define SPS_SIMD SPS_PRAGMA(omp simd)
 #define SPS_SIMD_SUM(...) SPS_PRAGMA(omp simd reduction(+ : __VA_ARGS__))
+#define SPS_SIMD_MIN(...) SPS_PRAGMA(omp simd reduction(min : __VA_ARGS__))
 #endif

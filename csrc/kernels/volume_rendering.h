@@ -13,7 +13,7 @@ namespace spslam {
 
 // Bells below this are taken as zero: a sample that far from the surface is not rendered.
 constexpr double kMinBell = 1e-3;
-// Grazing rays: the cosine between ray and normal is not taken below this.
+// Grazing rays: normal . direction is not taken below this.
 constexpr double kMinCosine = 0.15;
 
 // ---- weights (6)
@@ -62,7 +62,8 @@ SPS_INLINE T weight_backward(T grad_weight, T weighted_mean_grad, T bell_slope, 
 
 // ---- losses (8-11)
 
-// Scale from distance along the ray to distance to the surface.
+// Scale from distance along the ray to distance to the surface: normal . direction where the direction has depth 1, so
+// it may exceed 1 towards the image's corners; 0 where the normal is unknown.
 template <class T>
 SPS_INLINE T target_cosine(T cosine, bool cosine_targets) {
   return cosine_targets && cosine > 0 ? (cosine > T(kMinCosine) ? cosine : T(kMinCosine)) : T(1);

@@ -10,6 +10,7 @@ from spslam.ops.prior_fusion import fuse_prior_
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.volume_rendering import rendering_losses, volume_render
 from spslam.ops.voxel_hash import (
     new_voxel_hash,
     voxel_hash_build_,
@@ -38,6 +39,7 @@ __all__ = [
     "query_color",
     "query_sdf",
     "query_sdf_gradient",
+    "rendering_losses",
     "sample_along_rays",
     "sample_indices",
     "solve_normal_equations",
@@ -45,6 +47,7 @@ __all__ = [
     "track_gauss_newton",
     "tri_plane_interpolate",
     "trilinear_interpolate",
+    "volume_render",
     "voxel_hash_build_",
     "voxel_hash_find",
     "voxel_hash_insert",

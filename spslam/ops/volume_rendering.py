@@ -1,0 +1,183 @@
+"""Volume rendering of rays and the loss terms of tracking and mapping, differentiable by hand-written derivatives.
+
+float32 and float64, non-contiguous and empty input, first derivatives only. All sums run in a fixed order: the same
+input gives the same bits, whatever the number of threads. `sdf` is normalised throughout: the signed distance divided
+by the truncation distance, in [-1, 1], positive in front of surfaces.
+"""
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._autograd import forbid_second_derivatives
+from spslam.ops._checks import FLOATING, check, check_tensor
+
+
+def volume_render(
+    sdf: torch.Tensor, color: torch.Tensor, t: torch.Tensor, valid: torch.Tensor, truncation: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Colour and depth of rays as weighted sums over their samples (equations 5 and 6).
+
+    The weight of a sample is the bell sigmoid(sdf / truncation) * sigmoid(-sdf / truncation), taken as 0 below 1e-3,
+    where the sample is not valid, and where it lies deeper than the ray's first crossing (the smallest t of its valid
+    samples of negative sdf) plus truncation. The weights of a ray are then divided by their sum; a ray without any
+    weight renders as zeros.
+
+    Args:
+        sdf: [R, S] float32 or float64, normalised.
+        color: [R, S, 3] of the same dtype.
+        t: [R, S] of the same dtype, depth of the samples, metres, in any order.
+        valid: bool [R, S], whether a sample lies inside the volume.
+        truncation: truncation distance tr, metres.
+
+    Returns:
+        color [R, 3], depth [R] in metres, weights [R, S]. All three are differentiable by `sdf`, `color` and `t`; which
+        samples take part is not differentiated. R = 0 gives empty tensors, S = 0 zeros.
+
+    Raises:
+        TypeError: a dtype is wrong.
+        ValueError: a shape or device does not fit, or `truncation` is not positive.
+
+    Example:
+        >>> sdf, t = torch.tensor([[1.0, 0.0, -1.0]]), torch.tensor([[0.9, 1.0, 1.1]])
+        >>> color, depth, weights = volume_render(sdf, torch.ones(1, 3, 3), t, torch.ones(1, 3).bool(), 0.08)
+        >>> depth
+        tensor([1.])
+    """
+    name = "volume_render"
+    check_tensor(name, "sdf", sdf, ("R", "S"), FLOATING)
+    check_tensor(name, "color", color, (*sdf.shape, 3), sdf.dtype, like=sdf)
+    check_tensor(name, "t", t, tuple(sdf.shape), sdf.dtype, like=sdf)
+    check_tensor(name, "valid", valid, tuple(sdf.shape), torch.bool, like=sdf)
+    check(truncation > 0, name, "truncation", "be positive", truncation)
+    return torch.ops.spslam.volume_render(sdf, color, t, valid, truncation)
+
+
+def rendering_losses(
+    color: torch.Tensor,
+    depth: torch.Tensor,
+    sdf: torch.Tensor,
+    t: torch.Tensor,
+    valid: torch.Tensor,
+    rendered: torch.Tensor,
+    target_color: torch.Tensor,
+    target_depth: torch.Tensor,
+    cosine: torch.Tensor,
+    truncation: float,
+    cosine_targets: bool,
+) -> torch.Tensor:
+    """The four terms of the objective (equations 8 to 11), each averaged over all R rays.
+
+    The distance of a sample to the measured surface is e = (target_depth - t) * c, with c = max(cosine, 0.15) if
+    `cosine_targets` is set and the ray's cosine is known, else 1. A sample is near if |e| < truncation and it is valid,
+    free if e >= truncation, valid or not: outside the volume the field is 1, which adds nothing to the mean.
+
+    - rgb: squared error of the rendered colour, mean over the channels; rays that were rendered only.
+    - depth: squared error of the rendered depth, m^2; rays that were rendered only.
+    - free space: mean over a ray's free samples of (sdf - 1)^2.
+    - sdf: mean over a ray's near samples of (sdf * truncation - e)^2, m^2.
+
+    A ray adds 0 to a term for which it has no sample, and to all of them if its target depth is not positive and
+    finite.
+
+    Args:
+        color: [R, 3] float32 or float64, rendered.
+        depth: [R] of the same dtype, rendered, metres.
+        sdf: [R, S] of the same dtype, normalised.
+        t: [R, S] of the same dtype, depth of the samples, metres.
+        valid: bool [R, S], whether a sample lies inside the volume.
+        rendered: bool [R], whether any sample of the ray had a weight.
+        target_color: [R, 3] of the same dtype, measured.
+        target_depth: [R] of the same dtype, measured, metres.
+        cosine: [R] of the same dtype, surface normal times ray direction, the direction scaled to depth 1, so it may
+            exceed 1 towards the image's corners; 0 where the normal is unknown.
+        truncation: truncation distance, metres.
+        cosine_targets: whether distances are measured to the surface instead of along the ray.
+
+    Returns:
+        [4]: rgb, depth, free space, sdf. Differentiable by `color`, `depth`, `sdf` and `t`. R = 0 gives zeros.
+
+    Raises:
+        TypeError: a dtype is wrong.
+        ValueError: a shape or device does not fit, or `truncation` is not positive.
+
+    Example:
+        >>> one = torch.ones(1)
+        >>> losses = rendering_losses(
+        ...     torch.zeros(1, 3), 1.1 * one, torch.zeros(1, 2), torch.tensor([[0.5, 1.0]]), torch.ones(1, 2).bool(),
+        ...     one.bool(), torch.ones(1, 3), one, 0 * one, 0.08, False)
+        >>> losses
+        tensor([1.0000, 0.0100, 1.0000, 0.0000])
+    """
+    name = "rendering_losses"
+    check_tensor(name, "sdf", sdf, ("R", "S"), FLOATING)
+    rays, samples = sdf.shape
+    for argument, tensor, shape in (
+        ("color", color, (rays, 3)),
+        ("depth", depth, (rays,)),
+        ("t", t, (rays, samples)),
+        ("target_color", target_color, (rays, 3)),
+        ("target_depth", target_depth, (rays,)),
+        ("cosine", cosine, (rays,)),
+    ):
+        check_tensor(name, argument, tensor, shape, sdf.dtype, like=sdf)
+    check_tensor(name, "valid", valid, (rays, samples), torch.bool, like=sdf)
+    check_tensor(name, "rendered", rendered, (rays,), torch.bool, like=sdf)
+    check(truncation > 0, name, "truncation", "be positive", truncation)
+    return torch.ops.spslam.rendering_losses(
+        color, depth, sdf, t, valid, rendered, target_color, target_depth, cosine, truncation, cosine_targets
+    )
+
+
+@torch.library.register_fake("spslam::volume_render")
+def _(sdf, color, t, valid, truncation):
+    rays, samples = sdf.shape
+    return sdf.new_empty(rays, 3), sdf.new_empty(rays), sdf.new_empty(rays, samples)
+
+
+@torch.library.register_fake("spslam::volume_render_backward")
+def _(grad_color, grad_depth, grad_weights, sdf, color, t, valid, weights, truncation):
+    return sdf.new_empty(sdf.shape), sdf.new_empty(color.shape), sdf.new_empty(sdf.shape)
+
+
+@torch.library.register_fake("spslam::rendering_losses")
+def _(color, depth, sdf, t, valid, rendered, target_color, target_depth, cosine, truncation, cosine_targets):
+    return sdf.new_empty(4)
+
+
+@torch.library.register_fake("spslam::rendering_losses_backward")
+def _(grad, color, depth, sdf, t, valid, rendered, target_color, target_depth, cosine, truncation, cosine_targets):
+    rays, samples = sdf.shape
+    return sdf.new_empty(rays, 3), sdf.new_empty(rays), sdf.new_empty(rays, samples), sdf.new_empty(rays, samples)
+
+
+def _save_render(ctx, inputs, output):
+    *tensors, ctx.truncation = inputs
+    ctx.save_for_backward(*tensors, output[2])
+    ctx.set_materialize_grads(False)
+
+
+def _render_backward(ctx, grad_color, grad_depth, grad_weights):
+    sdf, color, t, valid, weights = ctx.saved_tensors
+    rays = sdf.shape[0]
+    grad_color = sdf.new_zeros(rays, 3) if grad_color is None else grad_color
+    grad_depth = sdf.new_zeros(rays) if grad_depth is None else grad_depth
+    gradients = torch.ops.spslam.volume_render_backward(
+        grad_color, grad_depth, grad_weights, sdf, color, t, valid, weights, ctx.truncation
+    )
+    return *gradients, None, None
+
+
+def _save_losses(ctx, inputs, output):
+    *tensors, ctx.truncation, ctx.cosine_targets = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _losses_backward(ctx, grad):
+    gradients = torch.ops.spslam.rendering_losses_backward(grad, *ctx.saved_tensors, ctx.truncation, ctx.cosine_targets)
+    return *gradients, None, None, None, None, None, None, None
+
+
+torch.library.register_autograd("spslam::volume_render", _render_backward, setup_context=_save_render)
+torch.library.register_autograd("spslam::rendering_losses", _losses_backward, setup_context=_save_losses)
+forbid_second_derivatives("volume_render")
+forbid_second_derivatives("rendering_losses")
