@@ -6,7 +6,7 @@ CUDA_ARCHS ?= 90-real
 # This machine's best instruction set is all that development needs.
 ISA := $(shell $(PYTHON) -c "import torch; print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(torch.backends.cpu.get_cpu_capability(), 'baseline'))")
 
-.PHONY: help dev test test-gpu lint
+.PHONY: help dev test test-gpu lint demo
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -25,4 +25,10 @@ test-gpu: ## run the tests on a CUDA device, against the installed or in-place b
 	$(PYTHON) -m pytest -m cuda
 
 lint: ## style and types
-	$(PYTHON) -m ruff check . && $(PYTHON) -m ruff format --check . && $(PYTHON) -m mypy
+	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
+	clang-format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh')
+	$(PYTHON) -m mypy
+
+demo: dev ## a generated room with known truth, into runs/demo
+	$(PYTHON) -m spslam.cli.main demo

@@ -1,4 +1,4 @@
-"""Builds the kernel libraries with CMake and puts them into the package; everything else is in pyproject.toml."""
+"""Builds the kernel libraries with CMake and puts them and configs/ into the package; the rest is in pyproject.toml."""
 
 import os
 import pathlib
@@ -8,7 +8,7 @@ import sys
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent / "cmake"))
 
-from setuptools import Extension, setup
+from setuptools import Extension, find_packages, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
@@ -50,7 +50,16 @@ class PlatformWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
+CONFIG_PACKAGES = {"spslam.configs": "configs", "spslam.configs.presets": "configs/presets"}
+
 setup(
+    packages=[*find_packages(include=["spslam", "spslam.*"]), *CONFIG_PACKAGES],
+    package_dir=CONFIG_PACKAGES,
+    package_data={
+        "spslam": ["py.typed"],
+        "spslam.prior": ["data/*.safetensors"],
+        **{name: ["*.yaml"] for name in CONFIG_PACKAGES},
+    },
     ext_modules=[Extension("spslam._ops_cpu", sources=[])],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )

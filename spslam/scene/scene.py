@@ -1,0 +1,204 @@
+"""The map: sparse volume, tri-planes and the two decoders, with one file to save to and load from."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+
+from spslam import ops
+from spslam.errors import SpslamError
+from spslam.io import atomic_write
+from spslam.scene.decoders import COLOR_DECODER, GEOMETRY_DECODER, random_parameters
+from spslam.scene.sparse_volume import SparseVolume
+from spslam.scene.tri_planes import TriPlanes
+
+FORMAT = "spslam-map-1"
+_GEOMETRY, _COLOR = 1, 2  # `purpose` of the decoders' initialisation
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What the map is made of; stored with it.
+
+    Attributes:
+        voxel_size_m: edge of a voxel.
+        truncation_m: distance at which the SDF saturates.
+        plane_cell_m: edge of a tri-plane cell.
+        position_scale: factor on positions (m) entering the geometry decoder.
+        max_voxels: vertices at which the volume refuses to grow.
+    """
+
+    voxel_size_m: float
+    truncation_m: float
+    plane_cell_m: float
+    position_scale: float
+    max_voxels: int
+
+
+class Scene:
+    """Geometry and appearance of what was seen.
+
+    Attributes:
+        settings: sizes and scales.
+        origin: float64 [3] world point (m) that decoder positions are relative to, the first camera's centre.
+        volume: embeddings at the vertices of allocated voxels.
+        planes: colour features on three planes.
+        geometry_decoder: flat parameters of position, embedding -> SDF / truncation.
+        color_decoder: flat parameters of tri-plane feature -> RGB.
+    """
+
+    def __init__(
+        self,
+        settings: SceneSettings,
+        seed: int,
+        origin: torch.Tensor | None = None,
+        geometry_decoder: torch.Tensor | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        """An empty map.
+
+        Args:
+            settings: sizes and scales.
+            seed: of the random initial values.
+            origin: float [3]; the world's origin where not given.
+            geometry_decoder: trained parameters to start from; random ones where not given.
+            device: where the tensors live.
+        """
+        self.settings = settings
+        self.seed = seed
+        self.device = torch.device(device)
+        self.origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin.to("cpu", torch.float64)
+        self.volume = SparseVolume(settings.voxel_size_m, max_voxels=settings.max_voxels, device=self.device)
+        self.planes = TriPlanes(settings.plane_cell_m, seed=seed, device=self.device)
+        if geometry_decoder is None:
+            geometry_decoder = random_parameters(GEOMETRY_DECODER, seed, _GEOMETRY)
+        self.geometry_decoder = geometry_decoder.to(self.device, torch.float32).clone()
+        self.color_decoder = random_parameters(COLOR_DECODER, seed, _COLOR).to(self.device)
+
+    def view(self) -> ops.SceneView:
+        """The tensors as the fused ops take them. Valid until the scene grows."""
+        return ops.SceneView(
+            hash_keys=self.volume.hash_keys,
+            hash_values=self.volume.hash_values,
+            corner_ids=self.volume.corner_ids,
+            embeddings=self.volume.embeddings,
+            geometry_params=self.geometry_decoder,
+            texels=self.planes.texels,
+            color_params=self.color_decoder,
+            voxel_size=self.settings.voxel_size_m,
+            origin=self.origin.tolist(),
+            position_scale=self.settings.position_scale,
+            plane_cell_size=self.settings.plane_cell_m,
+            plane_layout=self.planes.layout,
+        )
+
+    def sdf(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Signed distance / truncation at world points (eq. 2).
+
+        Args:
+            points: float32 [N, 3], m.
+
+        Returns:
+            float32 [N] in [-1, 1], 1 outside the allocated voxels; bool [N], whether the point is inside them.
+        """
+        return ops.query_sdf(self.view(), points)
+
+    def color(self, points: torch.Tensor) -> torch.Tensor:
+        """RGB at world points (eq. 3, 4): float32 [N, 3] in [0, 1] of float32 [N, 3] points (m)."""
+        return ops.query_color(self.view(), points)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the learnable parameters, the paper's model size."""
+        parameters = (self.volume.embeddings, self.planes.texels, self.geometry_decoder, self.color_decoder)
+        return sum(p.numel() * p.element_size() for p in parameters)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Everything learnt, as CPU tensors."""
+        state = {
+            "origin": self.origin,
+            "volume.voxel_coords": self.volume.voxel_coords,
+            "volume.embeddings": self.volume.embeddings,
+            "volume.weights": self.volume.weights,
+            "planes.texels": self.planes.texels,
+            "planes.layout": torch.tensor(self.planes.layout, dtype=torch.int64),
+            "geometry_decoder": self.geometry_decoder,
+            "color_decoder": self.color_decoder,
+        }
+        # Clones, not views: the file must not hold the spare capacity behind a view.
+        return {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in state.items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Replaces the content by that of `state_dict()`.
+
+        Raises:
+            SpslamError: a tensor is missing or of another shape.
+        """
+        _check_state(state)
+        self.origin = state["origin"].to("cpu", torch.float64)
+        self.volume = SparseVolume(self.settings.voxel_size_m, max_voxels=self.settings.max_voxels, device=self.device)
+        self.volume.insert(state["volume.voxel_coords"].to(self.device))
+        self.volume.embeddings.copy_(state["volume.embeddings"])
+        self.volume.weights.copy_(state["volume.weights"])
+        self.planes = TriPlanes(self.settings.plane_cell_m, seed=self.seed, device=self.device)
+        self.planes.restore(state["planes.texels"], state["planes.layout"].tolist())
+        self.geometry_decoder = state["geometry_decoder"].to(self.device)
+        self.color_decoder = state["color_decoder"].to(self.device)
+
+    def save(self, path: str | Path) -> None:
+        """Writes one safetensors file, atomically; the same scene gives the same bytes."""
+        # A single metadata key: safetensors does not keep the order of several.
+        header = json.dumps({"format": FORMAT, "seed": self.seed, "settings": vars(self.settings)}, sort_keys=True)
+        atomic_write(path, safetensors.torch.save(self.state_dict(), metadata={"spslam": header}))
+
+    @classmethod
+    def load(cls, path: str | Path, device: torch.device | str = "cpu") -> "Scene":
+        """Reads a file written by `save`.
+
+        Raises:
+            SpslamError: no such file, not a map, truncated, or of another shape.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise SpslamError(f"{path}: no such map file")
+        try:
+            with safetensors.safe_open(path, framework="pt") as file:
+                header = json.loads((file.metadata() or {}).get("spslam", "{}"))
+                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        except (safetensors.SafetensorError, ValueError, OSError) as error:
+            raise SpslamError(f"{path}: not a readable safetensors file ({error})") from None
+        if header.get("format") != FORMAT:
+            raise SpslamError(f"{path}: not a map of format {FORMAT}")
+        scene = cls(SceneSettings(**header["settings"]), header["seed"], device=device)
+        try:
+            scene.load_state_dict(state)
+        except SpslamError as error:
+            raise SpslamError(f"{path}: {error}") from None
+        return scene
+
+
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    "origin": (3,),
+    "volume.voxel_coords": (None, 3),
+    "volume.embeddings": (None, 8),
+    "volume.weights": (None,),
+    "planes.texels": (None, COLOR_DECODER.inputs),
+    "planes.layout": (15,),
+    "geometry_decoder": (GEOMETRY_DECODER.parameters,),
+    "color_decoder": (COLOR_DECODER.parameters,),
+}
+
+
+def _check_state(state: dict[str, torch.Tensor]) -> None:
+    for name, shape in _SHAPES.items():
+        if name not in state:
+            raise SpslamError(f"tensor {name} is missing")
+        actual = tuple(state[name].shape)
+        if len(actual) != len(shape) or any(want not in (None, got) for want, got in zip(shape, actual, strict=True)):
+            raise SpslamError(f"tensor {name} must have shape {list(shape)}, got {list(actual)}")
+    rows = {len(state[name]) for name in ("volume.voxel_coords", "volume.embeddings", "volume.weights")}
+    if len(rows) != 1:
+        raise SpslamError("the volume's tensors differ in length")

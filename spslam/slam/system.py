@@ -1,0 +1,157 @@
+"""The frame loop: what happens to one frame, in order."""
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from spslam.camera import Camera
+from spslam.config import Config
+from spslam.datasets.base import RgbdFrame
+from spslam.prior import load_prior
+from spslam.slam.mapper import Mapper
+from spslam.slam.pixels import FramePixels, sample_frame
+from spslam.slam.state import SlamState, pose_tensor
+from spslam.slam.tracker import Tracker, TrackingResult
+from spslam.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What happened to one frame; a line of log.jsonl.
+
+    Attributes:
+        frame: number of the frame in the run, from 0.
+        index: its index in the data set.
+        timestamp: s.
+        lost: whether its pose is not to be trusted.
+        valid_depth: share of pixels with usable depth.
+        tracking_iterations, tracking_ms: of this frame; 0 for the first.
+        residual_cm: weighted RMS distance of its pixels to the map; None where the optimiser does not tell.
+        inliers: share of its pixels on mapped surface.
+        encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
+        mapping_iterations, mapping_ms: of the joint optimisation after this frame.
+        loss: total loss of the last mapping iteration; None where there was none.
+        voxels: allocated vertices.
+    """
+
+    frame: int
+    index: int
+    timestamp: float
+    lost: bool
+    valid_depth: float
+    tracking_iterations: int
+    tracking_ms: float
+    residual_cm: float | None
+    inliers: float
+    encode_ms: float
+    mapping_iterations: int
+    mapping_ms: float
+    loss: float | None
+    voxels: int
+
+
+class SlamSystem:
+    """Tracks and maps RGB-D frames, one `process` call each.
+
+    Example:
+        >>> system = SlamSystem(load_config("folder"), camera)          # doctest: +SKIP
+        >>> for frame in frames: system.process(frame)                  # doctest: +SKIP
+        >>> system.finish(); system.trajectory().save_tum("path.txt")   # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        camera: Camera,
+        first_pose: np.ndarray | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        """A system that has seen nothing.
+
+        Args:
+            config: settings.
+            camera: pinhole intrinsics of all frames.
+            first_pose: float64 [4, 4] T_world_camera of the first frame; identity where not given.
+            device: where the map lives and the kernels run.
+        """
+        self.config = config
+        self.camera = camera
+        self.device = torch.device(device)
+        prior = load_prior(config.prior.weights) if config.prior.enabled else None
+        decoder = prior.decoder_params if prior is not None and config.prior.decoder == "pretrained" else None
+        self.first_pose = np.eye(4) if first_pose is None else np.asarray(first_pose, np.float64)
+        self.state = SlamState.start(config, camera, self.first_pose, decoder, self.device)
+        self.tracker = Tracker(config, camera)
+        self.mapper = Mapper(config, camera, prior)
+        self._unmapped = False
+
+    def process(self, frame: RgbdFrame, pixels: FramePixels | None = None) -> FrameReport:
+        """Takes the next frame in.
+
+        Args:
+            frame: colour, depth, timestamp.
+            pixels: `sample_frame(frame, camera, config)`, if that was done ahead on another thread.
+        """
+        if pixels is None:
+            pixels = sample_frame(frame, self.camera, self.config)
+        number = len(self.state.frames)
+        tracked, tracking_ms = _timed(lambda: self._track(pixels, number))
+        self.state.frames.append(tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice)
+        self.state.pixels.add(pixels.records)
+        # A lost frame must not touch the map.
+        mapped = not tracked.lost and self._is_mapping_frame(number)
+        self._unmapped = not mapped
+        encode_ms, mapping_ms, iterations, losses = self._map(pixels, number) if mapped else (0.0, 0.0, 0, None)
+        return FrameReport(
+            frame=number,
+            index=frame.index,
+            timestamp=frame.timestamp,
+            lost=tracked.lost,
+            valid_depth=pixels.valid_share,
+            tracking_iterations=tracked.iterations,
+            tracking_ms=tracking_ms,
+            residual_cm=None if math.isnan(tracked.residual_cm) else tracked.residual_cm,
+            inliers=tracked.inlier_share,
+            encode_ms=encode_ms,
+            mapping_iterations=iterations,
+            mapping_ms=mapping_ms,
+            loss=None if losses is None else float(losses[0]),
+            voxels=self.state.scene.volume.num_voxels,
+        )
+
+    def finish(self) -> None:
+        """Optimises once more if frames came after the last mapping call. Call it after the last frame."""
+        if self._unmapped and len(self.state.frames):
+            self.mapper.optimize(self.state, self.config.mapping.iterations)
+            self._unmapped = False
+
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames as they are refined up to now."""
+        frames = self.state.frames
+        return Trajectory(frames.timestamps.numpy().copy(), frames.matrices(), frames.lost.numpy().copy())
+
+    def _track(self, pixels: FramePixels, number: int) -> TrackingResult:
+        if self.state.scene.volume.num_voxels == 0:
+            pose = pose_tensor(self.first_pose, self.device)
+            return TrackingResult(pose, 0, math.nan, 1.0, lost=len(pixels.records) == 0)
+        start = self.tracker.predict(self.state.frames)
+        return self.tracker.track(self.state.scene, pixels, start, number)
+
+    def _is_mapping_frame(self, number: int) -> bool:
+        return number % self.config.mapping.every == 0 or self.state.scene.volume.num_voxels == 0
+
+    def _map(self, pixels: FramePixels, number: int) -> tuple[float, float, int, torch.Tensor | None]:
+        first = self.state.scene.volume.num_voxels == 0
+        _, encode_ms = _timed(lambda: self.mapper.integrate(self.state, pixels))
+        iterations = self.config.mapping.first_iterations if first else self.config.mapping.iterations
+        losses, mapping_ms = _timed(lambda: self.mapper.optimize(self.state, iterations))
+        return encode_ms, mapping_ms, iterations, losses
+
+
+def _timed(call):
+    started = time.perf_counter()
+    result = call()
+    return result, 1e3 * (time.perf_counter() - started)
