@@ -13,6 +13,10 @@ namespace {
 
 // One loop at a time runs on the workers; a loop started inside another one, or beside it from a second thread, runs on
 // its own caller.
+//
+// Chunks are claimed from one counter that carries the loop's generation, and the caller waits for chunks, not for
+// workers: a worker that wakes late, because other processes have the cores, finds the generation over and holds nobody
+// up.
 class ThreadPool {
  public:
   ~ThreadPool() { stop(); }
@@ -27,28 +31,36 @@ class ThreadPool {
 
   void run(std::int64_t chunks, detail::ChunkFunction function, void* context) {
     if (chunks <= 0) return;
-    if (chunks == 1 || count_ == 1 || inside_loop_ || !loop_mutex_.try_lock()) {
+    if (chunks == 1 || chunks > kChunkMask || count_ == 1 || inside_loop_ || !loop_mutex_.try_lock()) {
       for (std::int64_t chunk = 0; chunk < chunks; ++chunk) function(context, chunk);
       return;
     }
     std::lock_guard<std::mutex> running(loop_mutex_, std::adopt_lock);
     start();
+    Loop loop{0, chunks, function, context};
     {
       std::lock_guard<std::mutex> lock(mutex_);
-      function_ = function;
-      context_ = context;
-      chunks_ = chunks;
-      next_.store(0, std::memory_order_relaxed);
-      busy_ = static_cast<int>(workers_.size());
-      generation_.fetch_add(1, std::memory_order_release);
+      loop.generation = loop_.generation + 1;
+      loop_ = loop;
+      done_.store(0, std::memory_order_relaxed);
+      next_.store(static_cast<std::uint64_t>(loop.generation) << kChunkBits, std::memory_order_release);
     }
     wake_.notify_all();
-    take_chunks(function, context, chunks);
-    wait_for_workers();
+    take_chunks(loop);
+    wait_for_chunks(chunks);
   }
 
  private:
-  // A worker spins this long for the next loop before it sleeps: kernels follow each other within microseconds.
+  struct Loop {
+    std::uint32_t generation;
+    std::int64_t chunks;
+    detail::ChunkFunction function;
+    void* context;
+  };
+
+  static constexpr int kChunkBits = 32;
+  static constexpr std::int64_t kChunkMask = (std::int64_t{1} << kChunkBits) - 1;
+  // How long a thread spins before it sleeps: kernels follow each other within microseconds.
   static constexpr int kSpins = 4000;
 
   void start() {
@@ -59,7 +71,7 @@ class ThreadPool {
     }
     if (!workers_.empty()) return;
     stopping_ = false;
-    const std::uint64_t seen = generation_.load();
+    const std::uint32_t seen = loop_.generation;
     for (int i = 1; i < count_; ++i) workers_.emplace_back([this, seen] { work(seen); });
   }
 
@@ -68,7 +80,8 @@ class ThreadPool {
       {
         std::lock_guard<std::mutex> lock(mutex_);
         stopping_ = true;
-        generation_.fetch_add(1, std::memory_order_release);
+        loop_ = Loop{loop_.generation + 1, 0, nullptr, nullptr};
+        next_.store(static_cast<std::uint64_t>(loop_.generation) << kChunkBits, std::memory_order_release);
       }
       wake_.notify_all();
       for (std::thread& worker : workers_) worker.join();
@@ -78,41 +91,49 @@ class ThreadPool {
     workers_.clear();
   }
 
-  void work(std::uint64_t seen) {
+  void work(std::uint32_t seen) {
     inside_loop_ = true;
     while (true) {
-      for (int spin = 0; spin < kSpins && generation_.load(std::memory_order_acquire) == seen; ++spin) pause();
-      detail::ChunkFunction function;
-      void* context;
-      std::int64_t chunks;
+      for (int spin = 0; spin < kSpins && current_generation() == seen; ++spin) pause();
+      Loop loop;
       {
         std::unique_lock<std::mutex> lock(mutex_);
-        wake_.wait(lock, [&] { return generation_.load() != seen; });
-        seen = generation_.load();
+        wake_.wait(lock, [&] { return loop_.generation != seen; });
         if (stopping_) return;
-        function = function_;
-        context = context_;
-        chunks = chunks_;
+        loop = loop_;
       }
-      take_chunks(function, context, chunks);
-      if (busy_.fetch_sub(1, std::memory_order_acq_rel) == 1) {
-        std::lock_guard<std::mutex> lock(mutex_);
-        done_.notify_one();
-      }
+      seen = loop.generation;
+      take_chunks(loop);
     }
   }
 
-  void take_chunks(detail::ChunkFunction function, void* context, std::int64_t chunks) {
+  void take_chunks(const Loop& loop) {
     const bool nested = inside_loop_;
     inside_loop_ = true;
-    for (std::int64_t chunk = next_.fetch_add(1); chunk < chunks; chunk = next_.fetch_add(1)) function(context, chunk);
+    std::uint64_t ticket = next_.load(std::memory_order_acquire);
+    while (true) {
+      const std::int64_t chunk = static_cast<std::int64_t>(ticket) & kChunkMask;
+      if (static_cast<std::uint32_t>(ticket >> kChunkBits) != loop.generation || chunk >= loop.chunks) break;
+      if (!next_.compare_exchange_weak(ticket, ticket + 1, std::memory_order_acq_rel)) continue;
+      loop.function(loop.context, chunk);
+      if (done_.fetch_add(1, std::memory_order_acq_rel) + 1 == loop.chunks) {
+        std::lock_guard<std::mutex> lock(mutex_);
+        finished_.notify_one();
+      }
+      ticket = next_.load(std::memory_order_acquire);
+    }
     inside_loop_ = nested;
   }
 
-  void wait_for_workers() {
-    for (int spin = 0; spin < kSpins && busy_.load(std::memory_order_acquire) > 0; ++spin) pause();
+  void wait_for_chunks(std::int64_t chunks) {
+    for (int spin = 0; spin < kSpins && done_.load(std::memory_order_acquire) < chunks; ++spin) pause();
+    if (done_.load(std::memory_order_acquire) == chunks) return;
     std::unique_lock<std::mutex> lock(mutex_);
-    done_.wait(lock, [&] { return busy_.load(std::memory_order_acquire) == 0; });
+    finished_.wait(lock, [&] { return done_.load(std::memory_order_acquire) == chunks; });
+  }
+
+  std::uint32_t current_generation() const {
+    return static_cast<std::uint32_t>(next_.load(std::memory_order_acquire) >> kChunkBits);
   }
 
   static void pause() {
@@ -125,14 +146,11 @@ class ThreadPool {
   pid_t owner_ = getpid();
   std::vector<std::thread> workers_;
   std::mutex loop_mutex_, mutex_;
-  std::condition_variable wake_, done_;
-  std::atomic<std::uint64_t> generation_{0};
-  std::atomic<std::int64_t> next_{0};
-  std::atomic<int> busy_{0};
+  std::condition_variable wake_, finished_;
+  Loop loop_{0, 0, nullptr, nullptr};
+  std::atomic<std::uint64_t> next_{0};  // generation << 32 | next chunk
+  std::atomic<std::int64_t> done_{0};
   bool stopping_ = false;
-  detail::ChunkFunction function_ = nullptr;
-  void* context_ = nullptr;
-  std::int64_t chunks_ = 0;
   static thread_local bool inside_loop_;
 };
 

@@ -31,7 +31,7 @@ def track_gauss_newton(
     """Tracks one frame against a frozen scene; all iterations in one call.
 
     Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the
-    step to a norm of 0.15. The kernel width k goes geometrically from `kernel_start` to `kernel_end`, which it reaches one
+    step to a norm of 0.15. The kernel width k goes geometrically from `kernel_start` to `kernel_end`, reached one
     iteration before the last. Points outside the map, or where |s| >= 0.98, take no part.
 
     Args:
@@ -108,8 +108,8 @@ def gauss_newton_poses(
         kernel: width k of the robust kernel, m.
 
     Returns:
-        H float32 [F, 6, 6], gradient float32 [F, 6], weighted mean squared residual float32 [F] (m^2), share of pixels on
-        mapped surface float32 [F]. F = 0 or N = 0 gives empty tensors or zeros.
+        H float32 [F, 6, 6], gradient float32 [F, 6], weighted mean squared residual float32 [F] (m^2), share of pixels
+        on mapped surface float32 [F]. F = 0 or N = 0 gives empty tensors or zeros.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.

@@ -12,7 +12,9 @@ AGREEMENT_M = 0.1
 MIN_DEPTH_M = 0.05
 
 
-def overlap(points: torch.Tensor, rotations: torch.Tensor, centers: torch.Tensor, lattices: torch.Tensor, camera: Camera):
+def overlap(
+    points: torch.Tensor, rotations: torch.Tensor, centers: torch.Tensor, lattices: torch.Tensor, camera: Camera
+):
     """Share of world points that fall in each frame's view and agree with its depth.
 
     Args:

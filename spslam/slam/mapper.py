@@ -8,7 +8,7 @@ from spslam.config import Config
 from spslam.geometry import quaternion_to_matrix
 from spslam.prior import Prior, encode_frame
 from spslam.slam.covisibility import POINTS, select_frames
-from spslam.slam.optimization import BETA1, BETA2, EPSILON, quaternion_gradient, render_options
+from spslam.slam.optimization import quaternion_gradient, render_options
 from spslam.slam.pixels import FramePixels, unpack_points
 from spslam.slam.state import Moments, SlamState
 
@@ -29,7 +29,9 @@ class Mapper:
         points = self._to_world(unpack_points(pixels.records, self.camera), pose)
         encode_frame(state.scene.volume, points, self._rotate(pixels.normals, pose), self.prior, self.config.prior)
         margin = self.config.scene.truncation_m
-        state.scene.planes.cover(torch.stack([points.min(0).values - margin, points.max(0).values + margin]))
+        moved = state.scene.planes.cover(torch.stack([points.min(0).values - margin, points.max(0).values + margin]))
+        if moved is not None and "texels" in state.moments:
+            state.moments["texels"].move_rows(moved, len(state.scene.planes.texels))
 
     def optimize(self, state: SlamState, iterations: int) -> torch.Tensor | None:
         """Joint optimisation of scene and poses over selected frames.
@@ -99,7 +101,9 @@ class Mapper:
         mapping, scene = self.config.mapping, state.scene
         if mapping.optimize_geometry:
             self._adam_rows(state, "embeddings", scene.volume.embeddings, mapping.embedding_rate)
-            self._adam_dense(state, "geometry_decoder", scene.geometry_decoder, step.grad_geometry, mapping.decoder_rate)
+            self._adam_dense(
+                state, "geometry_decoder", scene.geometry_decoder, step.grad_geometry, mapping.decoder_rate
+            )
         if self.config.loss.rgb > 0:
             self._adam_rows(state, "texels", scene.planes.texels, mapping.plane_rate)
             self._adam_dense(state, "color_decoder", scene.color_decoder, step.grad_color, mapping.color_decoder_rate)
@@ -113,11 +117,8 @@ class Mapper:
             m.second[:rows],
             m.stamps[:rows],
             state.stamp,
-            rate,
-            BETA1,
-            BETA2,
-            EPSILON,
-            state.steps,
+            lr=rate,
+            step=state.steps,
         )
 
     def _adam_dense(
@@ -125,10 +126,8 @@ class Mapper:
     ) -> None:
         if rate == 0:
             return
-        m = _moments(state, name, parameter[:, None])
-        ops.sparse_adam_(
-            parameter[:, None], gradient[:, None], m.first, m.second, None, 0, rate, BETA1, BETA2, EPSILON, state.steps
-        )
+        m = _moments(state, name, parameter)
+        ops.sparse_adam_(parameter, gradient, m.first, m.second, lr=rate, step=state.steps)
 
     def _step_poses(self, state: SlamState, selected: torch.Tensor, grad_poses: torch.Tensor) -> None:
         poses = state.frames.poses
@@ -145,9 +144,7 @@ class Mapper:
         config, frames, newest = self.config, state.frames, len(state.frames) - 1
         usable = state.pixels.has_pixels & ~frames.lost
         records = state.pixels.records[newest]
-        draw = ops.sample_indices(
-            config.seed, ops.Stream.COVISIBILITY, newest, 0, POINTS, len(records), records.device
-        )
+        draw = ops.sample_indices(config.seed, ops.Stream.COVISIBILITY, newest, 0, POINTS, len(records), records.device)
         points = self._to_world(unpack_points(records[draw], self.camera), frames.poses[newest])
         rotations = _rotations(frames.poses)
         return select_frames(points, rotations, frames.poses[:, 4:], frames.lattices, usable, self.camera, config)

@@ -63,7 +63,9 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
     offset = LATTICE_STEP_PX // 2
     lattice = depth[offset::LATTICE_STEP_PX, offset::LATTICE_STEP_PX]
     return FramePixels(
-        records=torch.from_numpy(_pack(u, v, depth.ravel()[chosen], frame.color.reshape(-1, 3)[chosen], normals, camera)),
+        records=torch.from_numpy(
+            _pack(u, v, depth.ravel()[chosen], frame.color.reshape(-1, 3)[chosen], normals, camera)
+        ),
         normals=normals,
         lattice=torch.from_numpy(lattice.astype(np.float16)),
         valid_share=len(valid) / depth.size,
@@ -73,7 +75,9 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
 def usable_depth(depth: np.ndarray, min_depth_m: float, max_depth_m: float) -> np.ndarray:
     """float32 [H, W] depth (m) with everything outside the range, and what is not finite, set to 0."""
     usable = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
-    return np.where((usable >= min_depth_m) & (usable <= max_depth_m), usable, np.float32(0)).astype(np.float32, copy=False)
+    return np.where((usable >= min_depth_m) & (usable <= max_depth_m), usable, np.float32(0)).astype(
+        np.float32, copy=False
+    )
 
 
 def unpack_points(records: torch.Tensor, camera: Camera) -> torch.Tensor:

@@ -87,6 +87,14 @@ class Moments:
             grown[: len(old)] = old
             setattr(self, name, grown)
 
+    def move_rows(self, rows: torch.Tensor, count: int) -> None:
+        """Moves row i to row `rows[i]` of `count` rows, the others zero; for a parameter whose rows moved."""
+        for name in ("first", "second", "gradient", "stamps"):
+            old = getattr(self, name)
+            moved = old.new_zeros((count, *old.shape[1:]))
+            moved[rows] = old[: len(rows)]
+            setattr(self, name, moved)
+
     def reset(self) -> None:
         """Forgets the past steps."""
         self.first.zero_()

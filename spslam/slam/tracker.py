@@ -102,9 +102,7 @@ class Tracker:
         best, best_pose = math.inf, start
         iterations = self._iterations(frame)
         for iteration in range(iterations):
-            draw = ops.sample_indices(
-                seed, ops.Stream.TRACKING_PIXELS, frame, iteration, count, len(records), device
-            )
+            draw = ops.sample_indices(seed, ops.Stream.TRACKING_PIXELS, frame, iteration, count, len(records), device)
             step = ops.render_step(
                 scene.view(),
                 ops.RayBatch(records[draw], ray_frames, pose, ops.Intrinsics(*self.camera.intrinsics)),

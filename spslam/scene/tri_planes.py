@@ -1,0 +1,128 @@
+"""Colour features on three axis-aligned planes that grow as the camera moves (section III.B)."""
+
+from collections.abc import Sequence
+
+import torch
+
+from spslam import ops
+
+FEATURES = 32
+MARGIN_M = 1.0  # grown beyond what is asked for, so that growth is rare
+INITIAL_STD = 0.01
+AXES = ((0, 1), (0, 2), (1, 2))  # of the xy, xz and yz planes
+_BLOCK = 32  # edge of a square of texels that share a Philox key
+_FIRST_KEY = 2**31  # keys of blocks lie around it, away from those of other initial values
+
+
+class TriPlanes:
+    """Feature texels of the xy, xz and yz planes, as the rows of one table.
+
+    A plane is a rectangle of texels (iu, iv) at world position (iu, iv) * cell_size_m. A texel's initial value depends on
+    the seed, its plane and its (iu, iv) only, so it does not matter in which steps a plane grew.
+
+    Attributes:
+        cell_size_m: edge of a texel, m.
+        texels: float32 [P, 32].
+        layout: 15 ints, (first row, origin u, origin v, size u, size v) of each plane, as `ops.tri_plane_interpolate`
+            takes them.
+    """
+
+    def __init__(self, cell_size_m: float, seed: int = 0, device: torch.device | str = "cpu"):
+        """Planes of no extent."""
+        if not cell_size_m > 0:
+            raise ValueError(f"TriPlanes: cell_size_m must be positive, got {cell_size_m}")
+        self.cell_size_m = float(cell_size_m)
+        self.seed = seed
+        self.texels = torch.zeros(0, FEATURES, device=device)
+        self.layout = [0] * 15
+
+    def interpolate(self, points: torch.Tensor) -> torch.Tensor:
+        """Sum of the three planes' features (eq. 3): float32 [N, 32] at float32 [N, 3] points, m."""
+        return ops.tri_plane_interpolate(self.texels, points, self.cell_size_m, self.layout)
+
+    def cover(self, points: torch.Tensor) -> torch.Tensor | None:
+        """Grows the planes until they reach beyond all points; what they hold is kept.
+
+        Args:
+            points: float [N, 3], m; rows with NaN or infinity are left out.
+
+        Returns:
+            int64 [old P] the new row of every old one, for buffers kept beside the texels; None where nothing grew.
+        """
+        points = points[points.isfinite().all(1)]
+        if len(points) == 0:
+            return None
+        low = (points.min(0).values / self.cell_size_m).floor().long().tolist()
+        high = (points.max(0).values / self.cell_size_m).ceil().long().tolist()
+        margin = round(MARGIN_M / self.cell_size_m)
+        planes = [self._extended(plane, low, high, margin) for plane in range(3)]
+        if planes == [self._rectangle(plane) for plane in range(3)]:
+            return None
+        return self._regrow(planes)
+
+    def restore(self, texels: torch.Tensor, layout: Sequence[int]) -> None:
+        """Takes over saved texels and layout."""
+        rows = sum(layout[5 * plane + 3] * layout[5 * plane + 4] for plane in range(3)) if len(layout) == 15 else -1
+        if texels.shape != (rows, FEATURES):
+            raise ValueError(f"TriPlanes: texels must have the rows of layout, got {list(texels.shape)}")
+        self.texels = texels.to(self.texels.device, torch.float32).clone()
+        self.layout = [int(value) for value in layout]
+
+    def _rectangle(self, plane: int) -> tuple[int, int, int, int]:
+        """(origin u, origin v, size u, size v)."""
+        _, u, v, size_u, size_v = self.layout[5 * plane : 5 * plane + 5]
+        return u, v, size_u, size_v
+
+    def _extended(self, plane: int, low: list[int], high: list[int], margin: int) -> tuple[int, int, int, int]:
+        """The rectangle of a plane that holds low..high too; an axis that must grow gets a margin on that side."""
+        origins, sizes = [], []
+        for slot, axis in enumerate(AXES[plane]):
+            begin, size = self._rectangle(plane)[slot], self._rectangle(plane)[slot + 2]
+            end = begin + size
+            if size == 0:
+                begin, end = low[axis] - margin, high[axis] + 1 + margin
+            if low[axis] < begin:
+                begin = low[axis] - margin
+            if high[axis] >= end:
+                end = high[axis] + 1 + margin
+            origins.append(begin)
+            sizes.append(end - begin)
+        return origins[0], origins[1], sizes[0], sizes[1]
+
+    def _regrow(self, planes: list[tuple[int, int, int, int]]) -> torch.Tensor:
+        texels, layout, moved, first = [], [], [], 0
+        for plane, (u, v, size_u, size_v) in enumerate(planes):
+            old_first, old_u, old_v, old_size_u, old_size_v = self.layout[5 * plane : 5 * plane + 5]
+            grown = self._initial(plane, u, v, size_u, size_v)
+            rows = torch.arange(size_u * size_v, device=self.texels.device).view(size_u, size_v)
+            inside = (slice(old_u - u, old_u - u + old_size_u), slice(old_v - v, old_v - v + old_size_v))
+            old = self.texels[old_first : old_first + old_size_u * old_size_v]
+            if len(old):
+                grown[inside] = old.view(old_size_u, old_size_v, FEATURES)
+                moved.append(first + rows[inside].reshape(-1))
+            texels.append(grown.reshape(-1, FEATURES))
+            layout += [first, u, v, size_u, size_v]
+            first += size_u * size_v
+        self.texels, self.layout = torch.cat(texels), layout
+        return torch.cat(moved) if moved else torch.zeros(0, dtype=torch.int64, device=self.texels.device)
+
+    def _initial(self, plane: int, u: int, v: int, size_u: int, size_v: int) -> torch.Tensor:
+        """Initial texels [size_u, size_v, 32]: N(0, 0.01), cut out of blocks that lie at fixed places of the world."""
+        first_u, first_v = u // _BLOCK, v // _BLOCK
+        last_u, last_v = (u + size_u - 1) // _BLOCK, (v + size_v - 1) // _BLOCK
+        columns = [
+            torch.cat([self._initial_block(plane, bu, bv) for bv in range(first_v, last_v + 1)], 1)
+            for bu in range(first_u, last_u + 1)
+        ]
+        begin_u, begin_v = u - first_u * _BLOCK, v - first_v * _BLOCK
+        return torch.cat(columns)[begin_u : begin_u + size_u, begin_v : begin_v + size_v].contiguous()
+
+    def _initial_block(self, plane: int, block_u: int, block_v: int) -> torch.Tensor:
+        """Texels [_BLOCK, _BLOCK, 32] of the block with these world coordinates."""
+        count = _BLOCK * _BLOCK * 2 * FEATURES
+        frame, iteration = block_u & 0xFFFFFFFF, _FIRST_KEY + 4 * block_v + plane
+        stream = ops.Stream.INITIALIZATION
+        uniform = ops.philox_uniform(self.seed, stream, frame, iteration, count, self.texels.device)
+        first, second = uniform.view(_BLOCK, _BLOCK, 2, FEATURES).unbind(2)
+        # Box and Muller; 1 - u lies in (0, 1].
+        return INITIAL_STD * (-2 * torch.log(1 - first)).sqrt() * torch.cos(2 * torch.pi * second)
