@@ -23,6 +23,7 @@ _FRAME_COLUMNS = ("poses", "timestamps", "indices", "lost", "lattices")
 def fingerprint(config: Config) -> str:
     """Identifies what decides a run's result; devices, threads and checkpoint intervals do not take part."""
     content = config.model_dump(mode="json")
+    content["dataset"].pop("path", None)
     for section in ("run", "mesh"):
         content.pop(section, None)
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -5,7 +5,7 @@ import torch
 
 from spslam.scene.tri_planes import INITIAL_STD, TriPlanes
 
-CELL = 0.04
+CELL = 0.2
 
 
 def _points(*rows):
@@ -33,8 +33,8 @@ def test_growth_keeps_what_was_there(device):
     before, old_rows = planes.interpolate(points), planes.texels.clone()
     moved = planes.cover(_points([-5, 7, 3], [4, -6, -5]).to(device))
     assert torch.equal(planes.texels[moved], old_rows)
-    # A texel position of about 200 has a rounding of 1e-5, which the new origin shifts.
-    assert torch.allclose(planes.interpolate(points), before, atol=3e-4)
+    # The new origin shifts positions of tens of texels, which float32 holds to 4e-6.
+    assert torch.allclose(planes.interpolate(points), before, atol=1e-4)
 
 
 def test_initial_values_do_not_depend_on_the_steps_of_growth(device):
@@ -44,7 +44,8 @@ def test_initial_values_do_not_depend_on_the_steps_of_growth(device):
         in_steps.cover(_points([-reach] * 3, [reach] * 3).to(device))
     points = (torch.rand(300, 3) * 12 - 6).to(device)
     assert torch.allclose(at_once.interpolate(points), in_steps.interpolate(points), atol=1e-5)
-    assert abs(float(at_once.texels.std()) - INITIAL_STD) < 2e-4 and abs(float(at_once.texels.mean())) < 1e-4
+    # 11,000 texels x 32 normal numbers: five standard errors.
+    assert abs(float(at_once.texels.std()) - INITIAL_STD) < 7e-5 and abs(float(at_once.texels.mean())) < 9e-5
 
 
 def test_seeds_differ():
