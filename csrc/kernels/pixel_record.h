@@ -5,7 +5,6 @@
 #pragma once
 
 #include <cstdint>
-#include <cstring>
 
 #include "core/macros.h"
 #include "core/vec.h"
@@ -29,7 +28,7 @@ SPS_INLINE Pixel unpack_pixel(const std::int32_t* words) {
   Pixel pixel;
   pixel.u = static_cast<float>(uv & 0xFFFFu);
   pixel.v = static_cast<float>(uv >> 16);
-  memcpy(&pixel.depth, words + 1, sizeof(float));
+  __builtin_memcpy(&pixel.depth, words + 1, sizeof(float));
   for (int k = 0; k < 3; ++k) pixel.color[k] = static_cast<float>((rgbc >> (8 * k)) & 0xFFu) * (1.0f / 255.0f);
   const float c = static_cast<float>(rgbc >> 24) * kForeshorteningStep;
   pixel.foreshortening = c == 0.0f ? 1.0f : (c < kMinForeshortening ? kMinForeshortening : c);
