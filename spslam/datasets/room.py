@@ -62,6 +62,10 @@ class Room:
             np.minimum(distance, piece.solid.signed_distance(points), out=distance)
         return distance
 
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance [N] of points [N,3] to the nearest surface; exact in free space, see :meth:`signed_distance`."""
+        return np.abs(self.signed_distance(points))
+
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
         """Points [count,3] spread evenly by area over the surfaces that face free space; float64, metres.
 

@@ -1,0 +1,1 @@
+"""What a run is judged by: trajectories, surfaces, depth and colour images."""

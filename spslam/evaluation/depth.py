@@ -1,0 +1,56 @@
+"""Rendered depth and colour images against true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+
+def depth_l1(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+    """Mean absolute depth difference over views.
+
+    Parameters
+    ----------
+    views : pairs (estimated, reference) of depth images of one shape, metres, 0 or non-finite where there is none.
+
+    Returns
+    -------
+    ``depth_l1_cm`` : the mean, over views, of the mean difference over pixels where both have depth.
+    ``depth_l1_coverage`` : percent of the reference's pixels with depth where the estimate has depth too; without it a
+    map that renders little would look good.
+    Empty when no view has a pixel to compare.
+    """
+    means, compared, known = [], 0, 0
+    for estimated, reference in views:
+        if estimated.shape != reference.shape:
+            raise ValueError(
+                f"depth_l1: estimated and reference must have one shape, got {estimated.shape} and {reference.shape}"
+            )
+        has_reference = np.isfinite(reference) & (reference > 0)
+        both = has_reference & np.isfinite(estimated) & (estimated > 0)
+        known += int(has_reference.sum())
+        compared += int(both.sum())
+        if both.any():
+            means.append(np.mean(np.abs(estimated[both].astype(np.float64) - reference[both])))
+    if not means:
+        return {}
+    return {"depth_l1_cm": 100 * float(np.mean(means)), "depth_l1_coverage": 100 * compared / known}
+
+
+def psnr_db(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of uint8 images [H,W,3], over the pixels of a mask [H,W] if given.
+
+    ``10 log10(255^2 / MSE)``; infinite for equal images, NaN for an empty mask.
+    """
+    if rendered.shape != reference.shape:
+        raise ValueError(
+            f"psnr_db: rendered and reference must have one shape, got {rendered.shape} and {reference.shape}"
+        )
+    squared = (rendered.astype(np.float64) - reference) ** 2
+    if mask is not None:
+        squared = squared[mask]
+    if not squared.size:
+        return float("nan")
+    error = float(squared.mean())
+    return float("inf") if error == 0 else 10 * float(np.log10(255**2 / error))
