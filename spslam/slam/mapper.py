@@ -19,6 +19,7 @@ class Mapper:
     def __init__(self, config: Config, camera: Camera, prior: Prior | None):
         self.config = config
         self.camera = camera
+        self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self.prior = prior
 
     def integrate(self, state: SlamState, pixels: FramePixels) -> None:
@@ -74,7 +75,7 @@ class Mapper:
                 records,
                 slot.to(device, torch.int32),
                 state.frames.poses[selected],
-                ops.Intrinsics(*self.camera.intrinsics),
+                self.intrinsics,
             ),
             render_options(config, ops.Stream.MAPPING_RAYS, newest, iteration),
             gradients,

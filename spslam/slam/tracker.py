@@ -41,6 +41,7 @@ class Tracker:
     def __init__(self, config: Config, camera: Camera):
         self.config = config
         self.camera = camera
+        self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose where there is only one, or after loss."""
@@ -76,7 +77,7 @@ class Tracker:
             scene.view(),
             records,
             start,
-            ops.Intrinsics(*self.camera.intrinsics),
+            self.intrinsics,
             num_pixels=tracking.pixels,
             iterations=self._iterations(frame),
             truncation=scene.settings.truncation_m,
@@ -105,7 +106,7 @@ class Tracker:
             draw = ops.sample_indices(seed, ops.Stream.TRACKING_PIXELS, frame, iteration, count, len(records), device)
             step = ops.render_step(
                 scene.view(),
-                ops.RayBatch(records[draw], ray_frames, pose, ops.Intrinsics(*self.camera.intrinsics)),
+                ops.RayBatch(records[draw], ray_frames, pose, self.intrinsics),
                 render_options(self.config, ops.Stream.TRACKING_RAYS, frame, iteration),
             )
             loss = float(step.losses[0])
