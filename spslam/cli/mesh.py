@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from spslam.cli.arguments import add_quiet, add_run_folder, positive_metres, require_run_file
+from spslam.cli.arguments import add_run_folder, positive_metres, require_run_file
 from spslam.config import load_config
 
 FORMATS = ("ply", "glb", "obj")
@@ -14,7 +14,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_folder(parser)
     parser.add_argument("--resolution", metavar="M", type=positive_metres, help="edge of a cell in metres")
     parser.add_argument("--format", choices=FORMATS, default="ply", help="file format, ply if not given")
-    add_quiet(parser)
 
 
 def execute(args: argparse.Namespace) -> None:
@@ -27,5 +26,4 @@ def execute(args: argparse.Namespace) -> None:
     mesh = extract_mesh(Scene.load(map_file), resolution)
     path = args.output / f"mesh.{args.format}"
     save_mesh(mesh, path)
-    if not args.quiet:
-        print(f"{path}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
+    print(f"{path}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")

@@ -60,8 +60,9 @@ def render_mesh(
     picture. Deterministic; a million small faces at 640x480 take about a second.
     """
     fine = camera.resized(camera.width * supersampling, camera.height * supersampling)
-    raster = rasterize(vertices, faces, fine, T_world_camera, cull_back)
-    picture = _shade(np.asarray(vertices), np.asarray(faces), colors, fine, T_world_camera, raster)
+    points, faces = _to_camera(np.asarray(vertices), T_world_camera), np.asarray(faces).reshape(-1, 3)
+    raster = _rasterize(points, faces, fine, cull_back)
+    picture = _shade(points, faces, colors, fine, raster)
     if supersampling == 1:
         return picture, raster.depth
     size = camera.width, camera.height
@@ -78,7 +79,11 @@ def rasterize(
     Arguments as for :func:`render_mesh`. Of faces at the same depth the one with the highest number wins.
     """
     points = _to_camera(np.asarray(vertices), T_world_camera)
-    corners, ids = _clip(points, _in_view(points, np.asarray(faces).reshape(-1, 3), camera))
+    return _rasterize(points, np.asarray(faces).reshape(-1, 3), camera, cull_back)
+
+
+def _rasterize(points: np.ndarray, faces: np.ndarray, camera: Camera, cull_back: bool) -> Raster:
+    corners, ids = _clip(points, _in_view(points, faces, camera))
     setup = _Setup.of(corners, ids, camera, cull_back)
     inverse_depth = np.zeros(camera.height * camera.width, dtype=np.float32)
     winners = np.full(camera.height * camera.width, -1, dtype=np.int32)
@@ -224,26 +229,22 @@ def _pixel_range(coordinates: np.ndarray, size: int) -> tuple[np.ndarray, np.nda
 
 
 def _shade(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    colors: np.ndarray | None,
-    camera: Camera,
-    T_world_camera: np.ndarray,
-    raster: Raster,
+    points: np.ndarray, faces: np.ndarray, colors: np.ndarray | None, camera: Camera, raster: Raster
 ) -> np.ndarray:
     hit = raster.face_ids >= 0
     picture = np.full((*hit.shape, 3), _BACKGROUND, dtype=np.uint8)
     if not hit.any():
         return picture
-    corners = _to_camera(vertices[faces[raster.face_ids[hit]]].reshape(-1, 3), T_world_camera).reshape(-1, 3, 3)
-    points = (camera.ray_directions() * raster.depth[..., None])[hit]
+    shown = faces[raster.face_ids[hit]]
+    corners = points.astype(np.float32)[shown]
+    places = (camera.ray_directions() * raster.depth[..., None])[hit]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    light = _lighting(normals, points, hit)
+    light = _lighting(normals, places, hit)
     if colors is None:
         base: np.ndarray | float = 200.0
     else:
-        weights = _barycentric(corners, points, normals)
-        base = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[faces[raster.face_ids[hit]], :3].astype(np.float32))
+        weights = _barycentric(corners, places, normals)
+        base = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[shown, :3].astype(np.float32))
     picture[hit] = np.clip(base * light[:, None], 0, 255).astype(np.uint8)
     return picture
 

@@ -1,0 +1,82 @@
+"""``spslam demo``: the whole system on a generated room whose truth is known; nothing to download."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+from spslam.cli.arguments import add_device, at_least_one, overrides
+from spslam.cli.progress import print_summary
+from spslam.cli.run import run
+from spslam.config import load_config
+from spslam.errors import ConfigError, OutputError
+
+DEFAULT_OUTPUT = Path("runs/demo")
+# What a run leaves; an earlier demo's are removed, anything else is left alone.
+RUN_FILES = (
+    "checkpoint.safetensors",
+    "config.yaml",
+    "log.jsonl",
+    "map.safetensors",
+    "mesh.ply",
+    "metrics.json",
+    "report.html",
+    "skipped.jsonl",
+    "trajectory.txt",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--output",
+        metavar="DIR",
+        type=Path,
+        default=DEFAULT_OUTPUT,
+        help=f"{DEFAULT_OUTPUT} if not given; an earlier demo there is replaced",
+    )
+    add_device(parser)
+    parser.add_argument("--frames", metavar="N", type=at_least_one, help="only the first N of the 300 frames")
+
+
+def execute(args: argparse.Namespace) -> None:
+    config = load_config("demo", overrides=overrides(args))
+
+    from spslam.slam.run import resolve_device
+
+    resolve_device(config.device)
+    _remove_earlier_demo(args.output)
+    frames = None if args.frames is None else slice(0, args.frames, 1)
+    run(config, args.output, frames, resume=False, mesh=True, quiet=False)
+    print_summary(_evaluate(args.output), args.output)
+
+
+def _remove_earlier_demo(output: Path) -> None:
+    if not (output / "config.yaml").is_file():
+        return
+    try:
+        earlier = load_config(output / "config.yaml")
+    except ConfigError as error:
+        raise OutputError(f"{output}: holds something that isn't a demo; use another --output") from error
+    if earlier.dataset.type != "generated":
+        raise OutputError(f"{output}: holds a run over other data; use another --output")
+    for name in RUN_FILES:
+        (output / name).unlink(missing_ok=True)
+    shutil.rmtree(output / "previews", ignore_errors=True)
+
+
+def _evaluate(output: Path) -> dict:
+    """Adds the mesh's figures, by the room's exact surface, to metrics and report."""
+    from spslam.datasets.generated import GeneratedDataset
+    from spslam.datasets.registry import open_dataset
+    from spslam.evaluation.finished_run import add_metrics, surface_figures
+    from spslam.evaluation.report import write_report
+    from spslam.evaluation.run_output import RunOutput
+
+    dataset = open_dataset(load_config(output / "config.yaml").dataset)
+    finished = RunOutput.read(output)
+    if not isinstance(dataset, GeneratedDataset) or finished.mesh() is None:
+        return finished.metrics
+    metrics = add_metrics(finished, surface_figures(finished, dataset, dataset.room.sample_surface))
+    write_report(output)
+    return metrics

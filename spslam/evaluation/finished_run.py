@@ -1,0 +1,78 @@
+"""A finished run against the truth: its trajectory, and its mesh where the camera saw the surface."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spslam.datasets.base import RgbdDataset
+from spslam.errors import OutputError
+from spslam.evaluation.mesh import SAMPLES, observed_mask, observed_samples, sample_mesh, surface_metrics
+from spslam.evaluation.run_output import RunOutput, match_times
+from spslam.evaluation.trajectory import align, ate, rpe
+from spslam.io import atomic_write
+
+# Frames that decide what was observed; more of a sequence's neighbours add nothing but time.
+_CULLING_FRAMES = 200
+
+SurfaceSampler = Callable[[int, int], np.ndarray]
+
+
+def trajectory_figures(run: RunOutput) -> dict[str, float]:
+    """ATE and RPE as metrics.json names them; empty where no true pose is known."""
+    if run.truth is None:
+        return {}
+    return {**ate(run.trajectory.poses, run.truth), **rpe(run.trajectory.poses, run.truth)}
+
+
+def surface_figures(run: RunOutput, dataset: RgbdDataset, sample_truth: SurfaceSampler) -> dict[str, float]:
+    """Accuracy, completeness and F1 of the run's mesh, as metrics.json names them.
+
+    The mesh is carried into the truth's world by the alignment of the trajectories (rigid); surface that no frame
+    observed is left out on both sides.
+
+    Parameters
+    ----------
+    run : with a mesh.
+    dataset : the one that the run was over, or that it took its frames from; its depth says what was observed.
+    sample_truth : gives n points [n,3] of the true surface for (n, seed).
+
+    Raises
+    ------
+    OutputError
+        When the run has no mesh, or none of its frames is in the dataset.
+    """
+    mesh = run.mesh()
+    if mesh is None:
+        raise OutputError(f"{run.folder}: has no mesh to evaluate; spslam mesh {run.folder} makes one")
+    rows, indices = _frames_of(run, dataset)
+    poses = run.trajectory.poses if run.truth is None else run.truth
+    vertices = mesh.vertices if run.truth is None else align(run.trajectory.poses, run.truth).apply(mesh.vertices)
+
+    def observed(points: np.ndarray) -> np.ndarray:
+        depths = (dataset[int(index)].depth for index in indices)
+        return observed_mask(points, depths, poses[rows], dataset.camera)
+
+    reconstructed = observed_samples(lambda count, seed: sample_mesh(vertices, mesh.faces, count, seed), observed)
+    return surface_metrics(reconstructed, observed_samples(sample_truth, observed, SAMPLES))
+
+
+def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
+    """Write metrics.json with further figures; returns all of them."""
+    metrics = {**run.metrics, **figures}
+    atomic_write(Path(run.folder) / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+    return metrics
+
+
+def _frames_of(run: RunOutput, dataset: RgbdDataset) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the run's trajectory, spread evenly, and the dataset's numbers of those frames."""
+    indices = match_times(dataset.timestamps(), run.trajectory.timestamps)
+    rows = np.flatnonzero(indices >= 0)
+    if not len(rows):
+        raise OutputError(f"{run.folder}: must be a run over {dataset.name}, but has none of its frames")
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _CULLING_FRAMES).round().astype(int))]
+    return rows, indices[rows]

@@ -1,0 +1,253 @@
+"""report.html: one file that shows a run, made from the other files in its output folder."""
+
+from __future__ import annotations
+
+import html
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.evaluation import charts, pictures
+from spslam.evaluation.report_style import STYLE
+from spslam.evaluation.run_output import Mesh, Preview, RunOutput
+from spslam.evaluation.trajectory import align
+from spslam.io import atomic_write
+from spslam.meshing.render import render_mesh
+
+VIEWS = 3
+# The figures at the top: name, key of metrics.json, form.
+_TILES = (
+    ("frames", "frames", "{:,}"),
+    ("frames a second", "fps", "{:.1f}"),
+    ("ATE RMSE", "ate_rmse_cm", "{:.2f} cm"),
+    ("F1 at 5 cm", "f1_5cm", "{:.1f} %"),
+    ("lost frames", "lost_frames", "{}"),
+    ("tracking, a frame", "tracking_fps", "{:.0f} /s"),
+    ("model", "model_mb", "{:.1f} MB"),
+    ("memory", "peak_rss_mb", "{:,.0f} MB"),
+)
+
+
+def write_report(output_dir: str | os.PathLike) -> Path:
+    """Write ``report.html`` of a finished run; returns its path.
+
+    Parameters
+    ----------
+    output_dir : the run's output folder. ``trajectory.txt`` and ``metrics.json`` must be there; ``mesh.ply``,
+        ``log.jsonl``, ``config.yaml`` and ``previews/`` (``camera.json``, ``truth.txt``, ``frame-NNNNNN.png`` and
+        ``depth-NNNNNN.png`` in 16-bit millimetres, numbered by row of the trajectory) add their parts where they are.
+
+    The file needs nothing from outside it: styles and pictures are inside, charts are SVG, there is no script.
+
+    Raises
+    ------
+    OutputError
+        When the folder is no finished run's, a file in it is damaged, or the report can't be written.
+    """
+    run = RunOutput.read(Path(output_dir))
+    sections = [_header(run), _tiles(run.metrics), *_map_sections(run)]
+    sections += [_trajectory(run), _errors(run), _time(run), _tracking(run), _figures(run.metrics), _settings(run)]
+    page = _PAGE.format(title=html.escape(_title(run)), style=STYLE, body="\n".join(sections))
+    path = run.folder / "report.html"
+    atomic_write(path, page)
+    return path
+
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<main>
+{body}
+</main>
+</body>
+</html>
+"""
+
+
+def _title(run: RunOutput) -> str:
+    return f"spslam: {run.folder.resolve().name}"
+
+
+def _header(run: RunOutput) -> str:
+    known = run.metrics
+    facts = [known.get("device_name"), f"spslam {known['version']}" if "version" in known else None]
+    facts.append(f"seed {known['seed']}" if "seed" in known else None)
+    text = " · ".join(html.escape(str(fact)) for fact in facts if fact)
+    return f"<header><h1>{html.escape(run.folder.resolve().name)}</h1><p>{text}</p></header>"
+
+
+def _tiles(metrics: dict[str, Any]) -> str:
+    tiles = [
+        f"<div><dt>{name}</dt><dd>{form.format(metrics[key])}</dd></div>"
+        for name, key, form in _TILES
+        if metrics.get(key) is not None
+    ]
+    return f'<dl class="tiles">{"".join(tiles)}</dl>'
+
+
+def _map_sections(run: RunOutput) -> list[str]:
+    mesh, previews = run.mesh(), run.previews()
+    if mesh is None or not len(run.trajectory):
+        return []
+    if run.camera is None:
+        return [_section("Map", _overview(run, mesh, mesh.faces))]
+    faces = pictures.outward_faces(mesh, run.camera, run.trajectory.poses[0])
+    sections = [_section("Map", _overview(run, mesh, faces))]
+    views = [_view(run, mesh, run.camera, preview) for preview in _spread(previews, VIEWS)]
+    if views:
+        note = "Input beside the mesh as seen from the estimated pose"
+        sections.append(_section("Views", "".join(views), note))
+    return sections
+
+
+def _overview(run: RunOutput, mesh: Mesh, faces: np.ndarray) -> str:
+    picture = pictures.overview(mesh, faces, run.trajectory.poses)
+    caption = "The mesh from above, walls towards the viewer left out, and the camera's path; "
+    caption += f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+    return _figure(picture, 1200, caption, "map")
+
+
+def _spread(previews: list[Preview], count: int) -> list[Preview]:
+    rows = np.unique(np.linspace(0, len(previews) - 1, min(count, len(previews))).round().astype(int))
+    return [previews[row] for row in rows]
+
+
+def _view(run: RunOutput, mesh: Mesh, camera: Camera, preview: Preview) -> str:
+    """A row: input and rendered colour, input depth where it was kept, rendered depth."""
+    pose = run.trajectory.poses[preview.row]
+    color, depth = render_mesh(mesh.vertices, mesh.faces, mesh.colors, camera, pose, supersampling=2)
+    limits = pictures.depth_limits(depth if preview.depth is None else preview.depth)
+    images = [
+        _figure(preview.color, 480, f"frame {preview.row}, input"),
+        _figure(color, 480, "mesh"),
+    ]
+    if preview.depth is not None:
+        images.append(_figure(pictures.depth_picture(preview.depth, *limits), 480, "input depth"))
+    scale = f"mesh depth, {limits[0]:.1f} m yellow to {limits[1]:.1f} m violet"
+    images.append(_figure(pictures.depth_picture(depth, *limits), 480, scale))
+    return f'<div class="row">{"".join(images)}</div>'
+
+
+def _trajectory(run: RunOutput) -> str:
+    if not len(run.trajectory):
+        return ""
+    estimate, truth = _aligned_positions(run)
+    # Drawn in the estimate's axes as seen from above; with truth the two share them after alignment.
+    axes = pictures.top_axes(run.trajectory.poses)
+    origin = estimate[0]
+    plan_truth = None if truth is None else (truth - origin) @ axes
+    chart = charts.path_chart((estimate - origin) @ axes, plan_truth, run.trajectory.lost)
+    length = np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum()
+    return _section("Trajectory", chart, f"seen from above; {length:.2f} m long")
+
+
+def _errors(run: RunOutput) -> str:
+    estimate, truth = _aligned_positions(run) if len(run.trajectory) else (np.zeros((0, 3)), None)
+    if truth is None:
+        return ""
+    difference = 100 * (estimate - truth) @ np.column_stack([pictures.top_axes(run.trajectory.poses), _up(run)])
+    series = [charts.Series(name, name[0], column) for name, column in zip(_AXES, difference.T, strict=True)]
+    series.append(charts.Series("distance", "total", np.linalg.norm(difference, axis=1)))
+    chart = charts.line_chart(series, "cm", run.trajectory.lost)
+    return _section("Error over time", chart, "position after rigid alignment, along the first camera's axes")
+
+
+_AXES = ("right", "forward", "up")
+
+
+def _up(run: RunOutput) -> np.ndarray:
+    axes = pictures.top_axes(run.trajectory.poses)
+    return np.cross(axes[:, 0], axes[:, 1])
+
+
+def _aligned_positions(run: RunOutput) -> tuple[np.ndarray, np.ndarray | None]:
+    """Estimated positions [F,3], and the true ones carried into the estimate's world; None if none is known."""
+    estimate = run.trajectory.poses[:, :3, 3]
+    if run.truth is None:
+        return estimate, None
+    alignment = align(run.trajectory.poses, run.truth)
+    return estimate, (run.truth[:, :3, 3] - alignment.translation) @ alignment.rotation
+
+
+def _time(run: RunOutput) -> str:
+    if not run.log:
+        return ""
+    tracking, encoding, mapping = (_column(run, key) / 1000 for key in ("tracking_ms", "encode_ms", "mapping_ms"))
+    spent = float(np.nansum(tracking) + np.nansum(encoding) + np.nansum(mapping))
+    rest = max(float(run.metrics.get("wall_s", 0.0)) - spent, 0.0)
+    bar = charts.stacked_bar(
+        [
+            ("tracking", "tracking", float(np.nansum(tracking))),
+            ("encoding and fusion", "encoding", float(np.nansum(encoding))),
+            ("mapping", "mapping", float(np.nansum(mapping))),
+            ("reading and the rest", "rest", rest),
+            ("mesh", "mesh", float(run.metrics.get("mesh_s", 0.0))),
+        ],
+        "s",
+    )
+    mapped = encoding + mapping
+    mapped[mapped == 0] = np.nan
+    tracking[tracking == 0] = np.nan
+    # The first frame's long mapping would flatten the rest.
+    mapped[0] = np.nan
+    series = [
+        charts.Series("tracking, each frame", "tracking", 1000 * tracking),
+        charts.Series("mapping, where a frame is mapped", "mapping", 1000 * mapped, dots=True),
+    ]
+    note = f"images are decoded ahead on other threads, {run.metrics.get('decode_ms', 0):.1f} ms a frame"
+    first = (
+        f"first mapping {run.metrics['first_mapping_s']:.2f} s, not drawn; " if "first_mapping_s" in run.metrics else ""
+    )
+    return _section("Time", bar + charts.line_chart(series, "ms", run.trajectory.lost), first + note)
+
+
+def _tracking(run: RunOutput) -> str:
+    residual, inliers = _column(run, "residual_cm"), 100 * _column(run, "inliers")
+    if not np.isfinite(residual).any():
+        return ""
+    lost = run.trajectory.lost if len(run.trajectory) == len(residual) else None
+    body = charts.line_chart([charts.Series("distance from the map", "tracking", residual)], "cm", lost)
+    body += charts.line_chart([charts.Series("pixels on mapped surface", "encoding", inliers)], "%", lost)
+    return _section("Tracking", body, "how far each frame's depth is from the map, and how much of it is mapped")
+
+
+def _column(run: RunOutput, key: str) -> np.ndarray:
+    values = [entry.get(key) for entry in run.log]
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+
+def _figures(metrics: dict[str, Any]) -> str:
+    rows = "".join(f"<tr><th>{html.escape(key)}</th><td>{_format(value)}</td></tr>" for key, value in metrics.items())
+    return _section("All figures", f"<table>{rows}</table>", "as in metrics.json")
+
+
+def _format(value: Any) -> str:
+    return f"{value:,.4g}" if isinstance(value, float) and abs(value) < 1e5 else html.escape(str(value))
+
+
+def _settings(run: RunOutput) -> str:
+    if not run.config:
+        return ""
+    return f"<section><details><summary>Settings</summary><pre>{html.escape(run.config)}</pre></details></section>"
+
+
+def _section(title: str, body: str, note: str = "") -> str:
+    if not body:
+        return ""
+    below = f"<p>{html.escape(note)}</p>" if note else ""
+    return f"<section><h2>{html.escape(title)}</h2>{below}{body}</section>"
+
+
+def _figure(image: np.ndarray, max_width: int, caption: str, kind: str = "view") -> str:
+    source = pictures.png_uri(image, max_width)
+    text = html.escape(caption)
+    return f'<figure class="{kind}"><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'

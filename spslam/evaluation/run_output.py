@@ -1,0 +1,163 @@
+"""Reading back what a run left in its output folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+from spslam.camera import Camera
+from spslam.errors import OutputError
+from spslam.trajectory import Trajectory
+
+# Files keep a microsecond.
+_SAME_TIME_S = 2e-6
+
+
+@dataclass(frozen=True)
+class Preview:
+    """An input frame kept as pictures: its row in the trajectory, uint8 [H,W,3] RGB, float32 [H,W] metres or None."""
+
+    row: int
+    color: np.ndarray
+    depth: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Vertices [V,3] in metres, faces [L,3], colours uint8 [V,3]."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+
+
+@dataclass(frozen=True)
+class RunOutput:
+    """A finished run's files.
+
+    Attributes
+    ----------
+    folder : where they are.
+    trajectory : estimated, F frames.
+    truth : float64 [F,4,4] true poses of the same frames, NaN where unknown; None if none is known.
+    metrics : what metrics.json holds.
+    log : one entry a frame, as in log.jsonl.
+    config : text of config.yaml.
+    camera : None where the run kept no previews.
+    """
+
+    folder: Path
+    trajectory: Trajectory
+    truth: np.ndarray | None
+    metrics: dict[str, Any]
+    log: list[dict[str, Any]]
+    config: str
+    camera: Camera | None
+
+    @classmethod
+    def read(cls, folder: Path) -> RunOutput:
+        """Read a run's small files; trajectory.txt and metrics.json must be there.
+
+        Raises
+        ------
+        OutputError
+            When the folder is no finished run's, or a file in it is damaged.
+        """
+        for name in ("trajectory.txt", "metrics.json"):
+            if not (folder / name).is_file():
+                raise OutputError(f"{folder}: must be the output folder of a finished run, but has no {name}")
+        trajectory = Trajectory.load_tum(folder / "trajectory.txt")
+        return cls(
+            folder,
+            trajectory,
+            _read_truth(folder / "previews" / "truth.txt", trajectory.timestamps),
+            _parse(folder / "metrics.json", _read_text(folder / "metrics.json")),
+            [_parse(folder / "log.jsonl", line) for line in _read_text(folder / "log.jsonl").splitlines()],
+            _read_text(folder / "config.yaml"),
+            _read_camera(folder / "previews" / "camera.json"),
+        )
+
+    def previews(self) -> list[Preview]:
+        """The kept input frames, by row; ones that can't be read, or aren't in the trajectory, are left out."""
+        found = (_read_preview(path) for path in sorted((self.folder / "previews").glob("frame-*.png")))
+        return [preview for preview in found if preview is not None and preview.row < len(self.trajectory)]
+
+    def mesh(self) -> Mesh | None:
+        """mesh.ply; None where there is none or it is empty. Raises OutputError if it can't be read."""
+        path = self.folder / "mesh.ply"
+        if not path.is_file():
+            return None
+        try:
+            mesh = trimesh.load(path, process=False)
+        except Exception as error:  # trimesh raises whatever the parser stumbles over
+            raise OutputError(f"{path}: can't be read as a mesh: {error}") from error
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            return None
+        colors = np.asarray(mesh.visual.vertex_colors)[:, :3]  # type: ignore[union-attr]
+        return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), colors)
+
+
+def match_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """For each wanted time the index of the same one in ``times``, to the microsecond that files keep; -1 if absent."""
+    if not len(times):
+        return np.full(len(wanted), -1)
+    order = np.argsort(times, kind="stable")
+    after = np.clip(np.searchsorted(times[order], wanted), 1, max(len(times) - 1, 1)).clip(max=len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.where(np.abs(times[order[before]] - wanted) <= np.abs(times[order[after]] - wanted), before, after)
+    found = order[nearer]
+    return np.where(np.abs(times[found] - wanted) <= _SAME_TIME_S, found, -1)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8") if path.is_file() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise OutputError(f"{path}: can't be read: {error}") from error
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise OutputError(f"{path}: must be JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise OutputError(f"{path}: must hold a JSON object, got {type(value).__name__}")
+    return value
+
+
+def _read_camera(path: Path) -> Camera | None:
+    if not path.is_file():
+        return None
+    values = _parse(path, _read_text(path))
+    try:
+        return Camera(**values)
+    except (TypeError, ValueError) as error:
+        raise OutputError(f"{path}: must hold a camera: {error}") from error
+
+
+def _read_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    truth = Trajectory.load_tum(path)
+    poses = np.full((len(timestamps), 4, 4), np.nan)
+    rows = match_times(truth.timestamps, timestamps)
+    poses[rows >= 0] = truth.poses[rows[rows >= 0]]
+    return poses if np.isfinite(poses).any() else None
+
+
+def _read_preview(path: Path) -> Preview | None:
+    number = path.stem.removeprefix("frame-")
+    color = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if color is None or not number.isdecimal():
+        return None
+    depth_path = path.with_name(f"depth-{number}.png")
+    depth = cv2.imread(str(depth_path), cv2.IMREAD_UNCHANGED) if depth_path.is_file() else None
+    metres = None if depth is None else depth.astype(np.float32) / 1000
+    return Preview(int(number), cv2.cvtColor(color, cv2.COLOR_BGR2RGB), metres)
