@@ -1,0 +1,95 @@
+"""A triangle mesh as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Triangles with a colour and a normal at each vertex; K vertices, L faces, both may be 0.
+
+    Attributes:
+        vertices: float32 [K, 3], world, m.
+        faces: int32 [L, 3], indices of vertices, counter-clockwise seen from free space.
+        colors: uint8 [K, 3] RGB.
+        normals: float32 [K, 3] unit vectors towards free space; 0 where the faces around are degenerate.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+    normals: np.ndarray
+
+    def __post_init__(self) -> None:
+        rows = self.vertices.shape[0]
+        for name, array, shape, dtype in (
+            ("vertices", self.vertices, (rows, 3), np.float32),
+            ("faces", self.faces, (self.faces.shape[0], 3), np.int32),
+            ("colors", self.colors, (rows, 3), np.uint8),
+            ("normals", self.normals, (rows, 3), np.float32),
+        ):
+            if array.shape != shape or array.dtype != dtype:
+                wanted = f"{np.dtype(dtype).name} {list(shape)}"
+                raise ValueError(f"TriangleMesh: {name} must be {wanted}, got {array.dtype} {list(array.shape)}")
+
+    def select_faces(self, keep: np.ndarray) -> TriangleMesh:
+        """The mesh of the faces where bool `keep` [L] holds, without the vertices that no face uses any more.
+
+        Normals are kept as they were, so that a cut does not bend the shading beside it.
+        """
+        faces, used = compact(self.faces[keep], len(self.vertices))
+        return TriangleMesh(self.vertices[used], faces, self.colors[used], self.normals[used])
+
+
+def compact(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Renumbers faces over the vertices they use.
+
+    Args:
+        faces: integers [L, 3].
+        num_vertices: vertices they index into.
+
+    Returns:
+        int32 faces [L, 3] over the used vertices, and these vertices' old indices, ascending.
+    """
+    is_used = np.zeros(num_vertices, dtype=bool)
+    is_used[faces] = True
+    renumbered = np.cumsum(is_used, dtype=np.int32) - 1
+    return renumbered[faces].astype(np.int32, copy=False), np.flatnonzero(is_used)
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals [L, 3] of faces, as long as twice their area, on the side from which they turn counter-clockwise."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals float32 [K, 3] of vertices: the mean of the faces around, by area; 0 where there is none."""
+    around = face_normals(vertices, faces)
+    total = np.zeros((len(vertices), 3))
+    for axis in range(3):
+        for corner in range(3):
+            total[:, axis] += np.bincount(faces[:, corner], around[:, axis], len(vertices))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.divide(total, length, out=np.zeros_like(total), where=length > 0).astype(np.float32)
+
+
+def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Number [L] of the connected part each face belongs to; faces that share a vertex are connected."""
+    edges = np.concatenate((faces[:, :2], faces[:, 1:]))
+    graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), (num_vertices, num_vertices))
+    _, labels = connected_components(graph, directed=False)
+    return labels[faces[:, 0]]
+
+
+def drop_small_parts(faces: np.ndarray, num_vertices: int, min_faces: int) -> np.ndarray:
+    """Bool [L]: whether the connected part that a face belongs to has at least `min_faces` faces."""
+    if min_faces <= 1 or len(faces) == 0:
+        return np.ones(len(faces), dtype=bool)
+    part = face_components(faces, num_vertices)
+    return np.bincount(part)[part] >= min_faces

@@ -1,0 +1,145 @@
+"""The mesh as arrays, and its files."""
+
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from spslam.errors import OutputError
+from spslam.meshing import TriangleMesh, save_mesh
+from spslam.meshing.mesh import drop_small_parts, vertex_normals
+
+
+def _sphere(subdivisions=3, offset=0.0):
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
+    vertices = (shape.vertices + offset).astype(np.float32)
+    faces = shape.faces.astype(np.int32)
+    colors = (255 * (shape.vertices + 1) / 2).astype(np.uint8)
+    return TriangleMesh(vertices, faces, colors, vertex_normals(vertices, faces))
+
+
+def _empty():
+    return TriangleMesh(*(np.zeros((0, 3), dtype) for dtype in (np.float32, np.int32, np.uint8, np.float32)))
+
+
+def test_vertex_normals_of_a_sphere_are_its_radii():
+    mesh = _sphere(4)
+    assert np.abs(mesh.normals - mesh.vertices).max() < 1e-2
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, rtol=1e-6)
+
+
+def test_vertex_normals_agree_with_trimesh_weighted_by_area():
+    rng = np.random.default_rng(0)
+    vertices = rng.normal(size=(50, 3)).astype(np.float32)
+    faces = rng.integers(0, 50, (80, 3)).astype(np.int32)
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])]
+    shape = trimesh.Trimesh(vertices, faces, process=False)
+    want = np.zeros((50, 3))
+    for normal, area, corners in zip(shape.face_normals, shape.area_faces, faces, strict=True):
+        for corner in corners:
+            want[corner] += normal * area
+    used = np.linalg.norm(want, axis=1) > 0
+    want[used] /= np.linalg.norm(want[used], axis=1, keepdims=True)
+    np.testing.assert_allclose(vertex_normals(vertices, faces), want, atol=1e-5)
+
+
+def test_degenerate_faces_have_no_normal():
+    assert not vertex_normals(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32)).any()
+
+
+def test_select_faces_drops_unused_vertices():
+    mesh = _sphere()
+    keep = mesh.vertices[mesh.faces].mean(1)[:, 2] > 0
+    half = mesh.select_faces(keep)
+    assert len(half.faces) == keep.sum() and len(half.vertices) < len(mesh.vertices)
+    np.testing.assert_array_equal(half.vertices[half.faces], mesh.vertices[mesh.faces[keep]])
+    np.testing.assert_array_equal(half.colors[half.faces], mesh.colors[mesh.faces[keep]])
+    nothing = mesh.select_faces(np.zeros(len(mesh.faces), bool))
+    assert len(nothing.vertices) == len(nothing.faces) == 0
+
+
+def test_small_parts():
+    small, large = _sphere(1), _sphere(2)
+    faces = np.concatenate((small.faces, large.faces + len(small.vertices)))
+    count = len(small.vertices) + len(large.vertices)
+    is_large = np.arange(len(faces)) >= len(small.faces)
+    np.testing.assert_array_equal(drop_small_parts(faces, count, len(small.faces) + 1), is_large)
+    assert drop_small_parts(faces, count, len(small.faces)).all()
+    assert drop_small_parts(faces[:0], count, 100).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "field,array,message",
+    [
+        ("vertices", np.zeros((4, 3)), r"vertices must be float32 \[4, 3\], got float64 \[4, 3\]"),
+        ("faces", np.zeros((2, 3), np.int64), r"faces must be int32 \[2, 3\], got int64 \[2, 3\]"),
+        ("colors", np.zeros((4, 4), np.uint8), r"colors must be uint8 \[4, 3\], got uint8 \[4, 4\]"),
+        ("normals", np.zeros((3, 3), np.float32), r"normals must be float32 \[4, 3\], got float32 \[3, 3\]"),
+    ],
+)
+def test_mesh_errors(field, array, message):
+    arrays = dict(
+        vertices=np.zeros((4, 3), np.float32),
+        faces=np.zeros((2, 3), np.int32),
+        colors=np.zeros((4, 3), np.uint8),
+        normals=np.zeros((4, 3), np.float32),
+    )
+    with pytest.raises(ValueError, match="^TriangleMesh: " + message):
+        TriangleMesh(**{**arrays, field: array})
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj", "PLY"])
+def test_files_hold_the_mesh(suffix, tmp_path):
+    mesh = _sphere()
+    path = tmp_path / f"mesh.{suffix}"
+    save_mesh(mesh, path)
+    loaded = trimesh.load(path, process=False, force="mesh")
+    np.testing.assert_allclose(loaded.vertices, mesh.vertices, atol=1e-7)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)
+    np.testing.assert_array_equal(loaded.visual.vertex_colors[:, :3], mesh.colors)
+    assert os.listdir(tmp_path) == [path.name]
+
+
+def test_ply_holds_the_normals(tmp_path):
+    mesh = _sphere()
+    save_mesh(mesh, tmp_path / "mesh.ply")
+    header, body = (tmp_path / "mesh.ply").read_bytes().split(b"end_header\n", 1)
+    assert header.index(b"property float nx") < header.index(b"property uchar red")
+    vertex = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)])
+    np.testing.assert_array_equal(np.frombuffer(body, vertex, len(mesh.vertices))["normal"], mesh.normals)
+
+
+def test_glb_holds_the_normals(tmp_path):
+    mesh = _sphere()
+    save_mesh(mesh, tmp_path / "mesh.glb")
+    assert b'"NORMAL":' in (tmp_path / "mesh.glb").read_bytes()
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
+def test_files_are_reproducible(suffix, tmp_path):
+    paths = [tmp_path / f"{name}.{suffix}" for name in "ab"]
+    for path in paths:
+        save_mesh(_sphere(), path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_empty_mesh(tmp_path):
+    save_mesh(_empty(), tmp_path / "mesh.ply")
+    assert b"element vertex 0" in (tmp_path / "mesh.ply").read_bytes()
+    for suffix in ("glb", "obj"):
+        with pytest.raises(OutputError, match=rf"mesh\.{suffix}: a mesh without faces can be written as \.ply only"):
+            save_mesh(_empty(), tmp_path / f"mesh.{suffix}")
+    assert os.listdir(tmp_path) == ["mesh.ply"]
+
+
+@pytest.mark.parametrize("name,shown", [("mesh.stl", r"not as \.stl"), ("mesh", "not as a file without suffix")])
+def test_unknown_suffix(name, shown, tmp_path):
+    with pytest.raises(OutputError, match=rf"a mesh is written as \.ply, \.glb, \.obj, {shown}"):
+        save_mesh(_sphere(), tmp_path / name)
+    assert os.listdir(tmp_path) == []
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(OutputError, match=r"mesh\.ply: can't be written: No such file or directory"):
+        save_mesh(_sphere(), tmp_path / "missing" / "mesh.ply")
