@@ -8,6 +8,7 @@ from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.prior_fusion import fuse_prior_
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
+from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
 from spslam.ops.volume_rendering import rendering_losses, volume_render
@@ -25,6 +26,10 @@ __all__ = [
     "CUDA_OFF_REASON",
     "Activation",
     "Intrinsics",
+    "RayBatch",
+    "RenderOptions",
+    "RenderStep",
+    "SceneGradients",
     "SceneView",
     "Stream",
     "bilinear_interpolate",
@@ -39,6 +44,7 @@ __all__ = [
     "query_color",
     "query_sdf",
     "query_sdf_gradient",
+    "render_step",
     "rendering_losses",
     "sample_along_rays",
     "sample_indices",

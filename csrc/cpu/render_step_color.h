@@ -1,0 +1,166 @@
+// Colour in render_step on the CPU: texels of three planes gathered, decoded, and the way back to texels and positions.
+#pragma once
+
+#include <initializer_list>
+
+#include "cpu/render_step_geometry.h"
+
+namespace spslam::render {
+
+// Rows of a plane's table as vectors of texels.
+struct PlaneTexels {
+  const float* texels;  // of the plane's first row
+  std::int64_t step_u, step_v;  // floats to the next texel; 0 where the plane has but one
+
+  PlaneTexels(const float* table, const PlaneLayout& layout)
+      : texels(table + layout.offset * kPlaneChannels),
+        step_u(layout.size_u > 1 ? layout.size_v * kPlaneChannels : 0),
+        step_v(layout.size_v > 1 ? kPlaneChannels : 0),
+        row_(layout.size_v * kPlaneChannels) {}
+
+  const float* at(const PlanePlace& place) const { return texels + place.u * row_ + place.v * kPlaneChannels; }
+
+ private:
+  std::int64_t row_;
+};
+
+inline bool planes_cover(const TriPlaneLayout& layout) {
+  return !empty_plane(layout.planes[0]) && !empty_plane(layout.planes[1]) && !empty_plane(layout.planes[2]);
+}
+
+// A sample's cells in the three planes; slopes are d fraction / d point (1/m), 0 where clamped.
+struct PlaneSample {
+  PlanePlace places[3];
+  float slope_u[3], slope_v[3];
+};
+
+inline PlaneSample locate_in_planes(const SceneView& scene, float inverse_cell, const Vec3<float>& point) {
+  PlaneSample sample;
+  for (int p = 0; p < 3; ++p) {
+    const PlaneLayout& layout = scene.planes.planes[p];
+    const AxisCell<float> u = axis_cell(plane_u(point, p) * inverse_cell, layout.origin_u, layout.size_u);
+    const AxisCell<float> v = axis_cell(plane_v(point, p) * inverse_cell, layout.origin_v, layout.size_v);
+    sample.places[p] = {u.lower, v.lower, u.fraction, v.fraction};
+    sample.slope_u[p] = u.slope * inverse_cell;
+    sample.slope_v[p] = v.slope * inverse_cell;
+  }
+  return sample;
+}
+
+// x = sum of the planes (equation 3); slopes[3, channels] = its derivatives by the point, where wanted.
+inline void interpolate_texels(const PlaneTexels (&planes)[3], const PlaneSample& sample, float* x, float* slopes) {
+  using V = Vector<float>;
+  for (std::int64_t c = 0; c < kPlaneChannels; c += kLanes<float>) {
+    V value{}, by_u[3], by_v[3];
+    for (int p = 0; p < 3; ++p) {
+      const PlanePlace& place = sample.places[p];
+      const float* texel = planes[p].at(place) + c;
+      const V t00 = load_vector<V>(texel), t10 = load_vector<V>(texel + planes[p].step_u);
+      const V t01 = load_vector<V>(texel + planes[p].step_v);
+      const V t11 = load_vector<V>(texel + planes[p].step_u + planes[p].step_v);
+      const V low = t00 + place.fraction_v * (t01 - t00), high = t10 + place.fraction_v * (t11 - t10);
+      value += low + place.fraction_u * (high - low);
+      by_u[p] = sample.slope_u[p] * (high - low);
+      by_v[p] = sample.slope_v[p] * ((t01 - t00) + place.fraction_u * ((t11 - t10) - (t01 - t00)));
+    }
+    store_vector(x + c, value);
+    if (!slopes) continue;
+    // The planes are xy, xz, yz.
+    store_vector(slopes + c, by_u[0] + by_u[1]);
+    store_vector(slopes + kPlaneChannels + c, by_v[0] + by_u[2]);
+    store_vector(slopes + 2 * kPlaneChannels + c, by_v[1] + by_v[2]);
+  }
+}
+
+inline void prefetch_texels(const PlaneTexels (&planes)[3], const PlaneSample& sample) {
+  for (int p = 0; p < 3; ++p) {
+    const float* texel = planes[p].at(sample.places[p]);
+    for (const float* corner : {texel, texel + planes[p].step_u}) {
+      for (std::int64_t c = 0; c < 2 * kPlaneChannels; c += 16) __builtin_prefetch(corner + c);
+    }
+  }
+}
+
+// Fills the colour decoder's input for the rendered samples; notes their places for the way back, where wanted.
+inline void gather_texels(const SceneView& scene, const MlpLayout<float>& layout, bool need_slopes, PlanePlace* places,
+                          Chunk& chunk) {
+  constexpr std::int64_t kAhead = 4;
+  const PlaneLayout* p = scene.planes.planes;
+  const PlaneTexels planes[3] = {{scene.texels, p[0]}, {scene.texels, p[1]}, {scene.texels, p[2]}};
+  const float inverse_cell = 1.0f / scene.plane_cell_size;
+  const bool covered = planes_cover(scene.planes);
+  PlaneSample queue[kAhead] = {};
+  const auto locate = [&](std::int64_t j) {
+    const std::int32_t i = chunk.color_sample[j];
+    queue[j % kAhead] = locate_in_planes(scene, inverse_cell, sample_point(chunk.rays[chunk.ray_of[i]], chunk.t[i]));
+    prefetch_texels(planes, queue[j % kAhead]);
+  };
+  const std::int64_t n = covered ? chunk.num_colors : 0;
+  for (std::int64_t j = 0; j < n && j < kAhead; ++j) locate(j);
+  for (std::int64_t j = 0; j < n; ++j) {
+    const PlaneSample sample = queue[j % kAhead];
+    if (j + kAhead < n) locate(j + kAhead);
+    interpolate_texels(planes, sample, chunk.color_x + j * layout.input_stride,
+                       need_slopes ? chunk.color_slopes + j * kColorSlopes : nullptr);
+    for (int k = 0; places && k < 3; ++k) places[3 * j + k] = sample.places[k];
+  }
+  const std::int64_t padded = round_up(chunk.num_colors, kRowBlock) * layout.input_stride;
+  for (std::int64_t k = n * layout.input_stride; k < padded; ++k) chunk.color_x[k] = 0.0f;
+  for (std::int64_t k = n * kColorSlopes; k < chunk.num_colors * kColorSlopes; ++k) chunk.color_slopes[k] = 0.0f;
+}
+
+inline void decode_color(const PackedMlp<float>& net, Chunk& chunk) {
+  const MlpLayout<float>& l = net.layout;
+  for (std::int64_t row = 0; row < chunk.num_colors; row += kTileRows) {
+    const std::int64_t rows = row + kTileRows < chunk.num_colors ? kTileRows : chunk.num_colors - row;
+    mlp_tile_forward(net, round_up(rows, kRowBlock), chunk.color_x + row * l.input_stride,
+                     chunk.color_h1 + row * l.hidden_stride, chunk.color_h2 + row * l.hidden_stride, chunk.rgb + row,
+                     chunk.rgb_stride);
+  }
+  for (int c = 0; c < 3; ++c) {
+    float* rgb = chunk.rgb + c * chunk.rgb_stride;
+#pragma omp simd
+    for (std::int64_t j = 0; j < chunk.num_colors; ++j) rgb[j] = sigmoid(rgb[j]);
+  }
+}
+
+inline void pull_rays_by_color(const float* grad_x, std::int64_t first, std::int64_t rows, Chunk& chunk) {
+  for (std::int64_t r = 0; r < rows; ++r) {
+    const float* slopes = chunk.color_slopes + (first + r) * kColorSlopes;
+    Vector<float> sums[3] = {};
+    for (std::int64_t c = 0; c < kPlaneChannels; c += kLanes<float>) {
+      const Vector<float> grad = load_vector<Vector<float>>(grad_x + r * kPlaneChannels + c);
+      for (int k = 0; k < 3; ++k) sums[k] += grad * load_vector<Vector<float>>(slopes + k * kPlaneChannels + c);
+    }
+    pull_ray(chunk, chunk.color_sample[first + r],
+             {sum_lanes<float>(sums[0]), sum_lanes<float>(sums[1]), sum_lanes<float>(sums[2])});
+  }
+}
+
+// From grad_rgb back to parameters (added to `partial`, where given), to texels (rows written to `tables`, where given)
+// and to the rays.
+inline void color_backward(const PackedMlp<float>& net, const Plan& plan, std::int64_t first_row,
+                           const TableGradients& tables, float* partial, Chunk& chunk) {
+  const MlpLayout<float>& l = net.layout;
+  const std::int64_t n = chunk.num_colors, stride = chunk.rgb_stride;
+  for (int c = 0; c < 3; ++c) {
+    float *grad = chunk.grad_rgb + c * stride, *rgb = chunk.rgb + c * stride;
+#pragma omp simd
+    for (std::int64_t j = 0; j < n; ++j) grad[j] *= activation_slope(MlpActivation::kSigmoid, rgb[j]);
+    for (std::int64_t j = n; j < round_up(n, kRowBlock); ++j) grad[j] = 0.0f;
+  }
+  for (std::int64_t row = 0; row < n; row += kTileRows) {
+    const std::int64_t rows = row + kTileRows < n ? kTileRows : n - row;
+    const float *h1 = chunk.color_h1 + row * l.hidden_stride, *h2 = chunk.color_h2 + row * l.hidden_stride;
+    float* grad_x = plan.texels ? tables.texel + (first_row + row) * l.input_stride : chunk.grad_x;
+    mlp_tile_backward(net, round_up(rows, kRowBlock), h1, h2, chunk.grad_rgb + row, stride, chunk.g1, chunk.g2,
+                      plan.texels || plan.pose ? grad_x : nullptr);
+    if (plan.color_params) {
+      mlp_tile_add_weight_gradients(l, rows, chunk.color_x + row * l.input_stride, h1, h2, chunk.grad_rgb + row, stride,
+                                    chunk.g1, chunk.g2, partial);
+    }
+    if (plan.pose) pull_rays_by_color(grad_x, row, rows, chunk);
+  }
+}
+
+}  // namespace spslam::render

@@ -1,0 +1,135 @@
+// Geometry in render_step on the CPU: embeddings gathered, decoded, and the way back to embeddings and positions.
+#pragma once
+
+#include "cpu/render_step_chunk.h"
+#include "kernels/decoders.h"
+
+namespace spslam::render {
+
+struct FeatureSlopes {
+  Feature value, x, y, z;  // and its derivatives by the position in the cell
+};
+
+inline FeatureSlopes interpolate_embedding(const float* embeddings, const std::int32_t* corners,
+                                           const Vec3<float>& local) {
+  Feature e[kCellCorners];
+  for (int k = 0; k < kCellCorners; ++k) {
+    e[k] = load_vector<Feature>(embeddings + kEmbeddingChannels * std::int64_t{corners[k]});
+  }
+  const auto mix = [](const Feature& a, const Feature& b, float s) { return a + s * (b - a); };
+  Feature edge[4], along[4];  // on the four edges along x
+  for (int k = 0; k < 4; ++k) {
+    along[k] = e[2 * k + 1] - e[2 * k];
+    edge[k] = e[2 * k] + local.x * along[k];
+  }
+  const Feature low = mix(edge[0], edge[1], local.y), high = mix(edge[2], edge[3], local.y);
+  return {mix(low, high, local.z),
+          mix(mix(along[0], along[1], local.y), mix(along[2], along[3], local.y), local.z),
+          mix(edge[1] - edge[0], edge[3] - edge[2], local.z), high - low};
+}
+
+inline Vec3<float> sample_point(const Ray& ray, float t) {
+  return ray.origin + t * ray.direction;
+}
+
+// Fills the decoder's input for the samples inside.
+inline void gather_embeddings(const SceneView& scene, const MlpLayout<float>& layout, bool need_slopes, Chunk& chunk) {
+  const float inverse_voxel = 1.0f / scene.voxel_size;
+  const Vec3<float> origin{scene.origin[0], scene.origin[1], scene.origin[2]};
+  for (std::int64_t i = 0; i < chunk.num_inside; ++i) {
+    const Vec3<float> point = sample_point(chunk.rays[chunk.ray_of[i]], chunk.t[i]);
+    const Vec3<float> local = voxel_cell(point, inverse_voxel).local;
+    const std::int32_t* corners = scene.corner_ids + kCellCorners * std::int64_t{chunk.voxel_of[i]};
+    const FeatureSlopes feature = interpolate_embedding(scene.embeddings, corners, local);
+    const Vec3<float> position = scene.position_scale * (point - origin);
+    float* x = chunk.x + i * layout.input_stride;
+    for (std::int64_t c = layout.input; c < layout.input_stride; ++c) x[c] = 0.0f;
+    x[0] = position.x;
+    x[1] = position.y;
+    x[2] = position.z;
+    store_vector(x + 3, feature.value);
+    chunk.local[i] = local;
+    if (!need_slopes) continue;
+    float* slopes = chunk.slopes + i * kGeometrySlopes;
+    store_vector(slopes, feature.x);
+    store_vector(slopes + kEmbeddingChannels, feature.y);
+    store_vector(slopes + 2 * kEmbeddingChannels, feature.z);
+  }
+  const std::int64_t padded = round_up(chunk.num_inside, kRowBlock) * layout.input_stride;
+  for (std::int64_t i = chunk.num_inside * layout.input_stride; i < padded; ++i) chunk.x[i] = 0.0f;
+}
+
+// SDF and bell of the samples inside.
+inline void decode_geometry(const PackedMlp<float>& net, float inverse_truncation, Chunk& chunk) {
+  const MlpLayout<float>& l = net.layout;
+  for (std::int64_t row = 0; row < chunk.num_inside; row += kTileRows) {
+    const std::int64_t rows = row + kTileRows < chunk.num_inside ? kTileRows : chunk.num_inside - row;
+    mlp_tile_forward(net, round_up(rows, kRowBlock), chunk.x + row * l.input_stride, chunk.h1 + row * l.hidden_stride,
+                     chunk.h2 + row * l.hidden_stride, chunk.sdf + row, rows);
+  }
+#pragma omp simd
+  for (std::int64_t i = 0; i < chunk.num_inside; ++i) {
+    const float sdf = hyperbolic_tangent(chunk.sdf[i]);
+    const Bell<float> b = bell(sdf, inverse_truncation);
+    chunk.sdf[i] = sdf;
+    chunk.bells[i] = b.value;
+    chunk.bell_slopes[i] = b.slope;
+  }
+}
+
+// Adds d L / d point of sample i, split as RayPull says.
+inline void pull_ray(Chunk& chunk, std::int64_t i, const Vec3<float>& force) {
+  RayPull& pull = chunk.pulls[chunk.ray_of[i]];
+  pull.force = pull.force + force;
+  pull.moment = pull.moment + chunk.t[i] * force;
+}
+
+// d L / d point of a tile's samples, from gradient rows of the decoder's input.
+inline void pull_rays_by_geometry(const SceneView& scene, const float* grad_x, std::int64_t stride, std::int64_t first,
+                                  std::int64_t rows, Chunk& chunk) {
+  constexpr int kBytes = static_cast<int>(kFeatureBytes);
+  const float inverse_voxel = 1.0f / scene.voxel_size;
+  for (std::int64_t r = 0; r < rows; ++r) {
+    const float* g = grad_x + r * stride;
+    const float* slopes = chunk.slopes + (first + r) * kGeometrySlopes;
+    const Feature grad = load_vector<Feature>(g + 3);
+    const Vec3<float> by_cell{
+        sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes)),
+        sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + kEmbeddingChannels)),
+        sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + 2 * kEmbeddingChannels))};
+    const Vec3<float> by_position{g[0], g[1], g[2]};
+    pull_ray(chunk, first + r, inverse_voxel * by_cell + scene.position_scale * by_position);
+  }
+}
+
+// From grad_sdf back to parameters (added to `partial`, where given), to embeddings (rows written to `tables`, where
+// given) and to the rays.
+inline void geometry_backward(const SceneView& scene, const PackedMlp<float>& net, const Plan& plan,
+                              std::int64_t first_row, const TableGradients& tables, float* partial, Chunk& chunk) {
+  const MlpLayout<float>& l = net.layout;
+  const std::int64_t n = chunk.num_inside;
+#pragma omp simd
+  for (std::int64_t i = 0; i < n; ++i) {
+    chunk.grad_sdf[i] *= activation_slope(MlpActivation::kTanh, chunk.sdf[i]);
+  }
+  for (std::int64_t i = n; i < round_up(n, kRowBlock); ++i) chunk.grad_sdf[i] = 0.0f;
+  for (std::int64_t row = 0; row < n; row += kTileRows) {
+    const std::int64_t rows = row + kTileRows < n ? kTileRows : n - row;
+    const float *h1 = chunk.h1 + row * l.hidden_stride, *h2 = chunk.h2 + row * l.hidden_stride;
+    float* grad_x = plan.embeddings ? tables.embedding + (first_row + row) * l.input_stride : chunk.grad_x;
+    mlp_tile_backward(net, round_up(rows, kRowBlock), h1, h2, chunk.grad_sdf + row, rows, chunk.g1, chunk.g2,
+                      plan.embeddings || plan.pose ? grad_x : nullptr);
+    if (plan.geometry_params) {
+      mlp_tile_add_weight_gradients(l, rows, chunk.x + row * l.input_stride, h1, h2, chunk.grad_sdf + row, rows,
+                                    chunk.g1, chunk.g2, partial);
+    }
+    if (plan.pose) pull_rays_by_geometry(scene, grad_x, l.input_stride, row, rows, chunk);
+  }
+  if (!plan.embeddings) return;
+  for (std::int64_t i = 0; i < n; ++i) {
+    tables.voxel_of[first_row + i] = chunk.voxel_of[i];
+    tables.local[first_row + i] = chunk.local[i];
+  }
+}
+
+}  // namespace spslam::render

@@ -1,0 +1,309 @@
+"""The fused step, against the same composed in float64, and its promises: determinism, frozen parts, errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from spslam.geometry import matrix_to_pose7, quaternion_to_matrix
+from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
+from tests.reference.render_step import PARAMETERS, render_step
+
+OPTIONS = ops.RenderOptions(
+    num_uniform=32,
+    num_surface=11,
+    near=0.2,
+    far=1.02,
+    truncation=TRUNCATION,
+    cosine_targets=True,
+    weight_rgb=10.0,
+    weight_depth=0.1,
+    weight_free_space=20.0,
+    weight_sdf=1000.0,
+    seed=2**33 + 5,
+    stream=ops.Stream.MAPPING_RAYS,
+    frame=3,
+    iteration=7,
+)
+GRADIENTS = dict(
+    zip(("poses", *PARAMETERS), ("grad_poses", "embeddings", "grad_geometry", "texels", "grad_color"), strict=True)
+)
+# Float32 sums of some thousand terms against float64.
+LOSS_TOLERANCE = dict(rtol=2e-5, atol=1e-7)
+# Of the largest element: float32 rounding, and the sample or two that it puts beyond a cell's face or a threshold.
+GRADIENT_TOLERANCE = 1e-3
+
+
+def _pose(center, target):
+    forward = np.subtract(target, center)
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.2, 1.0, -0.1], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = center
+    return pose
+
+
+POSES = [
+    _pose([0.02, -0.1, 0.05], [0.9, 0.5, 1.1]),
+    _pose([0.1, 0.0, 0.2], [0.9, 0.4, 0.8]),
+    _pose([-0.2, -0.15, 0.1], [0.8, 0.5, 1.1]),
+]
+
+
+def _rays(generator, counts=(90, 60, 57), device="cpu"):
+    """Rays of a few frames, with noise on the depth, some without depth, and with all kinds of foreshortening."""
+    pixels = torch.cat([corner_pixels(POSES[f], generator, n) for f, n in enumerate(counts)])
+    depth = pixels[:, 1].contiguous().view(torch.float32)
+    depth = depth + 0.02 * torch.randn(len(depth), generator=generator)
+    depth[::19] = 0.0
+    pixels[:, 1] = depth.view(torch.int32)
+    foreshortening = torch.randint(0, 160, (len(pixels),), generator=generator)
+    foreshortening[::3] = 0
+    pixels[:, 2] |= (foreshortening << 24).to(torch.int64).to(torch.int32)
+    frames = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)).int()
+    poses = torch.from_numpy(np.stack([matrix_to_pose7(p) for p in POSES[: len(counts)]])).float()
+    return ops.RayBatch(pixels.to(device), frames.to(device), poses.to(device), INTRINSICS)
+
+
+def _gradients(scene, stamp=4, spare_rows=0):
+    """Zero buffers for a scene's gradients."""
+    new = scene.embeddings.new_zeros
+    rows, texels = len(scene.embeddings) + spare_rows, len(scene.texels) + spare_rows
+    return ops.SceneGradients(
+        new(rows, 8), new(rows, dtype=torch.int32), new(texels, 32), new(texels, dtype=torch.int32), stamp
+    )
+
+
+def _step(scene, rays, options=OPTIONS, gradients=None):
+    """Losses and all gradients by the reference's names."""
+    step = ops.render_step(scene, rays, options, gradients)
+    found = {name: getattr(step, field, None) for name, field in GRADIENTS.items()}
+    if gradients is not None:
+        found |= {"embeddings": gradients.embeddings, "texels": gradients.texels}
+    return step.losses, found
+
+
+def _assert_close(got, want, tolerance=GRADIENT_TOLERANCE):
+    scale = want.abs().max().item()
+    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=tolerance * scale + 1e-12)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        dict(cosine_targets=False),
+        dict(weight_rgb=0.0),
+        dict(weight_free_space=0.0, weight_sdf=0.0),
+        dict(weight_rgb=0.0, weight_depth=0.0, weight_sdf=0.0),
+        dict(num_uniform=0),
+        dict(num_surface=0, num_uniform=70),
+        dict(truncation=0.05, near=0.5, far=1.2),
+    ],
+    ids=str,
+)
+def test_losses_and_gradients_are_those_of_the_composition(device, generator, change):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays, options = _rays(generator, device=device), replace(OPTIONS, **change)
+    want_losses, want = render_step(scene, rays, options)
+    if options.weight_rgb == 0:
+        want_losses[1] = 0  # colour is not evaluated
+    losses, got = _step(scene, rays, options, _gradients(scene))
+    torch.testing.assert_close(losses.cpu().double(), want_losses, **LOSS_TOLERANCE)
+    for name in want:
+        _assert_close(got[name], want[name])
+
+
+def test_where_the_scene_means_something(device, generator):
+    """The corner's own SDF: surfaces are crossed once, so the rendering terms and the mask matter."""
+    scene = make_scene(generator, random_decoder=False, device=device)
+    rays = _rays(generator, device=device)
+    want_losses, want = render_step(scene, rays, OPTIONS)
+    losses, got = _step(scene, rays, OPTIONS, _gradients(scene))
+    torch.testing.assert_close(losses.cpu().double(), want_losses, **LOSS_TOLERANCE)
+    assert losses[1:].min() > 0
+    for name in want:
+        _assert_close(got[name], want[name])
+
+
+def test_pose_gradient_is_the_slope_of_the_loss(device, generator):
+    """Central differences of the op itself, all samples well inside the volume: the loss jumps where one leaves it."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = _rays(generator, counts=(400,), device=device)
+    options = replace(OPTIONS, num_uniform=0, truncation=0.03, weight_rgb=0.0, weight_depth=0.0)
+    gradient = ops.render_step(scene, rays, options).grad_poses[0].cpu()
+    start, step, slopes = POSES[0], 1e-4, []
+    for axis in range(6):
+        totals = []
+        for sign in (1, -1):
+            increment = np.zeros(6)
+            increment[axis] = sign * step
+            moved = start.copy()
+            turn = quaternion_to_matrix(np.concatenate([[1.0], increment[3:] / 2]))
+            moved[:3, :3] = turn @ start[:3, :3]
+            moved[:3, 3] += increment[:3]
+            poses = torch.from_numpy(matrix_to_pose7(moved))[None].float().to(device)
+            totals.append(float(ops.render_step(scene, replace(rays, poses=poses), options).losses[0]))
+        slopes.append((totals[0] - totals[1]) / (2 * step))
+    # Over a step samples cross cells' faces, where the slope of the interpolation changes.
+    torch.testing.assert_close(torch.tensor(slopes), gradient, rtol=0, atol=0.01 * float(gradient.norm()))
+
+
+def test_tracking_leaves_the_scene_and_gives_the_same_pose_gradient(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = _rays(generator, device=device)
+    losses, with_scene = _step(scene, rays, OPTIONS, _gradients(scene))
+    tracking = ops.render_step(scene, rays, OPTIONS)
+    assert tracking.grad_geometry is None and tracking.grad_color is None
+    assert torch.equal(tracking.losses, losses)
+    assert torch.equal(tracking.grad_poses, with_scene["poses"])
+
+
+def test_frozen_geometry_still_teaches_colour(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays, everything, colour = _rays(generator, device=device), _gradients(scene), _gradients(scene)
+    full = ops.render_step(scene, rays, OPTIONS, everything)
+    colour = replace(colour, embeddings=None, embedding_stamps=None)
+    step = ops.render_step(scene, rays, replace(OPTIONS, pose_gradient=False), colour)
+    assert step.grad_poses is None and step.grad_geometry is None
+    assert torch.equal(step.losses, full.losses) and torch.equal(step.grad_color, full.grad_color)
+    assert torch.equal(colour.texels, everything.texels)
+
+
+def test_stamps_mark_the_rows_that_rays_reach(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    gradients = _gradients(scene, stamp=9, spare_rows=5)
+    ops.render_step(scene, _rays(generator, device=device), OPTIONS, gradients)
+    for table, stamps in (
+        (gradients.embeddings, gradients.embedding_stamps),
+        (gradients.texels, gradients.texel_stamps),
+    ):
+        assert set(stamps.unique().tolist()) == {0, 9}
+        assert not table[stamps != 9].any() and not stamps[-5:].any()
+        assert (table[stamps == 9].abs().sum(1) > 0).float().mean() > 0.5
+
+
+def test_gradients_of_tables_are_added(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays, once, twice = _rays(generator, device=device), _gradients(scene), _gradients(scene)
+    ops.render_step(scene, rays, OPTIONS, once)
+    for _ in range(2):
+        ops.render_step(scene, rays, OPTIONS, twice)
+    torch.testing.assert_close(twice.embeddings, 2 * once.embeddings, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(twice.texels, 2 * once.texels, rtol=1e-4, atol=1e-5)
+
+
+def test_same_bits_for_any_number_of_threads(generator):
+    scene = make_scene(generator, random_decoder=True)
+    rays = _rays(generator, counts=(1500, 900, 41))
+    threads = torch.ops.spslam.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 3):
+            torch.ops.spslam.set_num_threads(count)
+            gradients = _gradients(scene)
+            losses, found = _step(scene, rays, OPTIONS, gradients)
+            results.append([losses, *found.values(), gradients.embedding_stamps, gradients.texel_stamps])
+    finally:
+        torch.ops.spslam.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_same_bits_from_run_to_run(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = _rays(generator, device=device)
+    results = []
+    for _ in range(3):
+        losses, found = _step(scene, rays, OPTIONS, _gradients(scene))
+        results.append([losses, *found.values()])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_no_rays(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = _rays(generator, device=device)
+    none = replace(rays, pixels=rays.pixels[:0], ray_frames=rays.ray_frames[:0])
+    losses, found = _step(scene, none, OPTIONS, _gradients(scene))
+    assert not losses.any() and not any(g.any() for g in found.values())
+
+
+def test_rays_without_depth_add_nothing_but_count(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = _rays(generator, counts=(64,), device=device)
+    blind = rays.pixels.clone()
+    blind[:, 1] = 0
+    padded = replace(rays, pixels=torch.cat([rays.pixels, blind]), ray_frames=torch.cat([rays.ray_frames] * 2))
+    want, got = ops.render_step(scene, rays, OPTIONS), ops.render_step(scene, padded, OPTIONS)
+    torch.testing.assert_close(got.losses, want.losses / 2)
+    torch.testing.assert_close(got.grad_poses, want.grad_poses / 2, rtol=1e-4, atol=1e-4)
+
+
+def test_outside_the_map(device, generator):
+    """Every sample is free space of SDF 1: only the mask of the terms is left, which is nothing."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = _rays(generator, device=device)
+    far = rays.poses.clone()
+    far[:, 4:] += 1e6
+    losses, found = _step(scene, replace(rays, poses=far), OPTIONS, _gradients(scene))
+    assert not losses.any() and not any(g.any() for g in found.values())
+
+
+def test_no_planes(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    bare = replace(scene, texels=scene.texels[:0], plane_layout=[0] * 15)
+    rays = _rays(generator, device=device)
+    step = ops.render_step(bare, rays, OPTIONS, _gradients(bare))
+    dark = ops.render_step(replace(scene, texels=torch.zeros_like(scene.texels)), rays, OPTIONS)
+    torch.testing.assert_close(step.losses, dark.losses)
+    torch.testing.assert_close(step.grad_poses, dark.grad_poses)
+
+
+def test_opcheck(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays, g = _rays(generator, device=device), _gradients(scene)
+    new = rays.poses.new_empty
+    args = (rays.pixels, rays.ray_frames, rays.poses, list(INTRINSICS), 32, 11, 0.2, 1.02, TRUNCATION, True)
+    args += ([10.0, 0.1, 20.0, 1000.0], 1, 4, 0, 0, new(5), new(3, 6), g.embeddings, g.embedding_stamps)
+    args += (g.texels, g.texel_stamps, new(1473), new(2211), 3)
+    torch.library.opcheck(torch.ops.spslam.render_step, (*scene.arguments(), *args))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (dict(pixels=torch.zeros(9, 3)), TypeError, "render_step: pixels must be int32, got float32"),
+        (
+            dict(pixels=torch.zeros(8, 3).int()),
+            ValueError,
+            r"render_step: pixels must have shape \[9, 3\], got \[8, 3\]",
+        ),
+        (dict(ray_frames=torch.zeros(9)), TypeError, "render_step: ray_frames must be int32, got float32"),
+        (dict(poses=torch.zeros(1, 6)), ValueError, r"render_step: poses must have shape \[F, 7\], got \[1, 6\]"),
+        (dict(intrinsics=(1, 2)), ValueError, r"render_step: intrinsics must be \(fx, fy, cx, cy\), got \(1, 2\)"),
+        (dict(num_uniform=-1), ValueError, "render_step: num_uniform must be at least 0, got -1"),
+        (dict(num_surface=-1), ValueError, "render_step: num_surface must be at least 0, got -1"),
+        (dict(num_uniform=0, num_surface=0), ValueError, r"num_uniform \+ num_surface must be in \[1, 65536\], got 0"),
+        (dict(near=0.5, far=0.4), ValueError, r"near and far must be 0 <= near <= far, got \(0.5, 0.4\)"),
+        (dict(truncation=0.0), ValueError, "render_step: truncation must be positive, got 0.0"),
+        (dict(embeddings=torch.zeros(3, 8)), ValueError, "gradients.embeddings must have at least .* rows, got 3"),
+        (dict(texel_stamps=torch.zeros(9)), TypeError, "gradients.texel_stamps must be int32, got float32"),
+        (dict(texels=torch.zeros(32, 20000).T), ValueError, "gradients.texels must be contiguous, got strides"),
+    ],
+    ids=str,
+)
+def test_errors(generator, change, error, message):
+    scene = make_scene(generator, random_decoder=True)
+    rays = _rays(generator, counts=(9,))
+
+    def changed(argument):
+        fields = {name: value for name, value in change.items() if hasattr(argument, name)}
+        return replace(argument, **fields)
+
+    with pytest.raises(error, match=message):
+        ops.render_step(scene, changed(rays), changed(OPTIONS), changed(_gradients(scene)))
