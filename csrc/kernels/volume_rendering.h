@@ -38,13 +38,13 @@ SPS_INLINE Bell<T> bell(T sdf, T inverse_truncation) {
 // Depth of a sample if it lies behind a surface, infinity if not: the smallest along a ray is its first crossing.
 template <class T>
 SPS_INLINE T crossing_depth(T sdf, T t, bool valid) {
-  return valid && sdf < 0 ? t : std::numeric_limits<T>::infinity();
+  return valid & (sdf < 0) ? t : std::numeric_limits<T>::infinity();
 }
 
 // Whether a sample takes part in rendering: inside the volume, and not deeper than the first crossing plus truncation.
 template <class T>
 SPS_INLINE bool sample_visible(T t, bool valid, T first_crossing, T truncation) {
-  return valid && t <= first_crossing + truncation;
+  return valid & (t <= first_crossing + truncation);
 }
 
 // 1 / sum of the bells, by which weights are normalised; 0 for a ray that meets nothing.
@@ -69,17 +69,35 @@ SPS_INLINE T target_cosine(T cosine, bool cosine_targets) {
   return cosine_targets && cosine > 0 ? (cosine > T(kMinCosine) ? cosine : T(kMinCosine)) : T(1);
 }
 
+// Distance of a sample to the measured surface (m), positive in front of it.
+template <class T>
+SPS_INLINE T target_distance(T target_depth, T t, T cosine) {
+  return (target_depth - t) * cosine;
+}
+
+// Whether the SDF term supervises a sample (10): within the truncation distance and inside the volume.
+template <class T>
+SPS_INLINE bool near_surface(T distance, T truncation, bool valid) {
+  return valid & (std::fabs(distance) < truncation);
+}
+
+// Whether a sample counts for the free-space term (11): farther in front, inside the volume or not.
+template <class T>
+SPS_INLINE bool in_free_space(T distance, T truncation) {
+  return distance >= truncation;
+}
+
+// The three above at once, for code that runs one sample at a time: a struct of flags keeps a loop out of vector lanes.
 template <class T>
 struct SampleTarget {
-  T distance;  // to the measured surface (m), positive in front of it
-  bool near;   // supervised by the SDF term (10): within the truncation distance and inside the volume
-  bool free;   // supervised by the free-space term (11): farther in front, inside the volume or not
+  T distance;
+  bool near, free;
 };
 
 template <class T>
 SPS_INLINE SampleTarget<T> sample_target(T target_depth, T t, T cosine, T truncation, bool valid) {
-  const T distance = (target_depth - t) * cosine;
-  return {distance, valid && std::fabs(distance) < truncation, distance >= truncation};
+  const T distance = target_distance(target_depth, t, cosine);
+  return {distance, near_surface(distance, truncation, valid), in_free_space(distance, truncation)};
 }
 
 // Residual of the SDF term in metres; its derivatives are truncation by sdf and cosine by t.
@@ -94,10 +112,10 @@ SPS_INLINE T free_space_residual(T sdf) {
   return sdf - 1;
 }
 
-// 1 / count, 0 for none: the mean over a ray's samples of one kind.
+// 1 / count, 0 for none: the mean over a ray's samples of one kind. Counted in T, which vector lanes prefer.
 template <class T>
-SPS_INLINE T inverse_count(std::int32_t count) {
-  return count > 0 ? 1 / static_cast<T>(count) : T(0);
+SPS_INLINE T inverse_count(T count) {
+  return count > 0 ? 1 / count : T(0);
 }
 
 // The four terms of one ray, in the order of the public op.
