@@ -1,7 +1,7 @@
 """Meshes: from a map or a signed distance to triangles, and from triangles to files."""
 
 from spslam.meshing.export import FORMATS, save_mesh
-from spslam.meshing.extract import cubes_per_cell, extract_surface
+from spslam.meshing.extract import cubes_per_cell, extract_mesh, extract_surface
 from spslam.meshing.mesh import TriangleMesh
 
-__all__ = ["FORMATS", "TriangleMesh", "cubes_per_cell", "extract_surface", "save_mesh"]
+__all__ = ["FORMATS", "TriangleMesh", "cubes_per_cell", "extract_mesh", "extract_surface", "save_mesh"]
