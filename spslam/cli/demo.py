@@ -77,6 +77,6 @@ def _evaluate(output: Path) -> dict:
     finished = RunOutput.read(output)
     if not isinstance(dataset, GeneratedDataset) or finished.mesh() is None:
         return finished.metrics
-    metrics = add_metrics(finished, surface_figures(finished, dataset, dataset.room.sample_surface))
+    metrics = add_metrics(finished, surface_figures(finished, dataset, dataset.room))
     write_report(output)
     return metrics

@@ -39,11 +39,11 @@ def execute(args: argparse.Namespace) -> None:
 def _surface_figures(run: Any, gt_mesh: Path) -> dict[str, float]:
     from spslam.datasets import open_dataset
     from spslam.evaluation.finished_run import surface_figures
-    from spslam.evaluation.mesh import sample_mesh
+    from spslam.evaluation.surface import TriangleSurface
 
     vertices, faces = _load_surface(gt_mesh)
     dataset = open_dataset(load_config(require_run_file(run.folder, "config.yaml")).dataset)
-    return surface_figures(run, dataset, lambda count, seed: sample_mesh(vertices, faces, count, seed))
+    return surface_figures(run, dataset, TriangleSurface(vertices, faces))
 
 
 def _load_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,14 @@ import numpy as np
 
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import OutputError
-from spslam.evaluation.mesh import SAMPLES, observed_mask, observed_samples, sample_mesh, surface_metrics
+from spslam.evaluation.mesh import evaluate_surface, observed_mask
 from spslam.evaluation.run_output import RunOutput, match_times
+from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import align, ate, rpe
 from spslam.io import atomic_write
 
 # Frames that decide what was observed; more of a sequence's neighbours add nothing but time.
-_CULLING_FRAMES = 200
-
-SurfaceSampler = Callable[[int, int], np.ndarray]
+_CULLING_FRAMES = 100
 
 
 def trajectory_figures(run: RunOutput) -> dict[str, float]:
@@ -29,17 +27,17 @@ def trajectory_figures(run: RunOutput) -> dict[str, float]:
     return {**ate(run.trajectory.poses, run.truth), **rpe(run.trajectory.poses, run.truth)}
 
 
-def surface_figures(run: RunOutput, dataset: RgbdDataset, sample_truth: SurfaceSampler) -> dict[str, float]:
+def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dict[str, float]:
     """Accuracy, completeness and F1 of the run's mesh, as metrics.json names them.
 
-    The mesh is carried into the truth's world by the alignment of the trajectories (rigid); surface that no frame
+    The mesh is carried into the truth's world by the rigid alignment of the trajectories; surface that no frame
     observed is left out on both sides.
 
     Parameters
     ----------
     run : with a mesh.
     dataset : the one that the run was over, or that it took its frames from; its depth says what was observed.
-    sample_truth : gives n points [n,3] of the true surface for (n, seed).
+    truth : the true surface.
 
     Raises
     ------
@@ -52,13 +50,12 @@ def surface_figures(run: RunOutput, dataset: RgbdDataset, sample_truth: SurfaceS
     rows, indices = _frames_of(run, dataset)
     poses = run.trajectory.poses if run.truth is None else run.truth
     vertices = mesh.vertices if run.truth is None else align(run.trajectory.poses, run.truth).apply(mesh.vertices)
+    depths = [dataset[int(index)].depth for index in indices]
 
     def observed(points: np.ndarray) -> np.ndarray:
-        depths = (dataset[int(index)].depth for index in indices)
         return observed_mask(points, depths, poses[rows], dataset.camera)
 
-    reconstructed = observed_samples(lambda count, seed: sample_mesh(vertices, mesh.faces, count, seed), observed)
-    return surface_metrics(reconstructed, observed_samples(sample_truth, observed, SAMPLES))
+    return evaluate_surface(TriangleSurface(vertices, mesh.faces), truth, observed)
 
 
 def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,94 @@
+"""A run's output against the truth, on a run that is right by construction."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from spslam.datasets.base import Subset
+from spslam.datasets.generated import GeneratedDataset
+from spslam.errors import OutputError
+from spslam.evaluation.finished_run import add_metrics, surface_figures, trajectory_figures
+from spslam.evaluation.run_output import RunOutput, match_times
+from spslam.geometry import pose_from
+from spslam.trajectory import Trajectory
+
+TURN = pose_from(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([1.0, 2.0, 3.0]))
+
+
+@pytest.fixture(scope="module")
+def room():
+    return GeneratedDataset(frames=12, width=80, height=60)
+
+
+@pytest.fixture
+def output(tmp_path, room):
+    """The true trajectory and surface, in a world of their own."""
+    part = Subset(room, 0, 12, 2)
+    poses = part.poses()
+    Trajectory(part.timestamps(), TURN @ poses).save_tum(tmp_path / "trajectory.txt")
+    (tmp_path / "previews").mkdir()
+    Trajectory(part.timestamps(), poses).save_tum(tmp_path / "previews" / "truth.txt")
+    (tmp_path / "metrics.json").write_text('{"frames": 6}')
+    vertices, faces, _ = room.room.mesh()
+    moved = vertices @ TURN[:3, :3].T + TURN[:3, 3]
+    trimesh.Trimesh(moved, faces, process=False).export(tmp_path / "mesh.ply")
+    return tmp_path
+
+
+def test_perfect_run_has_perfect_figures(output, room):
+    run = RunOutput.read(output)
+    figures = trajectory_figures(run)
+    assert figures["ate_rmse_cm"] < 1e-4
+    assert figures["rpe_cm"] < 1e-4
+    figures = surface_figures(run, room, room.room)
+    assert figures["f1_5cm"] > 99.9
+    assert figures["accuracy_cm"] < 0.1
+    assert figures["completeness_cm"] < 0.1
+
+
+def test_shifted_mesh_is_found_out(output, room):
+    mesh = trimesh.load(output / "mesh.ply", process=False)
+    mesh.apply_translation([0.08, 0, 0])
+    mesh.export(output / "mesh.ply")
+    figures = surface_figures(RunOutput.read(output), room, room.room)
+    assert figures["f1_5cm"] < 95
+    assert figures["accuracy_cm"] > 1
+
+
+def test_no_truth_gives_no_trajectory_figures(output):
+    (output / "previews" / "truth.txt").unlink()
+    assert trajectory_figures(RunOutput.read(output)) == {}
+
+
+def test_run_over_other_data_is_refused(output, room):
+    Trajectory(np.array([1e3]), np.eye(4)[None]).save_tum(output / "trajectory.txt")
+    with pytest.raises(OutputError, match="must be a run over generated, but has none of its frames"):
+        surface_figures(RunOutput.read(output), room, room.room)
+
+
+def test_run_without_mesh_is_refused(output, room):
+    (output / "mesh.ply").unlink()
+    with pytest.raises(OutputError, match="has no mesh to evaluate; spslam mesh"):
+        surface_figures(RunOutput.read(output), room, room.room)
+
+
+def test_figures_are_added_to_the_others(output):
+    run = RunOutput.read(output)
+    assert add_metrics(run, {"f1_5cm": 98.0}) == {"frames": 6, "f1_5cm": 98.0}
+    assert json.loads((output / "metrics.json").read_text()) == {"frames": 6, "f1_5cm": 98.0}
+
+
+@pytest.mark.parametrize(
+    ("times", "wanted", "rows"),
+    [
+        ([], [1.0], [-1]),
+        ([1.0], [1.0, 2.0], [0, -1]),
+        ([1.0, 2.0, 3.0], [3.0000004, 0.9999996, 2.5], [2, 0, -1]),
+        ([3.0, 1.0, 2.0], [1.0, 3.0], [1, 0]),
+        ([1.0, 2.0], [], []),
+    ],
+)
+def test_times_are_matched_to_the_microsecond(times, wanted, rows):
+    assert match_times(np.array(times), np.array(wanted)).tolist() == rows
