@@ -26,6 +26,8 @@ def execute(args: argparse.Namespace) -> None:
         from spslam import ops
     except ImportError as error:
         raise DeviceError(str(error).removeprefix("spslam: ")) from error
+    except RuntimeError as error:
+        raise DeviceError(f"the kernel libraries don't fit this spslam, build them again: {error}") from error
     _row("CPU kernels", f"{ops.CPU_ISA}, {torch.get_num_threads()} threads; {_try(torch.device('cpu'))}")
     if ops.CUDA_OFF_REASON:
         _row("CUDA kernels", f"off: {ops.CUDA_OFF_REASON}")
