@@ -58,8 +58,8 @@ def select_frames(
         config: `mapping.frames`, `recent`, `covisible`, `covisibility_threshold`.
 
     Returns:
-        int64 [n] ascending frame indices, n at most `mapping.frames`, the newest always in. Drawn by Philox, keyed by the
-        newest frame's index.
+        int64 [n] ascending frame indices, n at most `mapping.frames`, the newest always in. Drawn by Philox, keyed by
+        the newest frame's index.
     """
     usable_ids = usable.nonzero()[:, 0]
     mapping, newest = config.mapping, len(rotations) - 1

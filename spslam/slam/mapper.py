@@ -23,7 +23,7 @@ class Mapper:
         self.prior = prior
 
     def integrate(self, state: SlamState, pixels: FramePixels) -> None:
-        """Allocates voxels around the newest frame's surface, fills them from the scene prior, and covers it with planes."""
+        """Allocates voxels around the newest frame's surface, fills them from the prior, and covers it with planes."""
         if len(pixels.records) == 0:
             return
         pose = state.frames.poses[-1]
@@ -42,7 +42,7 @@ class Mapper:
             iterations: I_m.
 
         Returns:
-            float32 [5] losses of the last iteration (total, rgb, depth, free space, SDF); None where nothing could be done.
+            float32 [5] losses of the last iteration (total, rgb, depth, free space, SDF); None where there was none.
         """
         if iterations == 0 or state.scene.volume.num_voxels == 0:
             return None

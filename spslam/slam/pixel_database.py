@@ -51,7 +51,8 @@ class PixelDatabase:
         """Appends a frame.
 
         Args:
-            records: int32 [N, 3] in random order; N = 0 marks a frame without depth. Other N than P are cut, or repeated.
+            records: int32 [N, 3] in random order; N = 0 marks a frame without depth. Other N than P are cut or
+                repeated.
         """
         self._reserve(self.num_frames + 1)
         count = self.pixels_per_frame

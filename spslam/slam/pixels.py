@@ -1,8 +1,8 @@
 """Pixels of one frame: which are kept, and how they are packed.
 
 A pixel record is three 32-bit words: u | v << 16; the bits of the float32 depth (m); r | g << 8 | b << 16 | c << 24.
-c is the foreshortening n . d times 128 (n the surface normal, d the ray direction with camera z = 1; 0 = unknown): it turns
-a depth difference along the ray into a distance to the surface's tangent plane.
+c is the foreshortening n . d times 128 (n the surface normal, d the ray direction with camera z = 1; 0 = unknown): it
+turns a depth difference along the ray into a distance to the surface's tangent plane.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,10 @@
 """A sequence from a data set to an output folder."""
 
+import contextlib
 import json
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from spslam.datasets import open_dataset
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError, DeviceError, OutputError
-from spslam.evaluation.trajectory import evaluate_trajectory
+from spslam.evaluation.trajectory import ate, rpe
 from spslam.io import atomic_write
 from spslam.slam.checkpoint import load_checkpoint, save_checkpoint
 from spslam.slam.pixels import FramePixels, sample_frame
@@ -99,6 +100,31 @@ def run_sequence(
         SpslamError: one clear line about what is wrong with the data, the settings, the device or the folder.
     """
     device = resolve_device(config.device)
+    with _one_torch_thread():
+        return _run(config, device, data_dir, output_dir, frames, resume, mesh, progress)
+
+
+@contextlib.contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Keeps torch's own threads from spinning on the cores that the kernels' threads need."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(
+    config: Config,
+    device: torch.device,
+    data_dir: Path | None,
+    output_dir: Path,
+    frames: slice | None,
+    resume: bool,
+    mesh: bool,
+    progress: Progress | None,
+) -> dict:
     dataset = open_dataset(config.dataset, data_dir)
     if frames is not None:
         dataset = Subset(dataset, frames.start or 0, frames.stop, frames.step or 1)
@@ -223,11 +249,12 @@ def _finish(
     if system.device.type == "cuda":
         metrics["peak_gpu_mb"] = torch.cuda.max_memory_allocated(system.device) / 2**20
     if truth is not None:
-        metrics |= evaluate_trajectory(trajectory.poses, truth[state.frames.indices.numpy()])
+        known = truth[state.frames.indices.numpy()]
+        metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
     if mesh:
-        metrics["mesh_s"] = files.write_mesh(state.scene, trajectory, system.camera, config)
+        metrics["mesh_s"] = files.write_mesh(state.scene, config.mesh.resolution_m)
     atomic_write(files.metrics, json.dumps(metrics, indent=1) + "\n")
-    files.write_report(loop.dataset, state.frames.indices.tolist(), truth)
+    files.write_report(loop.dataset, state.frames.indices.tolist(), truth, config.run.previews)
     files.checkpoint.unlink(missing_ok=True)
     return metrics
 

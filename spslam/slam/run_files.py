@@ -8,16 +8,13 @@ from typing import IO
 import cv2
 import numpy as np
 
-from spslam.camera import Camera
-from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
+from spslam.evaluation.report import write_report
 from spslam.io import atomic_write
 from spslam.meshing import extract_mesh, save_mesh
 from spslam.scene import Scene
 from spslam.trajectory import Trajectory
-
-PREVIEWS = 3
 
 
 class RunFiles:
@@ -84,32 +81,36 @@ class RunFiles:
         """Why the first of them could not."""
         return next((line["error"] for line in self._skipped()), "none")
 
-    def write_mesh(self, scene: Scene, trajectory: Trajectory, camera: Camera, config: Config) -> float:
+    def write_mesh(self, scene: Scene, resolution_m: float) -> float:
         """Extracts and writes the mesh; returns the seconds that took."""
         started = time.perf_counter()
-        save_mesh(extract_mesh(scene, config.mesh.resolution_m), self.mesh)
+        save_mesh(extract_mesh(scene, resolution_m), self.mesh)
         return time.perf_counter() - started
 
-    def write_previews(self, dataset: RgbdDataset, indices: list[int], truth: np.ndarray | None) -> None:
-        """Keeps a few input images, the camera and the true path for the report."""
+    def write_previews(self, dataset: RgbdDataset, indices: list[int], truth: np.ndarray | None, count: int) -> None:
+        """Keeps `count` input frames (depth as 16-bit millimetres), the camera and the true path, for the report."""
         self.previews.mkdir(exist_ok=True)
         camera = dataset.camera
         atomic_write(self.previews / "camera.json", json.dumps(vars(camera)) + "\n")
         if truth is not None:
             known = np.isfinite(truth).all((1, 2))
             Trajectory(dataset.timestamps()[known], truth[known]).save_tum(self.previews / "truth.txt")
-        for row in sorted({round(i * (len(indices) - 1) / (PREVIEWS - 1)) for i in range(PREVIEWS)}):
-            image = cv2.cvtColor(dataset[indices[row]].color, cv2.COLOR_RGB2BGR)
-            atomic_write(self.previews / f"frame-{row:06d}.png", cv2.imencode(".png", image)[1].tobytes())
+        for row in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int)).tolist():
+            frame = dataset[indices[row]]
+            depth = np.clip(np.rint(1000 * frame.depth), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+            _write_png(self.previews / f"frame-{row:06d}.png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+            _write_png(self.previews / f"depth-{row:06d}.png", depth)
 
-    def write_report(self, dataset: RgbdDataset, indices: list[int], truth: np.ndarray | None) -> None:
+    def write_report(self, dataset: RgbdDataset, indices: list[int], truth: np.ndarray | None, previews: int) -> None:
         """Writes report.html from the other files."""
-        from spslam.evaluation.report import write_report
-
-        self.write_previews(dataset, indices, truth)
+        self.write_previews(dataset, indices, truth, previews)
         write_report(self.folder)
 
     def _skipped(self) -> list[dict]:
         if not self.skipped.exists():
             return []
         return [json.loads(line) for line in self.skipped.read_text(encoding="utf-8").splitlines()]
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    atomic_write(path, cv2.imencode(".png", image)[1].tobytes())
