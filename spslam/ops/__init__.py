@@ -6,7 +6,7 @@ from spslam.ops.gauss_newton import gauss_newton_poses, track_gauss_newton
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
-from spslam.ops.prior_fusion import fuse_prior_
+from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_points, fuse_prior_, random_embeddings
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
@@ -24,6 +24,7 @@ from spslam.ops.voxel_hash import (
 __all__ = [
     "CPU_ISA",
     "CUDA_OFF_REASON",
+    "ENCODER_PARAMETERS",
     "Activation",
     "Intrinsics",
     "RayBatch",
@@ -33,6 +34,8 @@ __all__ = [
     "SceneView",
     "Stream",
     "bilinear_interpolate",
+    "depth_normals",
+    "encode_points",
     "fuse_prior_",
     "gauss_newton_poses",
     "marching_cubes",
@@ -44,6 +47,7 @@ __all__ = [
     "query_color",
     "query_sdf",
     "query_sdf_gradient",
+    "random_embeddings",
     "render_step",
     "rendering_losses",
     "sample_along_rays",

@@ -6,6 +6,91 @@ from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 
 FEATURES = 8
+_HIDDEN = 64
+# Encoder, as the layout of `mlp` has it: W1 [64, 6], b1, W2 [64, 64], b2, W3 [8, 64], b3.
+ENCODER_PARAMETERS = _HIDDEN * (6 + 1) + _HIDDEN * (_HIDDEN + 1) + FEATURES * (_HIDDEN + 1)
+
+
+def depth_normals(
+    depth: torch.Tensor,
+    pixels: torch.Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    step_px: int,
+    max_jump: float,
+) -> torch.Tensor:
+    """Surface normals at pixels of a depth image.
+
+    Cross product of central differences over `step_px` of back-projected depth, which is smoothed before, at each of
+    the five pixels: over 5x5 pixels, with a Gaussian of 2 px in the image and a biweight of 6 cm in depth.
+
+    Args:
+        depth: float32 [H, W], metres; 0, negative and not finite are invalid.
+        pixels: int32 [N, 2], (u, v): column, row.
+        fx, fy, cx, cy: pinhole camera, px.
+        step_px: distance of the differences, at least 1.
+        max_jump: a neighbour whose depth differs by this share of the pixel's, or more, is another surface.
+
+    Returns:
+        float32 [N, 3] in camera axes, unit, turned to the camera (n . p < 0). 0 where unknown: invalid depth at one of
+        the five pixels, a depth jump, or nearer than `step_px` to the border or outside. Same on every run; N = 0 gives
+        an empty tensor.
+
+    Raises:
+        ValueError: wrong shapes or devices, `fx`, `fy` or `max_jump` not positive, `step_px` below 1.
+        TypeError: wrong dtypes.
+    """
+    name = "depth_normals"
+    check_tensor(name, "depth", depth, ["H", "W"], torch.float32)
+    check_tensor(name, "pixels", pixels, ["N", 2], torch.int32, like=depth)
+    check(fx > 0, name, "fx", "be positive", fx)
+    check(fy > 0, name, "fy", "be positive", fy)
+    check(step_px >= 1, name, "step_px", "be at least 1", step_px)
+    check(max_jump > 0, name, "max_jump", "be positive", max_jump)
+    return torch.ops.spslam.depth_normals(depth, pixels, fx, fy, cx, cy, step_px, max_jump)
+
+
+def encode_points(
+    points: torch.Tensor,
+    normals: torch.Tensor,
+    encoder_params: torch.Tensor,
+    voxel_size: float,
+    neighborhood: int = 64,
+    min_pair_weight: float = 1e-4,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Encodes surface points into features at the voxel vertices around them; section III.B of SP-SLAM.
+
+    A point x (in voxels) with normal n gives to a vertex c the feature `encoder([(x - c) / r, n])`, with the weight
+    `prod(1 - |x - c| / r)^3` over the axes: r = 2 and the 4x4x4 vertices around the point for a neighbourhood of 64,
+    r = 1 and the 8 corners of its cell for 8. The encoder is 6 -> 64 -> 64 -> 8 with ReLU.
+
+    Args:
+        points: float32 [N, 3], world, metres. Not finite ones, and those beyond 2^20 voxels, are skipped.
+        normals: float32 [N, 3], unit, world, towards the camera; points whose normal is 0 are skipped.
+        encoder_params: float32 [5128], flat, in the layout of `mlp`.
+        voxel_size: metres.
+        neighborhood: 64 or 8.
+        min_pair_weight: pairs of a point and a vertex with less weight are left out, and never looked at again.
+
+    Returns:
+        voxel_coords int32 [M, 3], the vertices reached, sorted by (x, y, z); features float32 [M, 8], weighted means;
+        weights float32 [M], sums of weights. Same on every run and for every thread count; not differentiable.
+        N = 0 gives M = 0.
+
+    Raises:
+        ValueError: wrong shapes or devices, `voxel_size` not positive, another neighbourhood, a negative minimum.
+        TypeError: wrong dtypes.
+    """
+    name = "encode_points"
+    check_tensor(name, "points", points, ["N", 3], torch.float32)
+    check_tensor(name, "normals", normals, [points.shape[0], 3], torch.float32, like=points)
+    check_tensor(name, "encoder_params", encoder_params, [ENCODER_PARAMETERS], torch.float32, like=points)
+    check(voxel_size > 0, name, "voxel_size", "be positive", voxel_size)
+    check(neighborhood in (8, 64), name, "neighborhood", "be 64 or 8", neighborhood)
+    check(min_pair_weight >= 0, name, "min_pair_weight", "be at least 0", min_pair_weight)
+    return torch.ops.spslam.encode_points(points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight)
 
 
 def fuse_prior_(
@@ -44,6 +129,42 @@ def fuse_prior_(
     torch.ops.spslam.fuse_prior_(embeddings, weights, voxel_ids, features, feature_weights, max_weight)
 
 
+def random_embeddings(voxel_coords: torch.Tensor, seed: int, scale: float = 0.01) -> torch.Tensor:
+    """Embeddings to start from without a prior: numbers from N(0, scale^2) that voxel and seed alone decide on.
+
+    Args:
+        voxel_coords: int32 [M, 3].
+        seed: 64-bit seed.
+        scale: standard deviation, at least 0.
+
+    Returns:
+        float32 [M, 8]; the same whatever else is in `voxel_coords`, up to rounding the same on every device.
+
+    Raises:
+        ValueError: wrong shape, or a negative scale.
+        TypeError: wrong dtype.
+    """
+    check_tensor("random_embeddings", "voxel_coords", voxel_coords, ["M", 3], torch.int32)
+    check(scale >= 0, "random_embeddings", "scale", "be at least 0", scale)
+    return torch.ops.spslam.random_embeddings(voxel_coords, seed, scale)
+
+
+@torch.library.register_fake("spslam::random_embeddings")
+def _(voxel_coords, seed, scale):
+    return voxel_coords.new_empty((voxel_coords.shape[0], FEATURES), dtype=torch.float32)
+
+
 @torch.library.register_fake("spslam::fuse_prior_")
 def _(embeddings, weights, voxel_ids, features, feature_weights, max_weight):
     return None
+
+
+@torch.library.register_fake("spslam::depth_normals")
+def _(depth, pixels, fx, fy, cx, cy, step_px, max_jump):
+    return depth.new_empty((pixels.shape[0], 3))
+
+
+@torch.library.register_fake("spslam::encode_points")
+def _(points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight):
+    rows = torch.library.get_ctx().new_dynamic_size()
+    return points.new_empty((rows, 3), dtype=torch.int32), points.new_empty((rows, FEATURES)), points.new_empty(rows)

@@ -1,0 +1,93 @@
+"""What a frame's surface points do to the sparse volume: allocate voxels around them and fuse their encoding."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+
+from spslam import ops
+from spslam.errors import ConfigError
+from spslam.options import PriorOptions
+from spslam.prior.encoder import Prior
+
+
+class FeatureVolume(Protocol):
+    """What is asked of `spslam.scene.SparseVolume`."""
+
+    voxel_size_m: float
+    num_voxels: int
+
+    @property
+    def voxel_coords(self) -> torch.Tensor: ...
+
+    @property
+    def embeddings(self) -> torch.Tensor: ...
+
+    def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor: ...
+
+    def fuse(
+        self, voxel_coords: torch.Tensor, features: torch.Tensor, feature_weights: torch.Tensor, max_weight: float
+    ) -> torch.Tensor: ...
+
+
+def encode_frame(
+    volume: FeatureVolume,
+    points: torch.Tensor,
+    normals: torch.Tensor,
+    prior: Prior | None,
+    options: PriorOptions,
+    seed: int = 0,
+) -> torch.Tensor:
+    """Encodes a frame's surface points and fuses them into the volume; section III.B and equation (1) of SP-SLAM.
+
+    Vertices whose points weigh more than `options.min_weight` in sum are allocated; the weight of a fusion is that sum
+    over `options.kappa`, at most 1. Without a prior the same vertices are allocated and new ones start at random.
+
+    Args:
+        volume: the sparse volume; changed.
+        points: float32 [N, 3], world, metres, in random order: the first `options.points_per_frame` that have a normal
+            are taken.
+        normals: float32 [N, 3], world, unit, towards the camera; 0 = unknown.
+        prior: the networks; None for random embeddings.
+        options: the configuration's section `prior`.
+        seed: of the random embeddings.
+
+    Returns:
+        voxel_ids int32 [M] of the vertices concerned; M = 0 where no point has a normal.
+
+    Raises:
+        ConfigError: `options.neighborhood` isn't the one that the weights were trained for.
+        SpslamError: the volume's limit would be passed; it is then as before.
+    """
+    known = (normals != 0).any(1).nonzero()[: options.points_per_frame, 0]
+    points, normals = points[known], normals[known]
+    if prior is None:
+        return _allocate(volume, points, normals, options, seed)
+    if options.neighborhood != prior.neighborhood:
+        raise ConfigError(
+            f"prior.neighborhood must be {prior.neighborhood}, that of the weights, got {options.neighborhood}"
+        )
+    voxel_coords, features, weights = ops.encode_points(
+        points,
+        normals,
+        prior.encoder_params.to(points.device),
+        volume.voxel_size_m,
+        prior.neighborhood,
+        prior.min_pair_weight,
+    )
+    keep = weights > options.min_weight
+    shares = (weights[keep] / options.kappa).clamp(max=1)
+    return volume.fuse(voxel_coords[keep], features[keep], shares, options.max_weight)
+
+
+def _allocate(
+    volume: FeatureVolume, points: torch.Tensor, normals: torch.Tensor, options: PriorOptions, seed: int
+) -> torch.Tensor:
+    """Allocates the vertices that an encoder would reach; new ones get random embeddings."""
+    no_encoder = points.new_zeros(ops.ENCODER_PARAMETERS)
+    voxel_coords, _, weights = ops.encode_points(points, normals, no_encoder, volume.voxel_size_m, options.neighborhood)
+    first_new = volume.num_voxels
+    voxel_ids = volume.insert(voxel_coords[weights > options.min_weight])
+    volume.embeddings[first_new:] = ops.random_embeddings(volume.voxel_coords[first_new:], seed)
+    return voxel_ids

@@ -1,0 +1,94 @@
+"""The weights of the scene prior: a depth encoder and the geometry decoder that was trained with it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+from spslam.errors import WeightsError
+
+SHIPPED = Path(__file__).parent / "data" / "prior.safetensors"
+
+# Layer widths; the parameters of each are flat, as `spslam.ops.mlp` takes them.
+ENCODER_WIDTHS = (6, 64, 64, 8)  # position relative to the vertex (3), normal (3) -> feature
+DECODER_WIDTHS = (11, 32, 32, 1)  # scaled position (3), feature (8) -> SDF / truncation before tanh
+_NEIGHBORHOODS = (8, 64)
+_DEFAULT_MIN_PAIR_WEIGHT = 1e-4
+_METADATA_KEY = "prior"
+
+
+def parameter_count(widths: tuple[int, ...]) -> int:
+    """Length of the flat parameter vector of a network with these layer widths."""
+    return sum(outputs * (inputs + 1) for inputs, outputs in zip(widths, widths[1:], strict=False))
+
+
+_LENGTHS = {"encoder": parameter_count(ENCODER_WIDTHS), "geometry_decoder": parameter_count(DECODER_WIDTHS)}
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A trained encoder and decoder; neither works without the other.
+
+    Attributes:
+        encoder_params: float32 [5128], see `spslam.ops.encode_points`.
+        decoder_params: float32 [1473], see `spslam.ops.mlp`; inputs are position, feature.
+        neighborhood: vertices around a point that the encoder was trained for, 64 or 8.
+        min_pair_weight: pairs of a point and a vertex with less weight are left out.
+        metadata: provenance, as the file has it.
+    """
+
+    encoder_params: torch.Tensor
+    decoder_params: torch.Tensor
+    neighborhood: int
+    min_pair_weight: float
+    metadata: dict
+
+
+def load_prior(path: str | os.PathLike | None = None) -> Prior:
+    """Reads a file of weights, as `spslam pretrain` writes it: safetensors with `encoder` and `geometry_decoder`.
+
+    Args:
+        path: the file; the one shipped with spslam where None.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or not weights of these networks. One line that names it.
+    """
+    path = SHIPPED if path is None else Path(path)
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file of weights")
+    try:
+        with safe_open(path, framework="pt") as file:
+            names = set(file.keys())
+            tensors = {name: file.get_tensor(name) for name in _LENGTHS if name in names}
+            metadata = json.loads((file.metadata() or {}).get(_METADATA_KEY, "{}"))
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"{path}: not a readable safetensors file: {str(error).splitlines()[0]}") from error
+    for name, length in _LENGTHS.items():
+        _check_tensor(path, name, tensors.get(name), length)
+    settings = _settings(path, metadata)
+    return Prior(tensors["encoder"], tensors["geometry_decoder"], *settings, metadata)
+
+
+def _check_tensor(path: Path, name: str, tensor: torch.Tensor | None, length: int) -> None:
+    if tensor is None:
+        raise WeightsError(f"{path}: tensor {name} is missing: not weights of a scene prior")
+    if tensor.dtype != torch.float32 or tuple(tensor.shape) != (length,):
+        dtype = str(tensor.dtype).removeprefix("torch.")
+        raise WeightsError(f"{path}: tensor {name} must be float32 [{length}], got {dtype} {list(tensor.shape)}")
+    if not torch.isfinite(tensor).all():
+        raise WeightsError(f"{path}: tensor {name} must be finite, got NaN or infinity")
+
+
+def _settings(path: Path, metadata: object) -> tuple[int, float]:
+    settings = metadata.get("settings") if isinstance(metadata, dict) else None
+    if not isinstance(settings, dict) or settings.get("neighborhood") not in _NEIGHBORHOODS:
+        raise WeightsError(f"{path}: metadata {_METADATA_KEY} must say settings.neighborhood, 8 or 64")
+    min_pair_weight = settings.get("min_pair_weight", _DEFAULT_MIN_PAIR_WEIGHT)
+    if not isinstance(min_pair_weight, (int, float)) or not 0 <= min_pair_weight < 1:
+        raise WeightsError(f"{path}: settings.min_pair_weight must be in [0, 1), got {min_pair_weight}")
+    return settings["neighborhood"], float(min_pair_weight)
