@@ -1,6 +1,7 @@
 """Parameters of the two decoders, as the flat vectors that `spslam.ops.mlp` takes.
 
-Both are in -> hidden -> hidden -> out with ReLU inside (the paper's "2-layer MLP with 32 nodes", as ESLAM's code counts).
+Both are in -> hidden -> hidden -> out with ReLU inside: the paper's "2-layer MLP with 32 nodes", as ESLAM's code
+counts.
 """
 
 import math

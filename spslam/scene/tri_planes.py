@@ -17,8 +17,8 @@ _FIRST_KEY = 2**31  # keys of blocks lie around it, away from those of other ini
 class TriPlanes:
     """Feature texels of the xy, xz and yz planes, as the rows of one table.
 
-    A plane is a rectangle of texels (iu, iv) at world position (iu, iv) * cell_size_m. A texel's initial value depends on
-    the seed, its plane and its (iu, iv) only, so it does not matter in which steps a plane grew.
+    A plane is a rectangle of texels (iu, iv) at world position (iu, iv) * cell_size_m. A texel's initial value depends
+    on the seed, its plane and its (iu, iv) only, so it does not matter in which steps a plane grew.
 
     Attributes:
         cell_size_m: edge of a texel, m.

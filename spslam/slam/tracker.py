@@ -44,7 +44,7 @@ class Tracker:
         self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
-        """Constant-speed prediction of the next pose, float32 [7]; the last pose after only one frame, or after loss."""
+        """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
         if len(frames) < 2 or bool(frames.lost[-2:].any()):
             return frames.poses[-1].clone()
         before, last = FrameTable.matrices(_tail(frames))
