@@ -6,7 +6,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from spslam.cli.arguments import add_device, at_least_one, overrides
+from spslam.cli.arguments import add_device, add_quiet, at_least_one, overrides
 from spslam.cli.progress import print_summary
 from spslam.cli.run import run
 from spslam.config import load_config
@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_device(parser)
     parser.add_argument("--frames", metavar="N", type=at_least_one, help="only the first N of the 300 frames")
+    add_quiet(parser)
 
 
 def execute(args: argparse.Namespace) -> None:
@@ -47,8 +48,10 @@ def execute(args: argparse.Namespace) -> None:
     resolve_device(config.device)
     _remove_earlier_demo(args.output)
     frames = None if args.frames is None else slice(0, args.frames, 1)
-    run(config, args.output, frames, resume=False, mesh=True, quiet=False)
-    print_summary(_evaluate(args.output), args.output)
+    run(config, args.output, frames, resume=False, mesh=True, quiet=args.quiet)
+    metrics = _evaluate(args.output)
+    if not args.quiet:
+        print_summary(metrics, args.output)
 
 
 def _remove_earlier_demo(output: Path) -> None:

@@ -1,0 +1,143 @@
+"""Writes docs/configuration.md from the options' own descriptions, the defaults and the presets.
+
+Run it from the repository after changing an option; a test says when it is due.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from spslam.config import config_names  # noqa: E402
+from spslam.options import PRESETS, Config, Section  # noqa: E402
+
+HEADER = """# Configuration
+
+<!-- Written by docs/generate_configuration.py; change spslam/options.py or configs/ and run it again. -->
+
+A run's options are merged from four places, each winning over the one before:
+
+1. `configs/defaults.yaml`, which holds a value for every option,
+2. a preset, `--preset paper|balanced|fast`,
+3. the configuration file given to `spslam run`, by path or by the name of a shipped one ({names}),
+4. `--set section.key=value`, any number of times (and `--device`, `--seed`, `--data` for `device`, `seed` and
+   `dataset.path`).
+
+A file may name its `preset`, and under `presets: {{paper: {{...}}}}` give options that apply with that preset alone;
+so `configs/replica.yaml` holds the paper's iterations for Replica without touching the other presets. Unknown options,
+wrong types and values out of range are refused before anything runs. The resolved options of a run are in its
+`config.yaml`, which can be given to `spslam run` again.
+
+From Python:
+
+```python
+from spslam.config import load_config
+
+config = load_config("7scenes", preset="fast", overrides=["mapping.every=4"])
+print(config.mapping.every, config.scene.voxel_size_m)
+```
+"""
+
+
+def main() -> None:
+    """Write the page."""
+    (ROOT / "docs" / "configuration.md").write_text(page(), encoding="utf-8")
+
+
+def page() -> str:
+    """The whole page as Markdown."""
+    defaults = _load("defaults.yaml")
+    presets = {name: _load(f"presets/{name}.yaml") for name in PRESETS}
+    parts = [HEADER.format(names=", ".join(f"`{name}`" for name in config_names()))]
+    parts.append(_section("Options of the whole run", Config, "", defaults))
+    for name, field in Config.model_fields.items():
+        if _is_section(field.annotation):
+            title = f"`{name}`: {_sentence(field.annotation)}"
+            parts.append(_section(title, field.annotation, f"{name}.", defaults.get(name) or {}))
+    parts.append(_preset_table(defaults, presets))
+    return "\n".join(parts)
+
+
+def _section(title: str, section: type[Section], prefix: str, values: dict[str, Any]) -> str:
+    rows = ["| option | default | unit | values | meaning |", "|---|---|---|---|---|"]
+    for key, field in section.model_fields.items():
+        if _is_section(field.annotation):
+            continue
+        default = _value(values[key]) if key in values else "none, must be given"
+        unit = (field.json_schema_extra or {}).get("unit") or ""
+        rows.append(f"| `{prefix}{key}` | {default} | {unit} | {_allowed(field)} | {_meaning(field)} |")
+    return f"## {title}\n\n" + "\n".join(rows) + "\n"
+
+
+def _preset_table(defaults: dict[str, Any], presets: dict[str, dict[str, Any]]) -> str:
+    flat = {name: _flatten(values) for name, values in presets.items()}
+    base = _flatten(defaults)
+    rows = ["| option | " + " | ".join(presets) + " |", "|---" * (len(presets) + 1) + "|"]
+    for key, default in base.items():
+        values = [flat[name].get(key, default) for name in presets]
+        if len({str(value) for value in values}) > 1:
+            rows.append(f"| `{key}` | " + " | ".join(_value(value) for value in values) + " |")
+    text = (
+        "`paper` is section IV.A of the paper to the letter; `balanced`, the default, is our most accurate at the "
+        "camera's rate; `fast` is the least work that still maps. They differ in:"
+    )
+    return f"## Presets\n\n{text}\n\n" + "\n".join(rows) + "\n"
+
+
+def _load(name: str) -> dict[str, Any]:
+    return yaml.safe_load((ROOT / "configs" / name).read_text(encoding="utf-8")) or {}
+
+
+def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, Section)
+
+
+def _sentence(section: type[Section]) -> str:
+    text = (section.__doc__ or "").strip().splitlines()[0].rstrip(".")
+    return text[0].lower() + text[1:]
+
+
+def _value(value: Any) -> str:
+    return "`null`" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def _meaning(field: Any) -> str:
+    return field.description.replace("|", "\\|")
+
+
+def _allowed(field: Any) -> str:
+    limits = {type(limit).__name__: limit for limit in field.metadata}
+    parts = [_type(field.annotation)]
+    if "Ge" in limits:
+        parts.append(f"from {limits['Ge'].ge:g}")
+    if "Gt" in limits:
+        parts.append(f"above {limits['Gt'].gt:g}")
+    if "Le" in limits:
+        parts.append(f"to {limits['Le'].le:g}")
+    return " ".join(parts)
+
+
+def _type(annotation: Any) -> str:
+    if get_origin(annotation) is Literal:
+        return ", ".join(f"`{choice}`" for choice in get_args(annotation))
+    if get_origin(annotation) is Union or str(annotation).count("|"):
+        return " or ".join(_type(member) for member in get_args(annotation))
+    names = {int: "whole number", float: "number", bool: "`true`, `false`", str: "text", type(None): "`null`"}
+    return names[annotation]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""The documentation agrees with the code."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from spslam.cli.main import COMMANDS
+from spslam.config import option_paths
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+
+def generator():
+    spec = importlib.util.spec_from_file_location("generate_configuration", ROOT / "docs" / "generate_configuration.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_configuration_page_is_current():
+    expected = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert generator().page() == expected, "run python docs/generate_configuration.py"
+
+
+def test_configuration_page_has_every_option():
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert not [option for option in option_paths() if f"| `{option}` |" not in page]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if not target.startswith(("http:", "https:", "mailto:")):
+            assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_and_options_named_exist(page):
+    text = page.read_text(encoding="utf-8")
+    assert {name for name in re.findall(r"^\s*(?:\$ )?spslam ([a-z-]+)", text, re.MULTILINE)} <= set(COMMANDS)
+    for option in re.findall(r"--set ([\w.]+)=", text):
+        assert option in set(option_paths()) | {"section.key"}
