@@ -18,7 +18,6 @@ SHIPPED = Path(__file__).parent / "data" / "prior.safetensors"
 ENCODER_WIDTHS = (6, 64, 64, 8)  # position relative to the vertex (3), normal (3) -> feature
 DECODER_WIDTHS = (11, 32, 32, 1)  # scaled position (3), feature (8) -> SDF / truncation before tanh
 _NEIGHBORHOODS = (8, 64)
-_DEFAULT_MIN_PAIR_WEIGHT = 1e-4
 _METADATA_KEY = "prior"
 
 
@@ -38,14 +37,12 @@ class Prior:
         encoder_params: float32 [5128], see `spslam.ops.encode_points`.
         decoder_params: float32 [1473], see `spslam.ops.mlp`; inputs are position, feature.
         neighborhood: vertices around a point that the encoder was trained for, 64 or 8.
-        min_pair_weight: pairs of a point and a vertex with less weight are left out.
         metadata: provenance, as the file has it.
     """
 
     encoder_params: torch.Tensor
     decoder_params: torch.Tensor
     neighborhood: int
-    min_pair_weight: float
     metadata: dict
 
 
@@ -64,14 +61,14 @@ def load_prior(path: str | os.PathLike | None = None) -> Prior:
     try:
         with safe_open(path, framework="pt") as file:
             names = set(file.keys())
-            tensors = {name: file.get_tensor(name) for name in _LENGTHS if name in names}
+            # Copies: reading on in a mapped file that somebody overwrites would kill the process.
+            tensors = {name: file.get_tensor(name).clone() for name in _LENGTHS if name in names}
             metadata = json.loads((file.metadata() or {}).get(_METADATA_KEY, "{}"))
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {str(error).splitlines()[0]}") from error
     for name, length in _LENGTHS.items():
         _check_tensor(path, name, tensors.get(name), length)
-    settings = _settings(path, metadata)
-    return Prior(tensors["encoder"], tensors["geometry_decoder"], *settings, metadata)
+    return Prior(tensors["encoder"], tensors["geometry_decoder"], _neighborhood(path, metadata), metadata)
 
 
 def _check_tensor(path: Path, name: str, tensor: torch.Tensor | None, length: int) -> None:
@@ -84,11 +81,8 @@ def _check_tensor(path: Path, name: str, tensor: torch.Tensor | None, length: in
         raise WeightsError(f"{path}: tensor {name} must be finite, got NaN or infinity")
 
 
-def _settings(path: Path, metadata: object) -> tuple[int, float]:
+def _neighborhood(path: Path, metadata: object) -> int:
     settings = metadata.get("settings") if isinstance(metadata, dict) else None
     if not isinstance(settings, dict) or settings.get("neighborhood") not in _NEIGHBORHOODS:
         raise WeightsError(f"{path}: metadata {_METADATA_KEY} must say settings.neighborhood, 8 or 64")
-    min_pair_weight = settings.get("min_pair_weight", _DEFAULT_MIN_PAIR_WEIGHT)
-    if not isinstance(min_pair_weight, (int, float)) or not 0 <= min_pair_weight < 1:
-        raise WeightsError(f"{path}: settings.min_pair_weight must be in [0, 1), got {min_pair_weight}")
-    return settings["neighborhood"], float(min_pair_weight)
+    return settings["neighborhood"]

@@ -102,7 +102,7 @@ def test_encoding_matches_the_formula(device, neighborhood, min_pair_weight, gen
 
 def test_encoding_of_many_points_in_few_cells(device, generator):
     params = random_encoder(generator)
-    points, normals = surface(600, generator, extent=0.07)
+    points, normals = surface(300, generator, extent=0.07)
     want = reference.encode_points(points, normals, params, VOXEL, 64, 0.001)
     got = ops.encode_points(points.to(device), normals.to(device), params.to(device), VOXEL, 64, 0.001)
     assert torch.equal(got[0].cpu(), want[0])

@@ -58,26 +58,23 @@ def encoder(params: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
 
 def encode_points(points, normals, params, voxel_size, neighborhood, min_pair_weight):
     """Coordinates, mean features and weights of every vertex reached, sorted by (x, y, z)."""
-    span = range(-1, 3) if neighborhood == 64 else range(2)
-    reach = 2 if neighborhood == 64 else 1
+    usable = torch.isfinite(points).all(1) & normals.any(1)
+    points, normals = points[usable].double() / voxel_size, normals[usable].double()
+    span, reach = (range(-1, 3), 2) if neighborhood == 64 else (range(2), 1)
+    vertices = points.floor()[:, None] + torch.tensor(list(itertools.product(span, repeat=3)))
+    relative = (points[:, None] - vertices) / reach
+    weights = (1 - relative.abs()).prod(2) ** 3
+    features = encoder(params, torch.cat([relative, normals[:, None].expand_as(relative)], 2))
+    columns = vertices.reshape(-1, 3).long().tolist(), weights.flatten().tolist(), features.reshape(-1, 8).numpy()
     sums = {}
-    for point, normal in zip(points.double() / voxel_size, normals.double(), strict=True):
-        if not torch.isfinite(point).all() or not normal.any():
-            continue
-        base = point.floor()
-        vertices = torch.stack([base + torch.tensor(o) for o in itertools.product(span, repeat=3)])
-        relative = (point - vertices) / reach
-        weights = (1 - relative.abs()).prod(1) ** 3
-        features = encoder(params, torch.cat([relative, normal.expand_as(relative)], 1))
-        for vertex, weight, feature in zip(vertices.long().tolist(), weights.tolist(), features, strict=True):
-            if weight > 0 and weight >= min_pair_weight:
-                total, mean = sums.get(tuple(vertex), (0.0, 0.0))
-                sums[tuple(vertex)] = (total + weight, mean + weight * feature)
+    for vertex, weight, feature in zip(*columns, strict=True):
+        if weight > 0 and weight >= min_pair_weight:
+            total, weighted = sums.get(tuple(vertex), (0.0, 0.0))
+            sums[tuple(vertex)] = (total + weight, weighted + weight * feature)
     order = sorted(sums)
     coords = torch.tensor(order, dtype=torch.int32).reshape(-1, 3)
     totals = torch.tensor([sums[c][0] for c in order], dtype=torch.float64)
-    features = torch.stack([sums[c][1] / sums[c][0] for c in order]) if order else torch.zeros(0, 8)
-    return coords, features, totals
+    return coords, torch.tensor(np.array([sums[c][1] / sums[c][0] for c in order]).reshape(-1, 8)), totals
 
 
 def random_embedding(seed: int, coord: tuple[int, int, int], scale: float) -> np.ndarray:
