@@ -1,6 +1,6 @@
 """Kernels for sparse neural reconstruction: the public op library, independent of the rest of spslam."""
 
-from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON
+from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.gauss_newton import gauss_newton_poses, track_gauss_newton
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
@@ -38,6 +38,7 @@ __all__ = [
     "encode_points",
     "fuse_prior_",
     "gauss_newton_poses",
+    "get_num_threads",
     "marching_cubes",
     "mlp",
     "mlp_num_params",
@@ -52,6 +53,7 @@ __all__ = [
     "rendering_losses",
     "sample_along_rays",
     "sample_indices",
+    "set_num_threads",
     "solve_normal_equations",
     "sparse_adam_",
     "track_gauss_newton",

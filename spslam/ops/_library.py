@@ -49,4 +49,24 @@ def _load_cuda() -> str | None:
 
 CPU_ISA: str = _load_cpu()
 CUDA_OFF_REASON: str | None = _load_cuda()
-torch.ops.spslam.set_num_threads(torch.get_num_threads())
+
+
+def set_num_threads(count: int) -> None:
+    """Lets the CPU kernels use `count` threads, the calling one included. Results do not depend on it.
+
+    At import it is torch's number of threads. Not to be called while another thread runs a kernel.
+
+    Raises:
+        ValueError: `count` below 1.
+    """
+    if count < 1:
+        raise ValueError(f"set_num_threads: count must be at least 1, got {count}")
+    torch.ops.spslam.set_num_threads(count)
+
+
+def get_num_threads() -> int:
+    """Threads the CPU kernels may use."""
+    return torch.ops.spslam.get_num_threads()
+
+
+set_num_threads(torch.get_num_threads())

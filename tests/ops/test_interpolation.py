@@ -150,14 +150,14 @@ def test_non_contiguous(name, device, generator):
 def test_same_bits_for_any_number_of_threads(name, device, generator):
     arguments, differentiable = _arguments(name, device, torch.float32, generator, points=20_000, channels=8)
     weight = torch.randn(20_000, 8, generator=generator).to(device)
-    threads = torch.ops.spslam.get_num_threads()
+    threads = ops.get_num_threads()
     results = []
     try:
         for count in (1, 2, 7):
-            torch.ops.spslam.set_num_threads(count)
+            ops.set_num_threads(count)
             results.append(_value_and_gradients(getattr(ops, name), arguments, differentiable, weight))
     finally:
-        torch.ops.spslam.set_num_threads(threads)
+        ops.set_num_threads(threads)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

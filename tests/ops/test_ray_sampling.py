@@ -73,12 +73,12 @@ def test_samples_do_not_depend_on_the_other_rays_nor_on_threads(device):
     depth = torch.linspace(0.5, 4, 3000, device=device)
     samples = ops.sample_along_rays(depth, **PAPER, **KEY)
     assert torch.equal(ops.sample_along_rays(depth[:17], **PAPER, **KEY), samples[:17])
-    threads = torch.ops.spslam.get_num_threads()
+    threads = ops.get_num_threads()
     try:
-        torch.ops.spslam.set_num_threads(5)
+        ops.set_num_threads(5)
         assert torch.equal(ops.sample_along_rays(depth, **PAPER, **KEY), samples)
     finally:
-        torch.ops.spslam.set_num_threads(threads)
+        ops.set_num_threads(threads)
 
 
 def test_samples_of_strided_and_empty_input(device):

@@ -225,14 +225,14 @@ def test_non_contiguous(name, device, generator):
 @each_op
 def test_same_bits_for_any_number_of_threads(name, device, generator):
     arguments, differentiable = CASES[name](generator, torch.float32, device, rays=3000)
-    threads = torch.ops.spslam.get_num_threads()
+    threads = ops.get_num_threads()
     results = []
     try:
         for count in (1, 2, 7):
-            torch.ops.spslam.set_num_threads(count)
+            ops.set_num_threads(count)
             results.append(_values_and_gradients(getattr(ops, name), arguments, differentiable, generator))
     finally:
-        torch.ops.spslam.set_num_threads(threads)
+        ops.set_num_threads(threads)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
