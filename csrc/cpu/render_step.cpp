@@ -75,26 +75,28 @@ class Step {
   // Memory of the calling thread, kept between calls: fresh pages would cost more than the step's own work.
   void reserve() {
     static thread_local ScratchBuffer<float> partials, embedding, texel;
-    static thread_local ScratchBuffer<std::int64_t> num_inside, num_colors;
-    static thread_local ScratchBuffer<std::int32_t> voxel_of;
+    static thread_local ScratchBuffer<std::int64_t> num_embedding_runs, num_texel_runs;
+    static thread_local ScratchBuffer<EmbeddingRun> embedding_runs;
+    static thread_local ScratchBuffer<TexelRun> texel_runs;
     static thread_local ScratchBuffer<Vec3<float>> local;
-    static thread_local ScratchBuffer<PlanePlace> places;
+    static thread_local ScratchBuffer<PlaneFraction> fractions;
     static thread_local ScratchBuffer<RayResult> results;
     results_ = results.reserve(batch_.num_rays);
     partials_ = partials.reserve(num_groups() * partial_size());
     tables_ = {};
     tables_.capacity = kChunkRays * options_.sampling.num_samples();
-    const std::int64_t rows = chunks_ * tables_.capacity;
+    const std::int64_t rows = tables_.rows = chunks_ * tables_.capacity;
     if (plan_.embeddings) {
-      tables_.num_inside = num_inside.reserve(chunks_);
+      tables_.num_embedding_runs = num_embedding_runs.reserve(chunks_);
+      tables_.embedding_runs = embedding_runs.reserve(rows);
       tables_.embedding = embedding.reserve(rows * geometry_.layout.input_stride);
-      tables_.voxel_of = voxel_of.reserve(rows);
       tables_.local = local.reserve(rows);
     }
     if (plan_.texels) {
-      tables_.num_colors = num_colors.reserve(chunks_);
+      tables_.num_texel_runs = num_texel_runs.reserve(3 * chunks_);
+      tables_.texel_runs = texel_runs.reserve(3 * rows);
       tables_.texel = texel.reserve(rows * kPlaneChannels);
-      tables_.places = places.reserve(3 * rows);
+      tables_.fractions = fractions.reserve(3 * rows);
     }
   }
 
@@ -114,7 +116,7 @@ class Step {
     decode_geometry(geometry_, 1.0f / truncation, chunk);
     weigh_samples(truncation, chunk);
     if (plan_.color) {
-      gather_texels(scene_, color_.layout, plan_.pose, plan_.texels ? tables_.places + 3 * first_row : nullptr, chunk);
+      gather_texels(scene_, color_.layout, plan_, index, tables_, chunk);
       decode_color(color_, chunk);
     }
     ray_losses(scale_, plan_.color, truncation, chunk);
@@ -122,8 +124,9 @@ class Step {
       color_backward(color_, plan_, first_row, tables_, partial + geometry_.layout.size, chunk);
     }
     if (plan_.geometry_backward()) geometry_backward(scene_, geometry_, plan_, first_row, tables_, partial, chunk);
-    if (plan_.embeddings) tables_.num_inside[index] = chunk.num_inside;
-    if (plan_.texels) tables_.num_colors[index] = chunk.num_colors;
+    if (plan_.embeddings) {
+      tables_.num_embedding_runs[index] = store_embedding_runs(scene_, first_row, tables_, chunk);
+    }
     store_rays(begin, chunk);
   }
 

@@ -37,8 +37,8 @@ struct RayPull {
 
 // What this call has to compute beyond the losses.
 struct Plan {
-  bool color;             // the colour term has a weight
-  bool pose;              // gradients to sample positions
+  bool color;  // the colour term has a weight
+  bool pose;   // gradients to sample positions
   bool embeddings, texels;
   bool geometry_params, color_params;
 
@@ -53,10 +53,23 @@ struct ChunkCell {
   std::int32_t voxel_id;  // its lowest corner; kNoVoxel where the cell is incomplete
 };
 
-// A sample's place in one plane.
-struct PlanePlace {
-  std::int32_t u, v;  // lower texel, counted from the plane's start
-  float fraction_u, fraction_v;
+// Where a sample lies in one plane's cell.
+struct PlaneFraction {
+  float u, v;
+};
+
+// Parts of the embeddings that are filled independently: blocks of 64 rows (ids are neighbours where vertices are),
+// dealt out in turn.
+constexpr int kEmbeddingParts = 4, kEmbeddingBlockShift = 6;
+
+// Consecutive samples in one cell: those from the end of the run before to `end`.
+struct EmbeddingRun {
+  std::int32_t corners[kCellCorners];
+  std::uint8_t owned[kEmbeddingParts];  // bit k: corner k is in this part
+  std::int32_t end;
+};
+struct TexelRun {
+  std::int32_t row, end;
 };
 
 // Per-thread memory, kept from call to call. Arrays hold kChunkRays * num_samples rows.
@@ -136,18 +149,20 @@ class Chunk {
   ScratchBuffer<Vec3<float>> local_;
 };
 
-// Gradients of samples on their way to the tables: chunk c writes rows from c * kChunkRays * num_samples on.
+// Gradients of samples on their way to the tables: chunk c writes rows and runs from c * kChunkRays * num_samples on.
 struct TableGradients {
   std::int64_t capacity;  // rows a chunk may write
+  std::int64_t rows;      // of all chunks
 
-  std::int64_t* num_inside;  // [chunks]
-  float* embedding;          // gradient rows of the geometry decoder's input
-  std::int32_t* voxel_of;
+  std::int64_t* num_embedding_runs;  // [chunks]
+  EmbeddingRun* embedding_runs;
+  float* embedding;  // gradient rows of the geometry decoder's input
   Vec3<float>* local;
 
-  std::int64_t* num_colors;  // [chunks]
-  float* texel;              // gradient rows of the colour decoder's input
-  PlanePlace* places;        // [rows, 3]
+  std::int64_t* num_texel_runs;  // [chunks, 3]
+  TexelRun* texel_runs;          // [3, rows]
+  float* texel;                  // gradient rows of the colour decoder's input
+  PlaneFraction* fractions;      // [3, rows]
 };
 
 }  // namespace spslam::render

@@ -7,40 +7,36 @@
 
 namespace spslam::render {
 
-// Rows of a plane's table as vectors of texels.
+// One plane of the table.
 struct PlaneTexels {
-  const float* texels;  // of the plane's first row
-  std::int64_t step_u, step_v;  // floats to the next texel; 0 where the plane has but one
+  const float* texels;          // of the table's first row
+  std::int64_t step_u, step_v;  // rows to the next texel; 0 where the plane has but one
+  PlaneLayout layout;
 
-  PlaneTexels(const float* table, const PlaneLayout& layout)
-      : texels(table + layout.offset * kPlaneChannels),
-        step_u(layout.size_u > 1 ? layout.size_v * kPlaneChannels : 0),
-        step_v(layout.size_v > 1 ? kPlaneChannels : 0),
-        row_(layout.size_v * kPlaneChannels) {}
-
-  const float* at(const PlanePlace& place) const { return texels + place.u * row_ + place.v * kPlaneChannels; }
-
- private:
-  std::int64_t row_;
+  PlaneTexels(const float* table, const PlaneLayout& plane)
+      : texels(table), step_u(plane.size_u > 1 ? plane.size_v : 0), step_v(plane.size_v > 1 ? 1 : 0), layout(plane) {}
 };
 
 inline bool planes_cover(const TriPlaneLayout& layout) {
   return !empty_plane(layout.planes[0]) && !empty_plane(layout.planes[1]) && !empty_plane(layout.planes[2]);
 }
 
-// A sample's cells in the three planes; slopes are d fraction / d point (1/m), 0 where clamped.
+// A sample's cells in the three planes: lower rows and fractions; slopes are d fraction / d point (1/m), 0 where
+// clamped.
 struct PlaneSample {
-  PlanePlace places[3];
+  std::int64_t rows[3];
+  PlaneFraction fractions[3];
   float slope_u[3], slope_v[3];
 };
 
-inline PlaneSample locate_in_planes(const SceneView& scene, float inverse_cell, const Vec3<float>& point) {
+inline PlaneSample locate_in_planes(const PlaneTexels (&planes)[3], float inverse_cell, const Vec3<float>& point) {
   PlaneSample sample;
   for (int p = 0; p < 3; ++p) {
-    const PlaneLayout& layout = scene.planes.planes[p];
+    const PlaneLayout& layout = planes[p].layout;
     const AxisCell<float> u = axis_cell(plane_u(point, p) * inverse_cell, layout.origin_u, layout.size_u);
     const AxisCell<float> v = axis_cell(plane_v(point, p) * inverse_cell, layout.origin_v, layout.size_v);
-    sample.places[p] = {u.lower, v.lower, u.fraction, v.fraction};
+    sample.rows[p] = layout.offset + std::int64_t{u.lower} * layout.size_v + v.lower;
+    sample.fractions[p] = {u.fraction, v.fraction};
     sample.slope_u[p] = u.slope * inverse_cell;
     sample.slope_v[p] = v.slope * inverse_cell;
   }
@@ -53,15 +49,15 @@ inline void interpolate_texels(const PlaneTexels (&planes)[3], const PlaneSample
   for (std::int64_t c = 0; c < kPlaneChannels; c += kLanes<float>) {
     V value{}, by_u[3], by_v[3];
     for (int p = 0; p < 3; ++p) {
-      const PlanePlace& place = sample.places[p];
-      const float* texel = planes[p].at(place) + c;
-      const V t00 = load_vector<V>(texel), t10 = load_vector<V>(texel + planes[p].step_u);
-      const V t01 = load_vector<V>(texel + planes[p].step_v);
-      const V t11 = load_vector<V>(texel + planes[p].step_u + planes[p].step_v);
-      const V low = t00 + place.fraction_v * (t01 - t00), high = t10 + place.fraction_v * (t11 - t10);
-      value += low + place.fraction_u * (high - low);
+      const PlaneFraction& f = sample.fractions[p];
+      const float* texel = planes[p].texels + sample.rows[p] * kPlaneChannels + c;
+      const std::int64_t step_u = planes[p].step_u * kPlaneChannels, step_v = planes[p].step_v * kPlaneChannels;
+      const V t00 = load_vector<V>(texel), t10 = load_vector<V>(texel + step_u);
+      const V t01 = load_vector<V>(texel + step_v), t11 = load_vector<V>(texel + step_u + step_v);
+      const V low = t00 + f.v * (t01 - t00), high = t10 + f.v * (t11 - t10);
+      value += low + f.u * (high - low);
       by_u[p] = sample.slope_u[p] * (high - low);
-      by_v[p] = sample.slope_v[p] * ((t01 - t00) + place.fraction_u * ((t11 - t10) - (t01 - t00)));
+      by_v[p] = sample.slope_v[p] * ((t01 - t00) + f.u * ((t11 - t10) - (t01 - t00)));
     }
     store_vector(x + c, value);
     if (!slopes) continue;
@@ -72,38 +68,69 @@ inline void interpolate_texels(const PlaneTexels (&planes)[3], const PlaneSample
   }
 }
 
-inline void prefetch_texels(const PlaneTexels (&planes)[3], const PlaneSample& sample) {
+// Fetches the cells that differ from those of the sample before.
+inline void prefetch_texels(const PlaneTexels (&planes)[3], const PlaneSample& sample, const PlaneSample& before) {
   for (int p = 0; p < 3; ++p) {
-    const float* texel = planes[p].at(sample.places[p]);
-    for (const float* corner : {texel, texel + planes[p].step_u}) {
+    if (sample.rows[p] == before.rows[p]) continue;
+    const float* texel = planes[p].texels + sample.rows[p] * kPlaneChannels;
+    for (const float* corner : {texel, texel + planes[p].step_u * kPlaneChannels}) {
       for (std::int64_t c = 0; c < 2 * kPlaneChannels; c += 16) __builtin_prefetch(corner + c);
     }
   }
 }
 
-// Fills the colour decoder's input for the rendered samples; notes their places for the way back, where wanted.
-inline void gather_texels(const SceneView& scene, const MlpLayout<float>& layout, bool need_slopes, PlanePlace* places,
-                          Chunk& chunk) {
-  constexpr std::int64_t kAhead = 4;
+// Tells the tables which cells the rendered samples lie in, one after another.
+class TexelRunWriter {
+ public:
+  TexelRunWriter(std::int64_t first_row, const TableGradients& tables) : tables_(tables), first_row_(first_row) {}
+
+  void add(std::int64_t j, const PlaneSample& sample) {
+    for (int p = 0; p < 3; ++p) {
+      const std::int64_t at = p * tables_.rows + first_row_;
+      TexelRun* runs = tables_.texel_runs + at;
+      tables_.fractions[at + j] = sample.fractions[p];
+      if (counts_[p] == 0 || runs[counts_[p] - 1].row != sample.rows[p]) {
+        runs[counts_[p]++].row = static_cast<std::int32_t>(sample.rows[p]);
+      }
+      runs[counts_[p] - 1].end = static_cast<std::int32_t>(j + 1);
+    }
+  }
+
+  void finish(std::int64_t chunk) const {
+    for (int p = 0; p < 3; ++p) tables_.num_texel_runs[3 * chunk + p] = counts_[p];
+  }
+
+ private:
+  const TableGradients& tables_;
+  const std::int64_t first_row_;
+  std::int64_t counts_[3] = {0, 0, 0};
+};
+
+// Fills the colour decoder's input for the rendered samples.
+inline void gather_texels(const SceneView& scene, const MlpLayout<float>& layout, const Plan& plan, std::int64_t index,
+                          const TableGradients& tables, Chunk& chunk) {
+  constexpr std::int64_t kAhead = 16;
   const PlaneLayout* p = scene.planes.planes;
   const PlaneTexels planes[3] = {{scene.texels, p[0]}, {scene.texels, p[1]}, {scene.texels, p[2]}};
   const float inverse_cell = 1.0f / scene.plane_cell_size;
-  const bool covered = planes_cover(scene.planes);
-  PlaneSample queue[kAhead] = {};
+  TexelRunWriter runs(index * tables.capacity, tables);
+  PlaneSample queue[kAhead];
+  for (PlaneSample& sample : queue) sample.rows[0] = sample.rows[1] = sample.rows[2] = -1;
   const auto locate = [&](std::int64_t j) {
     const std::int32_t i = chunk.color_sample[j];
-    queue[j % kAhead] = locate_in_planes(scene, inverse_cell, sample_point(chunk.rays[chunk.ray_of[i]], chunk.t[i]));
-    prefetch_texels(planes, queue[j % kAhead]);
+    queue[j % kAhead] = locate_in_planes(planes, inverse_cell, sample_point(chunk.rays[chunk.ray_of[i]], chunk.t[i]));
+    prefetch_texels(planes, queue[j % kAhead], queue[(j + kAhead - 1) % kAhead]);
   };
-  const std::int64_t n = covered ? chunk.num_colors : 0;
+  const std::int64_t n = planes_cover(scene.planes) ? chunk.num_colors : 0;
   for (std::int64_t j = 0; j < n && j < kAhead; ++j) locate(j);
   for (std::int64_t j = 0; j < n; ++j) {
     const PlaneSample sample = queue[j % kAhead];
     if (j + kAhead < n) locate(j + kAhead);
     interpolate_texels(planes, sample, chunk.color_x + j * layout.input_stride,
-                       need_slopes ? chunk.color_slopes + j * kColorSlopes : nullptr);
-    for (int k = 0; places && k < 3; ++k) places[3 * j + k] = sample.places[k];
+                       plan.pose ? chunk.color_slopes + j * kColorSlopes : nullptr);
+    if (plan.texels) runs.add(j, sample);
   }
+  if (plan.texels) runs.finish(index);
   const std::int64_t padded = round_up(chunk.num_colors, kRowBlock) * layout.input_stride;
   for (std::int64_t k = n * layout.input_stride; k < padded; ++k) chunk.color_x[k] = 0.0f;
   for (std::int64_t k = n * kColorSlopes; k < chunk.num_colors * kColorSlopes; ++k) chunk.color_slopes[k] = 0.0f;

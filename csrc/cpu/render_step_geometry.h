@@ -23,8 +23,7 @@ inline FeatureSlopes interpolate_embedding(const float* embeddings, const std::i
     edge[k] = e[2 * k] + local.x * along[k];
   }
   const Feature low = mix(edge[0], edge[1], local.y), high = mix(edge[2], edge[3], local.y);
-  return {mix(low, high, local.z),
-          mix(mix(along[0], along[1], local.y), mix(along[2], along[3], local.y), local.z),
+  return {mix(low, high, local.z), mix(mix(along[0], along[1], local.y), mix(along[2], along[3], local.y), local.z),
           mix(edge[1] - edge[0], edge[3] - edge[2], local.z), high - low};
 }
 
@@ -93,10 +92,9 @@ inline void pull_rays_by_geometry(const SceneView& scene, const float* grad_x, s
     const float* g = grad_x + r * stride;
     const float* slopes = chunk.slopes + (first + r) * kGeometrySlopes;
     const Feature grad = load_vector<Feature>(g + 3);
-    const Vec3<float> by_cell{
-        sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes)),
-        sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + kEmbeddingChannels)),
-        sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + 2 * kEmbeddingChannels))};
+    const Vec3<float> by_cell{sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes)),
+                              sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + kEmbeddingChannels)),
+                              sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + 2 * kEmbeddingChannels))};
     const Vec3<float> by_position{g[0], g[1], g[2]};
     pull_ray(chunk, first + r, inverse_voxel * by_cell + scene.position_scale * by_position);
   }
@@ -125,11 +123,27 @@ inline void geometry_backward(const SceneView& scene, const PackedMlp<float>& ne
     }
     if (plan.pose) pull_rays_by_geometry(scene, grad_x, l.input_stride, row, rows, chunk);
   }
-  if (!plan.embeddings) return;
-  for (std::int64_t i = 0; i < n; ++i) {
-    tables.voxel_of[first_row + i] = chunk.voxel_of[i];
+}
+
+// Tells the tables which cells the samples inside lie in; returns the number of runs.
+inline std::int64_t store_embedding_runs(const SceneView& scene, std::int64_t first_row, const TableGradients& tables,
+                                         const Chunk& chunk) {
+  EmbeddingRun* runs = tables.embedding_runs + first_row;
+  std::int64_t count = 0;
+  for (std::int64_t i = 0; i < chunk.num_inside; ++i) {
     tables.local[first_row + i] = chunk.local[i];
+    if (i == 0 || chunk.voxel_of[i] != chunk.voxel_of[i - 1]) {
+      EmbeddingRun& run = runs[count++];
+      const std::int32_t* corners = scene.corner_ids + kCellCorners * std::int64_t{chunk.voxel_of[i]};
+      for (std::uint8_t& owned : run.owned) owned = 0;
+      for (int k = 0; k < kCellCorners; ++k) {
+        run.corners[k] = corners[k];
+        run.owned[(corners[k] >> kEmbeddingBlockShift) % kEmbeddingParts] |= static_cast<std::uint8_t>(1 << k);
+      }
+    }
+    runs[count - 1].end = static_cast<std::int32_t>(i + 1);
   }
+  return count;
 }
 
 }  // namespace spslam::render
