@@ -7,12 +7,23 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
+from typing import Generic, Protocol, TypeVar
 
-from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError
 
+Frame = TypeVar("Frame")
+ReadFrame = TypeVar("ReadFrame", covariant=True)
 
-class Prefetcher(Iterator[RgbdFrame | DatasetError]):
+
+class Readable(Protocol[ReadFrame]):
+    """What is read ahead: an ``RgbdDataset``, or whatever else has frames by number, from any thread."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> ReadFrame: ...
+
+
+class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
     """Frames of a dataset in order, read by threads up to ``ahead`` frames in advance.
 
     A frame that can't be read comes as its DatasetError in the frame's place (not raised): who iterates
@@ -26,7 +37,7 @@ class Prefetcher(Iterator[RgbdFrame | DatasetError]):
     wait_seconds : time that the caller waited for frames.
     """
 
-    def __init__(self, dataset: RgbdDataset, workers: int = 2, ahead: int = 8) -> None:
+    def __init__(self, dataset: Readable[Frame], workers: int = 2, ahead: int = 8) -> None:
         if workers < 0:
             raise ValueError(f"prefetch: workers must be at least 0, got {workers}")
         if ahead < 1:
@@ -34,13 +45,13 @@ class Prefetcher(Iterator[RgbdFrame | DatasetError]):
         self._dataset = dataset
         self._ahead = ahead
         self._next = 0
-        self._pending: deque[Future[tuple[RgbdFrame | DatasetError, float]]] = deque()
+        self._pending: deque[Future[tuple[Frame | DatasetError, float]]] = deque()
         self._threads = ThreadPoolExecutor(workers, thread_name_prefix="spslam-prefetch") if workers else None
         self.frames_read = 0
         self.read_seconds = 0.0
         self.wait_seconds = 0.0
 
-    def __next__(self) -> RgbdFrame | DatasetError:
+    def __next__(self) -> Frame | DatasetError:
         try:
             return self._take_next()
         except BaseException:
@@ -54,7 +65,7 @@ class Prefetcher(Iterator[RgbdFrame | DatasetError]):
         if self._threads is not None:
             self._threads.shutdown(wait=True, cancel_futures=True)
 
-    def __enter__(self) -> Prefetcher:
+    def __enter__(self) -> Prefetcher[Frame]:
         return self
 
     def __exit__(
@@ -62,7 +73,7 @@ class Prefetcher(Iterator[RgbdFrame | DatasetError]):
     ) -> None:
         self.close()
 
-    def _take_next(self) -> RgbdFrame | DatasetError:
+    def _take_next(self) -> Frame | DatasetError:
         started = time.perf_counter()
         frame, seconds = self._read_in_place() if self._threads is None else self._wait_for_oldest(self._threads)
         self.wait_seconds += time.perf_counter() - started
@@ -70,13 +81,13 @@ class Prefetcher(Iterator[RgbdFrame | DatasetError]):
         self.frames_read += 1
         return frame
 
-    def _read_in_place(self) -> tuple[RgbdFrame | DatasetError, float]:
+    def _read_in_place(self) -> tuple[Frame | DatasetError, float]:
         if self._next >= len(self._dataset):
             raise StopIteration
         self._next += 1
         return _timed_read(self._dataset, self._next - 1)
 
-    def _wait_for_oldest(self, threads: ThreadPoolExecutor) -> tuple[RgbdFrame | DatasetError, float]:
+    def _wait_for_oldest(self, threads: ThreadPoolExecutor) -> tuple[Frame | DatasetError, float]:
         self._submit_reads(threads)
         if not self._pending:
             raise StopIteration
@@ -91,7 +102,7 @@ class Prefetcher(Iterator[RgbdFrame | DatasetError]):
             self._next += 1
 
 
-def prefetch(dataset: RgbdDataset, workers: int = 2, ahead: int = 8) -> Prefetcher:
+def prefetch(dataset: Readable[Frame], workers: int = 2, ahead: int = 8) -> Prefetcher[Frame]:
     """Read a dataset's frames in order, ``ahead`` frames in advance, on ``workers`` threads.
 
     At most ``ahead`` + 1 decoded frames exist at a time. With 0 workers each frame is read when it is asked
@@ -106,9 +117,9 @@ def prefetch(dataset: RgbdDataset, workers: int = 2, ahead: int = 8) -> Prefetch
     return Prefetcher(dataset, workers, ahead)
 
 
-def _timed_read(dataset: RgbdDataset, index: int) -> tuple[RgbdFrame | DatasetError, float]:
+def _timed_read(dataset: Readable[Frame], index: int) -> tuple[Frame | DatasetError, float]:
     started = time.perf_counter()
-    frame: RgbdFrame | DatasetError
+    frame: Frame | DatasetError
     try:
         frame = dataset[index]
     except DatasetError as error:

@@ -38,7 +38,7 @@ def save_mesh(mesh: TriangleMesh, path: str | os.PathLike) -> None:
     if len(mesh.faces) == 0:
         raise OutputError(f"{path}: a mesh without faces can be written as .ply only")
     exported = _as_trimesh(mesh).export(file_type=suffix[1:], include_normals=True)
-    atomic_write(path, exported)
+    atomic_write(path, exported if isinstance(exported, bytes) else str(exported))
 
 
 def _as_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:

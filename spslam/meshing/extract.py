@@ -6,14 +6,16 @@ import numpy as np
 import torch
 
 from spslam import ops
+from spslam.camera import Camera
+from spslam.meshing.cleaning import face_support, faced_by_a_camera, in_large_part
 from spslam.meshing.lattice import SignedDistance, near_surface, near_surface_parts, sample_blocks
-from spslam.meshing.mesh import TriangleMesh, compact, drop_small_parts, vertex_normals
+from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
 from spslam.scene import Scene
 
 CHUNK_POINTS = 1 << 19
 # The learnt field is no exact distance; beyond this slope a surface could be missed.
 MAX_SLOPE = 1.5
-MIN_SUPPORT = 0.0
+MIN_SUPPORT = 0.1
 MIN_PART_FACES = 100
 # A block of more cubes an axis wastes samples far from the surface, one of fewer repeats too many at its border.
 _CUBES_PER_BLOCK = range(4, 8)
@@ -85,25 +87,31 @@ def cubes_per_cell(cell_size_m: float, resolution_m: float) -> tuple[int, int]:
 def extract_mesh(
     scene: Scene,
     resolution_m: float,
+    camera: Camera | None = None,
+    poses: np.ndarray | None = None,
     min_support: float = MIN_SUPPORT,
     min_part_faces: int = MIN_PART_FACES,
 ) -> TriangleMesh:
-    """The mesh of a map: its SDF's zero level within the complete cells, coloured, without unsupported surface.
+    """The mesh of a map: its SDF's zero level within the complete cells, coloured, without what was never measured.
 
     Args:
         scene: the map. Not changed.
         resolution_m: edge wanted for the cubes, see `extract_surface`.
-        min_support: fusion weight below which surface is dropped, interpolated from the eight vertices around. Behind
-            the seen surface and at depth edges, where truncation leaves double surfaces and fringes, little or nothing
-            was fused. 0 keeps everything.
+        camera: of the views that `poses` tells of.
+        poses: float [F, 4, 4] T_world_camera, the trajectory. Where given, with the camera, surface that no view has
+            seen from the front is dropped: second sheets behind walls, and what grew beyond the pictures' borders.
+        min_support: surface is dropped where the fusion weight is below this share of the largest one within a voxel
+            around, as on the lips behind depth edges. 0 keeps everything.
         min_part_faces: connected parts of fewer faces are dropped.
 
     Returns:
         The mesh; empty for an empty map. Memory is bounded as `extract_surface` says. The same map gives the same mesh.
 
     Raises:
-        ValueError: `resolution_m` is not positive.
+        ValueError: `resolution_m` is not positive, or one of `camera` and `poses` is missing.
     """
+    if (camera is None) != (poses is None):
+        raise ValueError("extract_mesh: camera and poses must be given together, got one of them")
     volume, truncation_m = scene.volume, scene.settings.truncation_m
 
     def sdf(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -111,23 +119,17 @@ def extract_mesh(
         return values * truncation_m, known
 
     cells = volume.voxel_coords[volume.corner_ids[:, 0] >= 0]
-    vertices, faces = extract_surface(cells, volume.voxel_size_m, resolution_m, sdf)
-    faces = faces[_support(scene, vertices, faces) >= min_support]
-    kept = drop_small_parts(faces.cpu().numpy(), len(vertices), min_part_faces)
-    new_faces, used = compact(faces.cpu().numpy()[kept], len(vertices))
-    points = vertices[torch.from_numpy(used).to(vertices.device)]
-    new_vertices = points.cpu().numpy()
-    return TriangleMesh(new_vertices, new_faces, _colors(scene, points), vertex_normals(new_vertices, new_faces))
-
-
-def _support(scene: Scene, vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Fusion weight float32 [L] at the middle of each face, which lies within a cell as the corners need not."""
-    weights = scene.volume.weights[:, None]
-    support = [weights.new_zeros(0)]
-    for some in faces.split(CHUNK_POINTS):
-        corner_ids, local_coords, _ = scene.volume.lookup(vertices[some].mean(1))
-        support.append(ops.trilinear_interpolate(weights, corner_ids, local_coords)[:, 0])
-    return torch.cat(support)
+    points, faces = extract_surface(cells, volume.voxel_size_m, resolution_m, sdf)
+    if min_support > 0:
+        faces = faces[face_support(volume, points, faces, CHUNK_POINTS) >= min_support]
+    vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
+    normals = vertex_normals(vertices, kept)
+    if camera is not None and poses is not None:
+        kept = kept[faced_by_a_camera(vertices, normals, kept, camera, poses)]
+    kept = kept[in_large_part(kept, len(vertices), min_part_faces)]
+    kept, used = compact(kept, len(vertices))
+    colors = _colors(scene, points[torch.from_numpy(used).to(points.device)])
+    return TriangleMesh(vertices[used], kept, colors, normals[used])
 
 
 def _colors(scene: Scene, points: torch.Tensor) -> np.ndarray:

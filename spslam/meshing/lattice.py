@@ -122,7 +122,7 @@ def _upper_neighbors(coords: torch.Tensor) -> dict[tuple[int, int, int], torch.T
     capacity = max(2, 1 << (2 * len(coords) - 1).bit_length())
     keys, values = ops.new_voxel_hash(capacity, coords.device)
     ops.voxel_hash_build_(keys, values, coords)
-    steps = [step for step in itertools.product((0, 1), repeat=3) if any(step)]
+    steps = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1) if x or y or z]
     return {
         step: ops.voxel_hash_find(keys, values, coords + torch.tensor(step, dtype=torch.int32, device=coords.device))
         >= 0

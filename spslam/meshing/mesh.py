@@ -85,11 +85,3 @@ def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
     graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), (num_vertices, num_vertices))
     _, labels = connected_components(graph, directed=False)
     return labels[faces[:, 0]]
-
-
-def drop_small_parts(faces: np.ndarray, num_vertices: int, min_faces: int) -> np.ndarray:
-    """Bool [L]: whether the connected part that a face belongs to has at least `min_faces` faces."""
-    if min_faces <= 1 or len(faces) == 0:
-        return np.ones(len(faces), dtype=bool)
-    part = face_components(faces, num_vertices)
-    return np.bincount(part)[part] >= min_faces

@@ -1,18 +1,15 @@
 """The map: sparse volume, tri-planes and the two decoders, with one file to save to and load from."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import safetensors
-import safetensors.torch
 import torch
 
 from spslam import ops
 from spslam.errors import SpslamError
-from spslam.io import atomic_write
 from spslam.scene.decoders import COLOR_DECODER, GEOMETRY_DECODER, random_parameters
 from spslam.scene.sparse_volume import SparseVolume
+from spslam.scene.tensor_file import load_tensors, save_tensors
 from spslam.scene.tri_planes import TriPlanes
 
 FORMAT = "spslam-map-1"
@@ -117,7 +114,7 @@ class Scene:
         return sum(p.numel() * p.element_size() for p in parameters)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Everything learnt, as CPU tensors."""
+        """Everything learnt, on the CPU and contiguous; views where it is there already, so clone what must stay."""
         state = {
             "origin": self.origin,
             "volume.voxel_coords": self.volume.voxel_coords,
@@ -128,8 +125,7 @@ class Scene:
             "geometry_decoder": self.geometry_decoder,
             "color_decoder": self.color_decoder,
         }
-        # Clones, not views: the file must not hold the spare capacity behind a view.
-        return {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in state.items()}
+        return {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replaces the content by that of `state_dict()`.
@@ -138,20 +134,19 @@ class Scene:
             SpslamError: a tensor is missing or of another shape.
         """
         _check_state(state)
-        self.origin = state["origin"].to("cpu", torch.float64)
+        self.origin = state["origin"].to("cpu", copy=True)
         self.volume = SparseVolume(self.settings.voxel_size_m, max_voxels=self.settings.max_voxels, device=self.device)
         volume = (state[f"volume.{name}"].to(self.device) for name in ("voxel_coords", "embeddings", "weights"))
         self.volume.restore(*volume)
         self.planes = TriPlanes(self.settings.plane_cell_m, seed=self.seed, device=self.device)
         self.planes.restore(state["planes.texels"], state["planes.layout"].tolist())
-        self.geometry_decoder = state["geometry_decoder"].to(self.device)
-        self.color_decoder = state["color_decoder"].to(self.device)
+        self.geometry_decoder = state["geometry_decoder"].to(self.device, copy=True)
+        self.color_decoder = state["color_decoder"].to(self.device, copy=True)
 
     def save(self, path: str | Path) -> None:
-        """Writes one safetensors file, atomically; the same scene gives the same bytes."""
-        # A single metadata key: safetensors does not keep the order of several.
-        header = json.dumps({"format": FORMAT, "seed": self.seed, "settings": vars(self.settings)}, sort_keys=True)
-        atomic_write(path, safetensors.torch.save(self.state_dict(), metadata={"spslam": header}))
+        """Writes one safetensors file, atomically; the same scene gives the same bytes. Raises OutputError."""
+        header = {"format": FORMAT, "seed": self.seed, "settings": vars(self.settings)}
+        save_tensors(path, self.state_dict(), header)
 
     @classmethod
     def load(cls, path: str | Path, device: torch.device | str = "cpu") -> "Scene":
@@ -160,44 +155,38 @@ class Scene:
         Raises:
             SpslamError: no such file, not a map, truncated, or of another shape.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise SpslamError(f"{path}: no such map file")
+        state, header = load_tensors(path, FORMAT, "map")
         try:
-            with safetensors.safe_open(path, framework="pt") as file:
-                header = json.loads((file.metadata() or {}).get("spslam", "{}"))
-                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-        except (safetensors.SafetensorError, ValueError, OSError) as error:
-            raise SpslamError(f"{path}: not a readable safetensors file ({error})") from None
-        if header.get("format") != FORMAT:
-            raise SpslamError(f"{path}: not a map of format {FORMAT}")
-        scene = cls(SceneSettings(**header["settings"]), header["seed"], device=device)
-        try:
+            scene = cls(SceneSettings(**header["settings"]), header["seed"], device=device)
             scene.load_state_dict(state)
-        except SpslamError as error:
-            raise SpslamError(f"{path}: {error}") from None
+        except (SpslamError, KeyError, TypeError, ValueError) as error:
+            raise SpslamError(f"{path}: a damaged map ({error})") from None
         return scene
 
 
-_SHAPES: dict[str, tuple[int | None, ...]] = {
-    "origin": (3,),
-    "volume.voxel_coords": (None, 3),
-    "volume.embeddings": (None, 8),
-    "volume.weights": (None,),
-    "planes.texels": (None, COLOR_DECODER.inputs),
-    "planes.layout": (15,),
-    "geometry_decoder": (GEOMETRY_DECODER.parameters,),
-    "color_decoder": (COLOR_DECODER.parameters,),
+_LEARNT: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {
+    "origin": (torch.float64, (3,)),
+    "volume.voxel_coords": (torch.int32, (None, 3)),
+    "volume.embeddings": (torch.float32, (None, 8)),
+    "volume.weights": (torch.float32, (None,)),
+    "planes.texels": (torch.float32, (None, COLOR_DECODER.inputs)),
+    "planes.layout": (torch.int64, (15,)),
+    "geometry_decoder": (torch.float32, (GEOMETRY_DECODER.parameters,)),
+    "color_decoder": (torch.float32, (COLOR_DECODER.parameters,)),
 }
 
 
 def _check_state(state: dict[str, torch.Tensor]) -> None:
-    for name, shape in _SHAPES.items():
+    for name, (dtype, shape) in _LEARNT.items():
         if name not in state:
             raise SpslamError(f"tensor {name} is missing")
-        actual = tuple(state[name].shape)
-        if len(actual) != len(shape) or any(want not in (None, got) for want, got in zip(shape, actual, strict=True)):
-            raise SpslamError(f"tensor {name} must have shape {list(shape)}, got {list(actual)}")
+        tensor = state[name]
+        fits = tensor.dim() == len(shape) and all(
+            want in (None, got) for want, got in zip(shape, tensor.shape, strict=True)
+        )
+        if not fits or tensor.dtype != dtype:
+            wanted = ", ".join("any" if rows is None else str(rows) for rows in shape)
+            raise SpslamError(f"tensor {name} must be {dtype} [{wanted}], got {tensor.dtype} {list(tensor.shape)}")
     rows = {len(state[name]) for name in ("volume.voxel_coords", "volume.embeddings", "volume.weights")}
     if len(rows) != 1:
         raise SpslamError("the volume's tensors differ in length")

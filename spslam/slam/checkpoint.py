@@ -6,30 +6,31 @@ One safetensors file, written to a temporary file, synced and renamed: a kill at
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
-import safetensors
-import safetensors.torch
 import torch
 
 from spslam.config import Config
-from spslam.errors import OutputError
-from spslam.io import atomic_write
+from spslam.errors import OutputError, SpslamError
+from spslam.scene.tensor_file import load_tensors, save_tensors
 from spslam.slam.state import Moments, SlamState
 
 FORMAT = "spslam-checkpoint-1"
-_FRAME_COLUMNS = ("poses", "timestamps", "indices", "lost", "lattices")
 
 
 def fingerprint(config: Config) -> str:
-    """Identifies what decides a run's result; devices, threads and checkpoint intervals do not take part."""
+    """Identifies what decides a run's result; device, limits, checkpoint intervals and outputs do not take part."""
     content = config.model_dump(mode="json")
-    content["dataset"].pop("path", None)
-    for section in ("run", "mesh"):
-        content.pop(section, None)
+    for section in ("device", "preset", "run", "mesh"):
+        content.pop(section)
+    content["dataset"].pop("path")
+    # A run that met a limit goes on when the limit is raised.
+    for limit in ("max_voxels", "max_texels"):
+        content["scene"].pop(limit)
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def save_checkpoint(path: Path, state: SlamState, config: Config, source: dict) -> None:
+def save_checkpoint(path: Path, state: SlamState, config: Config, source: dict[str, Any]) -> None:
     """Writes the state.
 
     Args:
@@ -37,24 +38,32 @@ def save_checkpoint(path: Path, state: SlamState, config: Config, source: dict) 
         state: after a whole frame.
         config: of the run.
         source: JSON object that names the data and where to go on, returned by `load_checkpoint`.
+
+    Raises:
+        OutputError: the file can't be written; the checkpoint before is left as it was.
     """
-    tensors = {f"scene.{name}": tensor for name, tensor in state.scene.state_dict().items()}
-    tensors |= {f"frames.{name}": getattr(state.frames, name).cpu().contiguous() for name in _FRAME_COLUMNS}
-    tensors |= {f"pixels.{name}": tensor for name, tensor in state.pixels.state_dict().items()}
-    for name, moments in state.moments.items():
-        tensors[f"moments.{name}.first"] = moments.first.cpu()
-        tensors[f"moments.{name}.second"] = moments.second.cpu()
+    tensors = {
+        **_prefixed("scene.", state.scene.state_dict()),
+        **_prefixed("frames.", state.frames.state_dict()),
+        **_prefixed("pixels.", state.pixels.state_dict()),
+    }
+    # Moments that the next mapping call resets anyway need no place.
+    if not config.mapping.reset_moments:
+        for name, moments in state.moments.items():
+            tensors[f"moments.{name}.first"] = moments.first.cpu()
+            tensors[f"moments.{name}.second"] = moments.second.cpu()
     header = {
         "format": FORMAT,
         "config": fingerprint(config),
         "steps": state.steps,
         "stamp": state.stamp,
+        "unmapped": state.unmapped,
         "source": source,
     }
-    atomic_write(path, safetensors.torch.save(tensors, metadata={"spslam": json.dumps(header, sort_keys=True)}))
+    save_tensors(path, tensors, header)
 
 
-def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict:
+def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, Any]:
     """Restores the state in place.
 
     Args:
@@ -69,27 +78,35 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict:
         OutputError: the file cannot be read, or belongs to a run with other settings.
     """
     try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("spslam", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (safetensors.SafetensorError, ValueError, OSError) as error:
-        raise OutputError(f"{path}: not a readable checkpoint ({error})") from None
-    if header.get("format") != FORMAT:
-        raise OutputError(f"{path}: not a checkpoint of format {FORMAT}")
-    if header["config"] != fingerprint(config):
+        tensors, header = load_tensors(path, FORMAT, "checkpoint")
+    except SpslamError as error:
+        raise OutputError(str(error)) from None
+    if header.get("config") != fingerprint(config):
         raise OutputError(f"{path}: belongs to a run with other settings; use the same options, or another --output")
-    device = state.scene.device
+    try:
+        _restore(state, tensors, header)
+        return header["source"]
+    except (SpslamError, KeyError, TypeError, ValueError) as error:
+        raise OutputError(f"{path}: a damaged checkpoint ({error})") from None
+
+
+def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
     state.scene.load_state_dict(_section(tensors, "scene."))
-    for name, tensor in _section(tensors, "frames.").items():
-        setattr(state.frames, name, tensor.to(getattr(state.frames, name).device))
+    state.frames.load_state_dict(_section(tensors, "frames."))
     state.pixels.load_state_dict(_section(tensors, "pixels."))
-    for name in sorted({key.split(".")[1] for key in tensors if key.startswith("moments.")}):
-        moments = Moments.like(tensors[f"moments.{name}.first"].to(device))
-        moments.first.copy_(tensors[f"moments.{name}.first"])
-        moments.second.copy_(tensors[f"moments.{name}.second"])
-        state.moments[name] = moments
-    state.steps, state.stamp = header["steps"], header["stamp"]
-    return header["source"]
+    device = state.scene.device
+    state.moments = {
+        name.removesuffix(".first"): Moments.of(
+            first.to(device, copy=True), tensors[f"moments.{name.removesuffix('.first')}.second"].to(device, copy=True)
+        )
+        for name, first in _section(tensors, "moments.").items()
+        if name.endswith(".first")
+    }
+    state.steps, state.stamp, state.unmapped = header["steps"], header["stamp"], header["unmapped"]
+
+
+def _prefixed(prefix: str, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {prefix + name: tensor for name, tensor in tensors.items()}
 
 
 def _section(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

@@ -26,13 +26,14 @@ class Mapper:
         """Allocates voxels around the newest frame's surface, fills them from the prior, and covers it with planes."""
         if len(pixels.records) == 0:
             return
-        pose = state.frames.poses[-1]
+        pose, scene = state.frames.poses[-1], state.scene
         points = self._to_world(unpack_points(pixels.records, self.camera), pose)
-        encode_frame(state.scene.volume, points, self._rotate(pixels.normals, pose), self.prior, self.config.prior)
         margin = self.config.scene.truncation_m
-        moved = state.scene.planes.cover(torch.stack([points.min(0).values - margin, points.max(0).values + margin]))
+        moved = scene.planes.cover(torch.stack([points.min(0).values - margin, points.max(0).values + margin]))
         if moved is not None and "texels" in state.moments:
-            state.moments["texels"].move_rows(moved, len(state.scene.planes.texels))
+            state.moments["texels"].move_rows(moved, len(scene.planes.texels))
+        normals = self._rotate(pixels.normals, pose)
+        encode_frame(scene.volume, points, normals, self.prior, self.config.prior, self.config.seed)
 
     def optimize(self, state: SlamState, iterations: int) -> torch.Tensor | None:
         """Joint optimisation of scene and poses over selected frames.
@@ -46,9 +47,9 @@ class Mapper:
         """
         if iterations == 0 or state.scene.volume.num_voxels == 0:
             return None
-        frames = self._select(state)
-        if len(frames) == 0:
+        if not bool(state.usable.any()):
             return None
+        frames = self._select(state)
         if self.config.mapping.reset_moments:
             _reset(state)
         losses = None
@@ -77,35 +78,33 @@ class Mapper:
                 state.frames.poses[selected],
                 self.intrinsics,
             ),
-            render_options(config, ops.Stream.MAPPING_RAYS, newest, iteration),
+            render_options(config, ops.Stream.MAPPING_RAYS, newest, iteration, config.mapping.optimize_poses),
             gradients,
         )
         self._step_scene(state, step)
-        if config.mapping.optimize_poses:
+        if step.grad_poses is not None:
             self._step_poses(state, selected, step.grad_poses)
         return step.losses
 
     def _gradients(self, state: SlamState) -> ops.SceneGradients:
-        """Buffers for the scene's gradients, grown to the scene's size."""
-        scene = state.scene
-        embeddings = _moments(state, "embeddings", scene.volume.embeddings)
-        texels = _moments(state, "texels", scene.planes.texels)
-        return ops.SceneGradients(
-            embeddings=embeddings.gradient if self.config.mapping.optimize_geometry else None,
-            embedding_stamps=embeddings.stamps if self.config.mapping.optimize_geometry else None,
-            texels=texels.gradient,
-            texel_stamps=texels.stamps,
-            stamp=state.stamp,
-        )
+        """Buffers for the gradients of what is optimised, grown to the scene's size."""
+        scene, config = state.scene, self.config
+        frozen: tuple[torch.Tensor | None, torch.Tensor | None] = (None, None)
+        embeddings = texels = frozen
+        if config.mapping.optimize_geometry:
+            embeddings = _buffers(state, "embeddings", scene.volume.embeddings)
+        if config.loss.rgb > 0:
+            texels = _buffers(state, "texels", scene.planes.texels)
+        return ops.SceneGradients(*embeddings, *texels, stamp=state.stamp)
 
     def _step_scene(self, state: SlamState, step: ops.RenderStep) -> None:
         mapping, scene = self.config.mapping, state.scene
-        if mapping.optimize_geometry:
+        if step.grad_geometry is not None:
             self._adam_rows(state, "embeddings", scene.volume.embeddings, mapping.embedding_rate)
             self._adam_dense(
                 state, "geometry_decoder", scene.geometry_decoder, step.grad_geometry, mapping.decoder_rate
             )
-        if self.config.loss.rgb > 0:
+        if step.grad_color is not None:
             self._adam_rows(state, "texels", scene.planes.texels, mapping.plane_rate)
             self._adam_dense(state, "color_decoder", scene.color_decoder, step.grad_color, mapping.color_decoder_rate)
 
@@ -133,8 +132,8 @@ class Mapper:
     def _step_poses(self, state: SlamState, selected: torch.Tensor, grad_poses: torch.Tensor) -> None:
         poses = state.frames.poses
         m = _moments(state, "poses", poses)
-        # The first frame holds the world in place.
-        free = selected > 0
+        # The frame that founded the map holds the world in place.
+        free = selected != state.usable.nonzero()[0, 0].to(selected.device)
         rows = selected[free]
         m.gradient[rows] = quaternion_gradient(poses[rows], grad_poses[free])
         m.stamps[rows] = state.stamp
@@ -142,11 +141,13 @@ class Mapper:
         poses[rows, :4] /= poses[rows, :4].norm(dim=1, keepdim=True)
 
     def _select(self, state: SlamState) -> torch.Tensor:
-        config, frames, newest = self.config, state.frames, len(state.frames) - 1
-        usable = state.pixels.has_pixels & ~frames.lost
-        records = state.pixels.records[newest]
-        draw = ops.sample_indices(config.seed, ops.Stream.COVISIBILITY, newest, 0, POINTS, len(records), records.device)
-        points = self._to_world(unpack_points(records[draw], self.camera), frames.poses[newest])
+        config, frames, usable = self.config, state.frames, state.usable
+        current = int(usable.nonzero()[-1])
+        records = state.pixels.records[current]
+        draw = ops.sample_indices(
+            config.seed, ops.Stream.COVISIBILITY, len(frames) - 1, 0, POINTS, len(records), records.device
+        )
+        points = self._to_world(unpack_points(records[draw], self.camera), frames.poses[current])
         rotations = _rotations(frames.poses)
         return select_frames(points, rotations, frames.poses[:, 4:], frames.lattices, usable, self.camera, config)
 
@@ -169,6 +170,12 @@ def _moments(state: SlamState, name: str, parameter: torch.Tensor) -> Moments:
         state.moments[name] = Moments.like(parameter)
     state.moments[name].fit(len(parameter))
     return state.moments[name]
+
+
+def _buffers(state: SlamState, name: str, parameter: torch.Tensor) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """Where the gradient of a parameter's rows, and which rows have one, are kept."""
+    moments = _moments(state, name, parameter)
+    return moments.gradient, moments.stamps
 
 
 def _reset(state: SlamState) -> None:

@@ -8,7 +8,9 @@ from spslam.config import Config
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8  # Adam's published constants
 
 
-def render_options(config: Config, stream: ops.Stream, frame: int, iteration: int) -> ops.RenderOptions:
+def render_options(
+    config: Config, stream: ops.Stream, frame: int, iteration: int, pose_gradient: bool = True
+) -> ops.RenderOptions:
     """The sampling, losses and random counters of one render step, from the configuration."""
     return ops.RenderOptions(
         num_uniform=config.sampling.uniform,
@@ -25,6 +27,7 @@ def render_options(config: Config, stream: ops.Stream, frame: int, iteration: in
         stream=stream,
         frame=frame,
         iteration=iteration,
+        pose_gradient=pose_gradient,
     )
 
 

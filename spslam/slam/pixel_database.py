@@ -63,11 +63,8 @@ class PixelDatabase:
         self.num_frames += 1
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """The content, as CPU tensors."""
-        return {
-            "records": self.records.to("cpu", copy=True).contiguous(),
-            "has_pixels": self.has_pixels.clone(),
-        }
+        """The content, on the CPU; views where it is there already."""
+        return {"records": self.records.cpu(), "has_pixels": self.has_pixels}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replaces the content by that of `state_dict()`."""

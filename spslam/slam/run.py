@@ -1,27 +1,28 @@
 """A sequence from a data set to an output folder."""
 
 import contextlib
+import hashlib
 import json
-import resource
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import torch
 
-from spslam import __version__
 from spslam.config import Config, dump_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError, DeviceError, OutputError
-from spslam.evaluation.trajectory import ate, rpe
 from spslam.io import atomic_write
 from spslam.slam.checkpoint import load_checkpoint, save_checkpoint
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.run_files import RunFiles
+from spslam.slam.run_results import provenance, write_results
 from spslam.slam.system import FrameReport, SlamSystem
 
 Progress = Callable[[int, int, FrameReport | None], None]
@@ -81,7 +82,7 @@ def run_sequence(
     resume: bool = False,
     mesh: bool = True,
     progress: Progress | None = None,
-) -> dict:
+) -> dict[str, Any]:
     """Runs SLAM over a sequence and leaves trajectory, map, mesh, metrics and log in `output_dir`.
 
     Args:
@@ -124,56 +125,47 @@ def _run(
     resume: bool,
     mesh: bool,
     progress: Progress | None,
-) -> dict:
+) -> dict[str, Any]:
     dataset = open_dataset(config.dataset, data_dir)
     if frames is not None:
         dataset = Subset(dataset, frames.start or 0, frames.stop, frames.step or 1)
-    truth = dataset.poses()
-    system = SlamSystem(config, dataset.camera, _first_pose(config, truth), device)
+    system = SlamSystem(config, dataset.camera, _first_pose(config, dataset), device)
     files = RunFiles(output_dir)
-    source = {"data": str(Path(data_dir).resolve()) if data_dir else "", "frames": len(dataset), "next": 0}
-    done = _begin(files, system, config, source, resume)
-    loop = _Loop(system, dataset, config, files, source, done, progress)
-    loop.run()
+    position, clock = _begin(files, system, dataset, data_dir, resume)
+    loop = _Loop(system, dataset, data_dir, files, clock, progress)
+    loop.run(position)
     system.finish()
-    return _finish(system, config, files, loop, truth, mesh)
+    return write_results(system, dataset, config, files, clock, mesh)
 
 
-def _begin(files: RunFiles, system: SlamSystem, config: Config, source: dict, resume: bool) -> int:
-    """Makes the folder, or picks up where its checkpoint stands; returns the position in the data set."""
+def _first_pose(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
+    poses = dataset.poses() if config.scene.first_pose == "dataset" else None
+    return poses[0] if poses is not None and bool(np.isfinite(poses[0]).all()) else None
+
+
+def _begin(
+    files: RunFiles, system: SlamSystem, dataset: RgbdDataset, data_dir: Path | None, resume: bool
+) -> tuple[int, dict[str, Any]]:
+    """Makes the folder, or picks up where its checkpoint stands; returns where in the data set, and the clock."""
     if resume and files.checkpoint.exists():
-        saved = load_checkpoint(files.checkpoint, system.state, config)
-        if (saved["data"], saved["frames"]) != (source["data"], source["frames"]):
-            raise OutputError(f"{files.folder}: belongs to a run over other data; use another --output")
-        files.keep_log_lines(len(system.state.frames))
-        return saved["next"]
+        source = load_checkpoint(files.checkpoint, system.state, system.config)
+        if source["data"] != _identity(dataset, data_dir):
+            raise OutputError(f"{files.folder}: belongs to a run over other data or frames; use another --output")
+        files.remove_temporaries()
+        files.keep_log(len(system.state.frames), source["next"])
+        return source["next"], source["clock"]
     files.create(resume)
-    atomic_write(files.config, dump_config(config, provenance(config, system.device)))
-    return 0
+    atomic_write(files.config, dump_config(system.config, provenance(system.config, system.device)))
+    return 0, {"frames": 0, "wall_s": 0.0, "decode_s": 0.0}
 
 
-def provenance(config: Config, device: torch.device) -> dict:
-    """What a run's files say of where they come from."""
+def _identity(dataset: RgbdDataset, data_dir: Path | None) -> dict[str, Any]:
+    """What tells the frames of one run from those of another."""
     return {
-        "version": __version__,
-        "torch": torch.__version__,
-        "seed": config.seed,
-        "device": str(device),
-        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
+        "folder": str(Path(data_dir).resolve()) if data_dir else "",
+        "frames": len(dataset),
+        "timestamps": hashlib.sha256(dataset.timestamps().tobytes()).hexdigest()[:16],
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return "cpu"
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "cpu")
-
-
-def _first_pose(config: Config, truth: np.ndarray | None) -> np.ndarray | None:
-    known = truth is not None and bool(np.isfinite(truth[0]).all())
-    return truth[0] if known and config.scene.first_pose == "dataset" else None
 
 
 class _Loop:
@@ -183,35 +175,36 @@ class _Loop:
         self,
         system: SlamSystem,
         dataset: RgbdDataset,
-        config: Config,
+        data_dir: Path | None,
         files: RunFiles,
-        source: dict,
-        start: int,
+        clock: dict[str, Any],
         progress: Progress | None,
     ):
-        self.system, self.dataset, self.config, self.files = system, dataset, config, files
-        self.source, self.start, self.progress = source, start, progress
-        self.wall_s = 0.0
-        self.decode_s = 0.0
-        self.done = 0
+        self.system, self.dataset, self.files = system, dataset, files
+        self.clock, self.progress = clock, progress
+        self.identity = _identity(dataset, data_dir)
 
-    def run(self) -> None:
-        run, total = self.config.run, len(self.dataset)
-        prepared = _PreparedFrames(self.dataset, self.config, self.start)
-        started = time.perf_counter()
+    def run(self, start: int) -> None:
+        """Processes the frames from position `start` on."""
+        run, total, last_saved = self.system.config.run, len(self.dataset), start
+        prepared = _PreparedFrames(self.dataset, self.system.config, start)
+        before, started = dict(self.clock), time.perf_counter()
         with prefetch(prepared, run.prefetch_workers, run.prefetch_ahead) as reader, self.files.open_log() as log:
-            for position, item in enumerate(reader, self.start):
+            for position, item in enumerate(reader, start):
                 report = self._take(item, position, log)
-                self.done += 1
+                done = position + 1
+                self.clock |= {
+                    "frames": before["frames"] + done - start,
+                    "wall_s": before["wall_s"] + time.perf_counter() - started,
+                    "decode_s": before["decode_s"] + reader.read_seconds,
+                }
                 if self.progress:
-                    self.progress(position + 1, total, report)
-                if run.checkpoint_every and (position + 1) % run.checkpoint_every == 0 and position + 1 < total:
-                    log.flush()
-                    self._checkpoint(position + 1)
-            self.decode_s = reader.read_seconds
-        self.wall_s = time.perf_counter() - started
+                    self.progress(done, total, report)
+                if done < total and _is_checkpoint_due(run.checkpoint_every, last_saved, done):
+                    self._checkpoint(done, log)
+                    last_saved = done
 
-    def _take(self, item: PreparedFrame | DatasetError, position: int, log) -> FrameReport | None:
+    def _take(self, item: PreparedFrame | DatasetError, position: int, log: IO[str]) -> FrameReport | None:
         if isinstance(item, DatasetError):
             self.files.record_skipped(position, item)
             return None
@@ -219,63 +212,13 @@ class _Loop:
         log.write(json.dumps(asdict(report)) + "\n")
         return report
 
-    def _checkpoint(self, position: int) -> None:
-        save_checkpoint(self.files.checkpoint, self.system.state, self.config, {**self.source, "next": position})
+    def _checkpoint(self, position: int, log: IO[str]) -> None:
+        # The log must hold the frames of every checkpoint, also after a power cut.
+        os.fsync(log.fileno())
+        source = {"data": self.identity, "next": position, "clock": self.clock}
+        save_checkpoint(self.files.checkpoint, self.system.state, self.system.config, source)
 
 
-def _finish(
-    system: SlamSystem, config: Config, files: RunFiles, loop: _Loop, truth: np.ndarray | None, mesh: bool
-) -> dict:
-    """Writes the results; the checkpoint goes last, as from then on there is nothing to resume."""
-    state = system.state
-    if len(state.frames) == 0:
-        raise DatasetError(f"{loop.dataset.name}: no frame could be read; the first: {files.first_skipped()}")
-    trajectory = system.trajectory()
-    trajectory.save_tum(files.trajectory)
-    state.scene.save(files.map)
-    metrics = {
-        **provenance(config, system.device),
-        "frames": len(state.frames),
-        "wall_s": loop.wall_s,
-        "fps": loop.done / loop.wall_s if loop.wall_s else 0.0,
-        "decode_ms": 1e3 * loop.decode_s / max(loop.done, 1),
-        **_timings(files.read_log()),
-        "lost_frames": int(state.frames.lost.sum()),
-        "skipped_frames": files.count_skipped(),
-        "voxels": state.scene.volume.num_voxels,
-        "model_mb": state.scene.nbytes / 2**20,
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-    }
-    if system.device.type == "cuda":
-        metrics["peak_gpu_mb"] = torch.cuda.max_memory_allocated(system.device) / 2**20
-    if truth is not None:
-        known = truth[state.frames.indices.numpy()]
-        metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
-    if mesh:
-        metrics["mesh_s"] = files.write_mesh(state.scene, config.mesh.resolution_m)
-    atomic_write(files.metrics, json.dumps(metrics, indent=1) + "\n")
-    files.write_report(loop.dataset, state.frames.indices.tolist(), truth, config.run.previews)
-    files.checkpoint.unlink(missing_ok=True)
-    return metrics
-
-
-def _timings(log: list[dict]) -> dict:
-    """The timing figures of metrics.json, from the log."""
-    tracked = [line for line in log if line["tracking_iterations"]]
-    mapped = [line for line in log if line["mapping_iterations"]]
-    later = mapped[1:]
-    figures: dict[str, float] = {}
-    if tracked:
-        seconds = sum(line["tracking_ms"] for line in tracked) / 1e3
-        iterations = sum(line["tracking_iterations"] for line in tracked)
-        figures["tracking_ms_per_iteration"] = 1e3 * seconds / iterations
-        figures["tracking_iterations"] = tracked[-1]["tracking_iterations"]
-        figures["tracking_fps"] = len(tracked) / seconds
-    if mapped:
-        figures["first_mapping_s"] = mapped[0]["mapping_ms"] / 1e3
-        figures["encode_ms"] = sum(line["encode_ms"] for line in mapped) / len(mapped)
-    if later:
-        total = sum(line["mapping_iterations"] for line in later)
-        figures["mapping_ms_per_iteration"] = sum(line["mapping_ms"] for line in later) / total
-        figures["mapping_iterations"] = later[-1]["mapping_iterations"]
-    return figures
+def _is_checkpoint_due(every: int, last_saved: int, done: int) -> bool:
+    """Every so many frames, but as checkpoints grow with the frames, not before a tenth of them is new."""
+    return every > 0 and done - last_saved >= max(every, done // 10)

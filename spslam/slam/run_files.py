@@ -34,7 +34,7 @@ class RunFiles:
         self.trajectory = self.folder / "trajectory.txt"
 
     def create(self, resume: bool) -> None:
-        """Makes the folder for a new run.
+        """Makes the folder for a new run; with `resume`, also over what a run left that had no checkpoint yet.
 
         Raises:
             OutputError: it is a file, or holds something already.
@@ -43,43 +43,57 @@ class RunFiles:
             raise OutputError(f"{self.folder}: is a file, not a folder for results")
         if self.metrics.exists():
             raise OutputError(f"{self.folder}: holds a finished run; use another --output")
-        if self.checkpoint.exists() and not resume:
+        if self.checkpoint.exists():
             raise OutputError(f"{self.folder}: holds an interrupted run; go on with --resume, or use another --output")
-        started_over = resume and self.config.exists()
-        if self.folder.exists() and any(self.folder.iterdir()) and not started_over:
-            raise OutputError(f"{self.folder}: is not empty; use another --output")
+        if self.config.exists() and not resume:
+            raise OutputError(
+                f"{self.folder}: holds a run that ended before its first checkpoint; "
+                "start it over with --resume, or use another --output"
+            )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for stale in (self.log, self.skipped):
-                stale.unlink(missing_ok=True)
+            self.remove_temporaries()
+            if any(self.folder.iterdir()) and not self.config.exists():
+                raise OutputError(f"{self.folder}: is not empty; use another --output")
+            for earlier in (self.log, self.skipped, self.trajectory, self.map, self.mesh, self.report):
+                earlier.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: can't be made: {error.strerror or error}") from None
 
+    def remove_temporaries(self) -> None:
+        """Removes what a killed run was just writing (see `spslam.io.atomic_write`)."""
+        for path in (self.checkpoint, self.config, self.log, self.map, self.mesh, self.metrics, self.trajectory):
+            for temporary in self.folder.glob(f".{path.stem}.*.tmp{path.suffix}"):
+                temporary.unlink(missing_ok=True)
+
     def open_log(self) -> IO[str]:
-        """The log, to append lines to."""
-        return self.log.open("a", encoding="utf-8")
+        """The log, to append lines to; each is written out at once."""
+        return self.log.open("a", encoding="utf-8", buffering=1)
 
     def read_log(self) -> list[dict]:
         """The log's lines."""
         return [json.loads(line) for line in self.log.read_text(encoding="utf-8").splitlines()]
 
-    def keep_log_lines(self, count: int) -> None:
-        """Drops the lines that an interrupted run wrote after its last checkpoint."""
-        lines = self.log.read_text(encoding="utf-8").splitlines(keepends=True) if self.log.exists() else []
-        atomic_write(self.log, "".join(lines[:count]))
+    def keep_log(self, frames: int, position: int) -> None:
+        """Drops what an interrupted run noted after its last checkpoint.
+
+        Args:
+            frames: how many were processed up to there.
+            position: of the next frame to read.
+        """
+        atomic_write(self.log, "".join(_whole_lines(self.log)[:frames]))
+        if self.skipped.exists():
+            kept = [line for line in _whole_lines(self.skipped) if json.loads(line)["position"] < position]
+            atomic_write(self.skipped, "".join(kept))
 
     def record_skipped(self, position: int, error: DatasetError) -> None:
         """Notes a frame that could not be read."""
         with self.skipped.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"position": position, "error": str(error)}) + "\n")
 
-    def count_skipped(self) -> int:
-        """How many frames could not be read."""
-        return len({line["position"] for line in self._skipped()})
-
-    def first_skipped(self) -> str:
-        """Why the first of them could not."""
-        return next((line["error"] for line in self._skipped()), "none")
+    def read_skipped(self) -> list[dict]:
+        """The frames that could not be read: position in the data set and error, in order."""
+        return [json.loads(line) for line in _whole_lines(self.skipped)]
 
     def write_mesh(self, scene: Scene, resolution_m: float) -> float:
         """Extracts and writes the mesh; returns the seconds that took."""
@@ -106,10 +120,12 @@ class RunFiles:
         self.write_previews(dataset, indices, truth, previews)
         write_report(self.folder)
 
-    def _skipped(self) -> list[dict]:
-        if not self.skipped.exists():
-            return []
-        return [json.loads(line) for line in self.skipped.read_text(encoding="utf-8").splitlines()]
+
+def _whole_lines(path: Path) -> list[str]:
+    """Lines of a file, with their ends, without one that was being written as the run was killed; none, if no file."""
+    if not path.exists():
+        return []
+    return [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:

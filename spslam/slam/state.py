@@ -9,61 +9,97 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
+from spslam.scene.sparse_volume import resize_rows
 from spslam.slam.pixel_database import PixelDatabase
 from spslam.slam.pixels import LATTICE_STEP_PX
 
+_FIRST_CAPACITY = 64
 
-@dataclass
+
 class FrameTable:
     """What is kept of every processed frame; rows are frames.
 
-    Attributes:
-        poses: float32 [F, 7] T_world_camera as unit quaternion (w, x, y, z) and translation (m), on the device.
-        timestamps: float64 [F], s.
-        indices: int64 [F] index in the data set.
-        lost: bool [F] whether tracking failed there.
-        lattices: float16 [F, h, w] coarse depth (m), on the device.
+    The columns are views of buffers that double when they are full: to write to one changes the table, and a frame
+    costs the same after ten thousand others as at first.
     """
 
-    poses: torch.Tensor
-    timestamps: torch.Tensor
-    indices: torch.Tensor
-    lost: torch.Tensor
-    lattices: torch.Tensor
-
-    @classmethod
-    def empty(cls, camera: Camera, device: torch.device) -> "FrameTable":
+    def __init__(self, camera: Camera, device: torch.device | str = "cpu"):
         """A table without rows for images of that camera."""
         offset = LATTICE_STEP_PX // 2
         rows = len(range(offset, camera.height, LATTICE_STEP_PX))
         columns = len(range(offset, camera.width, LATTICE_STEP_PX))
-        return cls(
-            poses=torch.zeros(0, 7, device=device),
-            timestamps=torch.zeros(0, dtype=torch.float64),
-            indices=torch.zeros(0, dtype=torch.int64),
-            lost=torch.zeros(0, dtype=torch.bool),
-            lattices=torch.zeros(0, rows, columns, dtype=torch.float16, device=device),
-        )
+        self._count = 0
+        self._columns = {
+            "poses": torch.zeros(0, 7, device=device),
+            "timestamps": torch.zeros(0, dtype=torch.float64),
+            "indices": torch.zeros(0, dtype=torch.int64),
+            "lost": torch.zeros(0, dtype=torch.bool),
+            "lattices": torch.zeros(0, rows, columns, dtype=torch.float16, device=device),
+        }
+
+    @property
+    def poses(self) -> torch.Tensor:
+        """float32 [F, 7] T_world_camera as unit quaternion (w, x, y, z) and translation (m), on the device."""
+        return self._columns["poses"][: self._count]
+
+    @property
+    def timestamps(self) -> torch.Tensor:
+        """float64 [F], s."""
+        return self._columns["timestamps"][: self._count]
+
+    @property
+    def indices(self) -> torch.Tensor:
+        """int64 [F] index in the data set."""
+        return self._columns["indices"][: self._count]
+
+    @property
+    def lost(self) -> torch.Tensor:
+        """bool [F] whether the pose is not to be trusted."""
+        return self._columns["lost"][: self._count]
+
+    @property
+    def lattices(self) -> torch.Tensor:
+        """float16 [F, h, w] coarse depth (m), on the device."""
+        return self._columns["lattices"][: self._count]
 
     def append(self, pose: torch.Tensor, timestamp: float, index: int, lost: bool, lattice: torch.Tensor) -> None:
         """Adds a row."""
-        row = (pose, timestamp, index, lost, lattice)
-        for name, value in zip(("poses", "timestamps", "indices", "lost", "lattices"), row, strict=True):
-            column = getattr(self, name)
-            value = torch.as_tensor(value, dtype=column.dtype, device=column.device)
-            setattr(self, name, torch.cat([column, value[None]]))
+        if self._count == len(self._columns["poses"]):
+            capacity = max(2 * self._count, _FIRST_CAPACITY)
+            self._columns = {name: resize_rows(column, capacity) for name, column in self._columns.items()}
+        row, self._count = self._count, self._count + 1
+        self.poses[row] = pose
+        self.timestamps[row] = timestamp
+        self.indices[row] = index
+        self.lost[row] = lost
+        self.lattices[row] = lattice
 
-    def matrices(self) -> np.ndarray:
-        """float64 [F, 4, 4] T_world_camera."""
-        return pose7_to_matrix(self.poses.cpu().numpy().astype(np.float64))
+    def matrices(self, first: int = 0) -> np.ndarray:
+        """float64 [F, 4, 4] T_world_camera of the rows from `first` on; negative ones count from the end."""
+        return pose7_to_matrix(self.poses[first:].cpu().numpy().astype(np.float64))
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """All columns on the CPU, as views where they are there already."""
+        return {name: column[: self._count].cpu() for name, column in self._columns.items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Replaces the content by that of `state_dict()`."""
+        self._count = len(state["poses"])
+        self._columns = {name: state[name].to(column.device, copy=True) for name, column in self._columns.items()}
 
     def __len__(self) -> int:
-        return len(self.poses)
+        return self._count
 
 
 @dataclass
 class Moments:
-    """Adam's running moments of one parameter tensor [rows, columns], and how many steps were taken."""
+    """What Adam keeps beside one parameter tensor [rows, ...]; may have spare rows at the end.
+
+    Attributes:
+        first, second: running moments.
+        gradient: sums of the current iteration, zero between iterations.
+        stamps: int32 [rows], the iteration that last touched a row.
+    """
 
     first: torch.Tensor
     second: torch.Tensor
@@ -73,8 +109,13 @@ class Moments:
     @classmethod
     def like(cls, parameter: torch.Tensor) -> "Moments":
         """Zero moments for a parameter [rows, columns]."""
-        rows = torch.zeros(len(parameter), dtype=torch.int32, device=parameter.device)
-        return cls(*(torch.zeros_like(parameter) for _ in range(3)), rows)
+        return cls.of(torch.zeros_like(parameter), torch.zeros_like(parameter))
+
+    @classmethod
+    def of(cls, first: torch.Tensor, second: torch.Tensor) -> "Moments":
+        """The given moments, between two iterations."""
+        stamps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
+        return cls(first, second, torch.zeros_like(first), stamps)
 
     def fit(self, rows: int) -> None:
         """Appends zero rows up to `rows`, with spare capacity so that growth is amortised."""
@@ -82,10 +123,7 @@ class Moments:
             return
         capacity = max(rows, len(self.stamps) * 3 // 2)
         for name in ("first", "second", "gradient", "stamps"):
-            old = getattr(self, name)
-            grown = old.new_zeros((capacity, *old.shape[1:]))
-            grown[: len(old)] = old
-            setattr(self, name, grown)
+            setattr(self, name, resize_rows(getattr(self, name), capacity))
 
     def move_rows(self, rows: torch.Tensor, count: int) -> None:
         """Moves row i to row `rows[i]` of `count` rows, the others zero; for a parameter whose rows moved."""
@@ -112,6 +150,7 @@ class SlamState:
         moments: optimiser state by parameter name.
         steps: Adam steps since the moments were last reset.
         stamp: number of mapping iterations ever done; marks rows touched by the current one.
+        unmapped: whether frames came since the map was last optimised.
     """
 
     scene: Scene
@@ -120,6 +159,12 @@ class SlamState:
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
     stamp: int = 0
+    unmapped: bool = False
+
+    @property
+    def usable(self) -> torch.Tensor:
+        """bool [F] on the CPU: frames that mapping may draw from, as they have pixels and a pose to be trusted."""
+        return self.pixels.has_pixels & ~self.frames.lost
 
     @classmethod
     def start(
@@ -141,7 +186,7 @@ class SlamState:
         origin = torch.from_numpy(np.asarray(first_pose)[:3, 3].copy())
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
         pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device)
-        return cls(scene, FrameTable.empty(camera, device), pixels)
+        return cls(scene, FrameTable(camera, device), pixels)
 
 
 def pose_tensor(matrix: np.ndarray, device: torch.device) -> torch.Tensor:

@@ -10,12 +10,15 @@ import torch
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
+from spslam.errors import DatasetError
 from spslam.prior import load_prior
 from spslam.slam.mapper import Mapper
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.state import SlamState, pose_tensor
 from spslam.slam.tracker import Tracker, TrackingResult
 from spslam.trajectory import Trajectory
+
+MAX_DISTANCE_M = 10_000.0  # a float32 still tells a millimetre there
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,8 @@ class FrameReport:
         lost: whether its pose is not to be trusted.
         valid_depth: share of pixels with usable depth.
         tracking_iterations, tracking_ms: of this frame; 0 for the first.
-        residual_cm: weighted RMS distance of its pixels to the map; None where the optimiser does not tell.
-        inliers: share of its pixels on mapped surface.
+        residual_cm: weighted RMS distance of its pixels to the map; None where it was not tracked.
+        inliers: share of its pixels on mapped surface; None where it was not tracked.
         encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
         mapping_iterations, mapping_ms: of the joint optimisation after this frame.
         loss: total loss of the last mapping iteration; None where there was none.
@@ -45,7 +48,7 @@ class FrameReport:
     tracking_iterations: int
     tracking_ms: float
     residual_cm: float | None
-    inliers: float
+    inliers: float | None
     encode_ms: float
     mapping_iterations: int
     mapping_ms: float
@@ -76,6 +79,9 @@ class SlamSystem:
             camera: pinhole intrinsics of all frames.
             first_pose: float64 [4, 4] T_world_camera of the first frame; identity where not given.
             device: where the map lives and the kernels run.
+
+        Raises:
+            DatasetError: the first pose lies too far from the world's origin.
         """
         self.config = config
         self.camera = camera
@@ -83,10 +89,10 @@ class SlamSystem:
         prior = load_prior(config.prior.weights) if config.prior.enabled else None
         decoder = prior.decoder_params if prior is not None and config.prior.decoder == "pretrained" else None
         self.first_pose = np.eye(4) if first_pose is None else np.asarray(first_pose, np.float64)
+        _check_first_pose(self.first_pose)
         self.state = SlamState.start(config, camera, self.first_pose, decoder, self.device)
         self.tracker = Tracker(config, camera)
         self.mapper = Mapper(config, camera, prior)
-        self._unmapped = False
 
     def process(self, frame: RgbdFrame, pixels: FramePixels | None = None) -> FrameReport:
         """Takes the next frame in.
@@ -94,6 +100,10 @@ class SlamSystem:
         Args:
             frame: colour, depth, timestamp.
             pixels: `sample_frame(frame, camera, config)`, if that was done ahead on another thread.
+
+        Raises:
+            SpslamError: the map or the pixels would pass a limit of the configuration. The frame has then been taken
+                in half, and the system must not be given another.
         """
         if pixels is None:
             pixels = sample_frame(frame, self.camera, self.config)
@@ -103,18 +113,18 @@ class SlamSystem:
         self.state.pixels.add(pixels.records)
         # A lost frame must not touch the map.
         mapped = not tracked.lost and self._is_mapping_frame(number)
-        self._unmapped = not mapped
+        self.state.unmapped = not mapped
         encode_ms, mapping_ms, iterations, losses = self._map(pixels, number) if mapped else (0.0, 0.0, 0, None)
         return FrameReport(
             frame=number,
             index=frame.index,
             timestamp=frame.timestamp,
-            lost=tracked.lost,
+            lost=bool(self.state.frames.lost[-1]),
             valid_depth=pixels.valid_share,
             tracking_iterations=tracked.iterations,
             tracking_ms=tracking_ms,
-            residual_cm=None if math.isnan(tracked.residual_cm) else tracked.residual_cm,
-            inliers=tracked.inlier_share,
+            residual_cm=_known(tracked.residual_cm),
+            inliers=_known(tracked.inlier_share),
             encode_ms=encode_ms,
             mapping_iterations=iterations,
             mapping_ms=mapping_ms,
@@ -124,9 +134,9 @@ class SlamSystem:
 
     def finish(self) -> None:
         """Optimises once more if frames came after the last mapping call. Call it after the last frame."""
-        if self._unmapped and len(self.state.frames):
+        if self.state.unmapped:
             self.mapper.optimize(self.state, self.config.mapping.iterations)
-            self._unmapped = False
+            self.state.unmapped = False
 
     def trajectory(self) -> Trajectory:
         """Poses of all frames as they are refined up to now."""
@@ -136,7 +146,7 @@ class SlamSystem:
     def _track(self, pixels: FramePixels, number: int) -> TrackingResult:
         if self.state.scene.volume.num_voxels == 0:
             pose = pose_tensor(self.first_pose, self.device)
-            return TrackingResult(pose, 0, math.nan, 1.0, lost=len(pixels.records) == 0)
+            return TrackingResult(pose, 0, math.nan, math.nan, lost=self.tracker.is_blind(pixels))
         start = self.tracker.predict(self.state.frames)
         return self.tracker.track(self.state.scene, pixels, start, number)
 
@@ -146,9 +156,27 @@ class SlamSystem:
     def _map(self, pixels: FramePixels, number: int) -> tuple[float, float, int, torch.Tensor | None]:
         first = self.state.scene.volume.num_voxels == 0
         _, encode_ms = _timed(lambda: self.mapper.integrate(self.state, pixels))
+        if self.state.scene.volume.num_voxels == 0:
+            # Depth without a surface in it: the map must begin with a later frame, and so must the path.
+            self.state.frames.lost[-1] = True
+            return encode_ms, 0.0, 0, None
         iterations = self.config.mapping.first_iterations if first else self.config.mapping.iterations
         losses, mapping_ms = _timed(lambda: self.mapper.optimize(self.state, iterations))
         return encode_ms, mapping_ms, iterations, losses
+
+
+def _check_first_pose(pose: np.ndarray) -> None:
+    distance = float(np.linalg.norm(pose[:3, 3]))
+    if not distance <= MAX_DISTANCE_M:
+        raise DatasetError(
+            f"the first pose must lie within {MAX_DISTANCE_M / 1000:.0f} km of the world's origin, got "
+            f"{distance / 1000:.0f} km; scene.first_pose=identity starts at the origin instead"
+        )
+
+
+def _known(number: float) -> float | None:
+    """None for NaN, which JSON has no word for."""
+    return None if math.isnan(number) else number
 
 
 def _timed(call):

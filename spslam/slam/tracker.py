@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
 from spslam import ops
@@ -23,8 +22,8 @@ class TrackingResult:
     Attributes:
         pose: float32 [7].
         iterations: how many were made.
-        residual_cm: weighted root mean squared distance of the pixels to the mapped surface (gauss_newton only).
-        inlier_share: share of pixels that fall on mapped surface; 1 where the optimiser does not tell.
+        residual_cm: weighted root mean squared distance of the pixels to the mapped surface; NaN if not tracked.
+        inlier_share: share of pixels that fall on mapped surface; NaN if not tracked.
         lost: whether the pose is not to be trusted.
     """
 
@@ -47,7 +46,7 @@ class Tracker:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
         if len(frames) < 2 or bool(frames.lost[-2:].any()):
             return frames.poses[-1].clone()
-        before, last = FrameTable.matrices(_tail(frames))
+        before, last = frames.matrices(-2)
         return pose_tensor(constant_speed(before, last), frames.poses.device)
 
     def track(self, scene: Scene, pixels: FramePixels, start: torch.Tensor, frame: int) -> TrackingResult:
@@ -59,11 +58,15 @@ class Tracker:
             start: float32 [7].
             frame: number of the frame, keys the random draws.
         """
-        if len(pixels.records) == 0 or pixels.valid_share < self.config.tracking.min_valid_share:
-            return TrackingResult(start.clone(), 0, math.nan, 0.0, lost=True)
+        if self.is_blind(pixels):
+            return TrackingResult(start.clone(), 0, math.nan, math.nan, lost=True)
         if self.config.tracking.optimizer == "adam":
             return self._track_adam(scene, pixels.records, start, frame)
         return self._track_gauss_newton(scene, pixels.records, start, frame)
+
+    def is_blind(self, pixels: FramePixels) -> bool:
+        """Whether too little of the image has depth to tell a pose from."""
+        return len(pixels.records) == 0 or pixels.valid_share < self.config.tracking.min_valid_share
 
     def _iterations(self, frame: int) -> int:
         tracking = self.config.tracking
@@ -89,10 +92,7 @@ class Tracker:
             frame=frame,
         )
         cost, inlier_share = stats[-1, :2].tolist()
-        lost = not (bool(torch.isfinite(pose).all()) and inlier_share >= tracking.min_inlier_share)
-        return TrackingResult(
-            start.clone() if lost else pose, len(stats), 100 * math.sqrt(max(cost, 0.0)), inlier_share, lost
-        )
+        return self._judged(start, pose, len(stats), cost, inlier_share)
 
     def _track_adam(self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int) -> TrackingResult:
         tracking, seed = self.config.tracking, self.config.seed
@@ -112,19 +112,23 @@ class Tracker:
             loss = float(step.losses[0])
             if loss < best:
                 best, best_pose = loss, pose[0].clone()
-            adam.step(step.grad_poses, iteration + 1)
-        return TrackingResult(best_pose, iterations, math.nan, 1.0, lost=not math.isfinite(best))
+            if step.grad_poses is not None:
+                adam.step(step.grad_poses, iteration + 1)
+        # A pose that looks away from the map has no loss either, so its fit to the surface decides.
+        _, _, cost, inlier_share = ops.gauss_newton_poses(
+            scene.view(),
+            records[None, :count],
+            best_pose[None],
+            self.intrinsics,
+            truncation=scene.settings.truncation_m,
+            kernel=self.config.tracking.kernel_end_m,
+        )
+        return self._judged(start, best_pose, iterations, float(cost), float(inlier_share))
 
-
-def _tail(frames: FrameTable) -> FrameTable:
-    """The last two rows."""
-    return FrameTable(
-        frames.poses[-2:], frames.timestamps[-2:], frames.indices[-2:], frames.lost[-2:], frames.lattices[-2:]
-    )
-
-
-def relative_motion(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Translation (m) and rotation (rad) between two float64 [4, 4] poses."""
-    delta = np.linalg.inv(before) @ after
-    cosine = np.clip((np.trace(delta[:3, :3]) - 1) / 2, -1, 1)
-    return float(np.linalg.norm(delta[:3, 3])), float(np.arccos(cosine))
+    def _judged(
+        self, start: torch.Tensor, pose: torch.Tensor, iterations: int, cost: float, inlier_share: float
+    ) -> TrackingResult:
+        """The result with `pose`, or with `start` where that is lost; `cost` in m^2."""
+        found = bool(torch.isfinite(pose).all()) and inlier_share >= self.config.tracking.min_inlier_share
+        residual_cm = 100 * math.sqrt(max(cost, 0.0))
+        return TrackingResult(pose if found else start.clone(), iterations, residual_cm, inlier_share, not found)

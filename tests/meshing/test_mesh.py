@@ -8,7 +8,8 @@ import trimesh
 
 from spslam.errors import OutputError
 from spslam.meshing import TriangleMesh, save_mesh
-from spslam.meshing.mesh import drop_small_parts, vertex_normals
+from spslam.meshing.cleaning import in_large_part
+from spslam.meshing.mesh import vertex_normals
 
 
 def _sphere(subdivisions=3, offset=0.0):
@@ -64,9 +65,9 @@ def test_small_parts():
     faces = np.concatenate((small.faces, large.faces + len(small.vertices)))
     count = len(small.vertices) + len(large.vertices)
     is_large = np.arange(len(faces)) >= len(small.faces)
-    np.testing.assert_array_equal(drop_small_parts(faces, count, len(small.faces) + 1), is_large)
-    assert drop_small_parts(faces, count, len(small.faces)).all()
-    assert drop_small_parts(faces[:0], count, 100).shape == (0,)
+    np.testing.assert_array_equal(in_large_part(faces, count, len(small.faces) + 1), is_large)
+    assert in_large_part(faces, count, len(small.faces)).all()
+    assert in_large_part(faces[:0], count, 100).shape == (0,)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,129 @@
+"""What a finished run writes: trajectory, map, mesh, metrics and report."""
+
+import json
+import resource
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from spslam import __version__
+from spslam.config import Config
+from spslam.datasets.base import RgbdDataset
+from spslam.errors import DatasetError
+from spslam.evaluation.trajectory import ate, rpe
+from spslam.io import atomic_write
+from spslam.slam.run_files import RunFiles
+from spslam.slam.system import SlamSystem
+
+
+def write_results(
+    system: SlamSystem,
+    dataset: RgbdDataset,
+    config: Config,
+    files: RunFiles,
+    clock: dict[str, Any],
+    mesh: bool,
+) -> dict[str, Any]:
+    """Writes everything; the checkpoint goes last, as from then on there is nothing to resume.
+
+    Args:
+        system: after the last frame.
+        dataset: what the run was over.
+        config: of the run.
+        files: of its output folder.
+        clock: `wall_s` of the loop, `decode_s` of reading, and the `frames` that they are for.
+        mesh: whether to extract the mesh.
+
+    Returns:
+        What is written to metrics.json.
+
+    Raises:
+        SpslamError: there is no frame, or a file can't be written.
+    """
+    frames, skipped = system.state.frames, files.read_skipped()
+    if len(frames) == 0:
+        raise DatasetError(f"{dataset.name}: no frame could be read; the first: {skipped[0]['error']}")
+    trajectory, truth = system.trajectory(), dataset.poses()
+    trajectory.save_tum(files.trajectory)
+    system.state.scene.save(files.map)
+    metrics = {
+        **provenance(config, system.device),
+        "frames": len(frames),
+        **_speed(clock),
+        **_timings(files.read_log()),
+        "lost_frames": int(frames.lost.sum()),
+        "skipped_frames": len(skipped),
+        **_sizes(system),
+    }
+    if truth is not None:
+        known = truth[frames.indices.numpy()]
+        metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
+    if mesh:
+        metrics["mesh_s"] = files.write_mesh(system.state.scene, config.mesh.resolution_m)
+    atomic_write(files.metrics, json.dumps(metrics, indent=1) + "\n")
+    files.write_report(dataset, frames.indices.tolist(), truth, config.run.previews)
+    files.checkpoint.unlink(missing_ok=True)
+    return metrics
+
+
+def provenance(config: Config, device: torch.device) -> dict[str, Any]:
+    """What a run's files say of where they come from."""
+    return {
+        "version": __version__,
+        "torch": torch.__version__,
+        "seed": config.seed,
+        "device": str(device),
+        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return "cpu"
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "cpu")
+
+
+def _speed(clock: dict[str, Any]) -> dict[str, float]:
+    frames, wall_s = clock["frames"], clock["wall_s"]
+    return {
+        "wall_s": wall_s,
+        "fps": frames / wall_s if wall_s else 0.0,
+        "decode_ms": 1e3 * clock["decode_s"] / max(frames, 1),
+    }
+
+
+def _sizes(system: SlamSystem) -> dict[str, float]:
+    scene = system.state.scene
+    sizes = {
+        "voxels": scene.volume.num_voxels,
+        "model_mb": scene.nbytes / 2**20,
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+    if system.device.type == "cuda":
+        sizes["peak_gpu_mb"] = torch.cuda.max_memory_allocated(system.device) / 2**20
+    return sizes
+
+
+def _timings(log: list[dict[str, Any]]) -> dict[str, float]:
+    """The timing figures of metrics.json, from the log."""
+    tracked = [line for line in log if line["tracking_iterations"]]
+    mapped = [line for line in log if line["mapping_iterations"]]
+    later = mapped[1:]
+    figures: dict[str, float] = {}
+    if tracked:
+        seconds = sum(line["tracking_ms"] for line in tracked) / 1e3
+        iterations = sum(line["tracking_iterations"] for line in tracked)
+        figures["tracking_ms_per_iteration"] = 1e3 * seconds / iterations
+        figures["tracking_iterations"] = tracked[-1]["tracking_iterations"]
+        figures["tracking_fps"] = len(tracked) / seconds
+    if mapped:
+        figures["first_mapping_s"] = mapped[0]["mapping_ms"] / 1e3
+        figures["encode_ms"] = sum(line["encode_ms"] for line in mapped) / len(mapped)
+    if later:
+        total = sum(line["mapping_iterations"] for line in later)
+        figures["mapping_ms_per_iteration"] = sum(line["mapping_ms"] for line in later) / total
+        figures["mapping_iterations"] = later[-1]["mapping_iterations"]
+    return figures
