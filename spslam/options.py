@@ -74,6 +74,7 @@ class SceneOptions(Section):
         "pose of the first frame: the data set's where it has one, or the identity"
     )
     max_voxels: int = _option("most voxel vertices the volume may hold", "vertices", ge=1000)
+    max_texels: int = _option("most texels the three feature planes may hold", "texels", ge=1000)
 
     def check(self) -> None:
         if self.truncation_m < self.voxel_size_m:

@@ -25,7 +25,8 @@ class SceneSettings:
         truncation_m: distance at which the SDF saturates.
         plane_cell_m: edge of a tri-plane cell.
         position_scale: factor on positions (m) entering the geometry decoder.
-        max_voxels: vertices at which the volume refuses to grow.
+        max_voxels: vertices above which the volume refuses to grow.
+        max_texels: texels above which the planes refuse to grow; None for never.
     """
 
     voxel_size_m: float
@@ -33,6 +34,7 @@ class SceneSettings:
     plane_cell_m: float
     position_scale: float
     max_voxels: int
+    max_texels: int | None = None
 
 
 class Scene:
@@ -68,8 +70,8 @@ class Scene:
         self.seed = seed
         self.device = torch.device(device)
         self.origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin.to("cpu", torch.float64)
-        self.volume = SparseVolume(settings.voxel_size_m, max_voxels=settings.max_voxels, device=self.device)
-        self.planes = TriPlanes(settings.plane_cell_m, seed=seed, device=self.device)
+        self.volume = self._empty_volume()
+        self.planes = self._empty_planes()
         if geometry_decoder is None:
             geometry_decoder = random_parameters(GEOMETRY_DECODER, seed, _GEOMETRY)
         self.geometry_decoder = geometry_decoder.to(self.device, torch.float32).clone()
@@ -135,10 +137,10 @@ class Scene:
         """
         _check_state(state)
         self.origin = state["origin"].to("cpu", copy=True)
-        self.volume = SparseVolume(self.settings.voxel_size_m, max_voxels=self.settings.max_voxels, device=self.device)
+        self.volume = self._empty_volume()
         volume = (state[f"volume.{name}"].to(self.device) for name in ("voxel_coords", "embeddings", "weights"))
         self.volume.restore(*volume)
-        self.planes = TriPlanes(self.settings.plane_cell_m, seed=self.seed, device=self.device)
+        self.planes = self._empty_planes()
         self.planes.restore(state["planes.texels"], state["planes.layout"].tolist())
         self.geometry_decoder = state["geometry_decoder"].to(self.device, copy=True)
         self.color_decoder = state["color_decoder"].to(self.device, copy=True)
@@ -162,6 +164,13 @@ class Scene:
         except (SpslamError, KeyError, TypeError, ValueError) as error:
             raise SpslamError(f"{path}: a damaged map ({error})") from None
         return scene
+
+    def _empty_volume(self) -> SparseVolume:
+        return SparseVolume(self.settings.voxel_size_m, max_voxels=self.settings.max_voxels, device=self.device)
+
+    def _empty_planes(self) -> TriPlanes:
+        settings = self.settings
+        return TriPlanes(settings.plane_cell_m, self.seed, self.device, settings.max_texels)
 
 
 _LEARNT: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {

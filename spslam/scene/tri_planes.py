@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from spslam import ops
+from spslam.errors import SpslamError
 
 FEATURES = 32
 MARGIN_M = 1.0  # grown beyond what is asked for, so that growth is rare
@@ -27,12 +28,19 @@ class TriPlanes:
             takes them.
     """
 
-    def __init__(self, cell_size_m: float, seed: int = 0, device: torch.device | str = "cpu"):
-        """Planes of no extent."""
+    def __init__(
+        self,
+        cell_size_m: float,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        max_texels: int | None = None,
+    ):
+        """Planes of no extent; of at most `max_texels` texels in all, None for as many as memory holds."""
         if not cell_size_m > 0:
             raise ValueError(f"TriPlanes: cell_size_m must be positive, got {cell_size_m}")
         self.cell_size_m = float(cell_size_m)
         self.seed = seed
+        self.max_texels = max_texels
         self.texels = torch.zeros(0, FEATURES, device=device)
         self.layout = [0] * 15
 
@@ -48,6 +56,9 @@ class TriPlanes:
 
         Returns:
             int64 [old P] the new row of every old one, for buffers kept beside the texels; None where nothing grew.
+
+        Raises:
+            SpslamError: the planes would hold more than `max_texels`. They are then as before.
         """
         points = points[points.isfinite().all(1)]
         if len(points) == 0:
@@ -58,6 +69,7 @@ class TriPlanes:
         planes = [self._extended(plane, low, high, margin) for plane in range(3)]
         if planes == [self._rectangle(plane) for plane in range(3)]:
             return None
+        self._check_limit(planes)
         return self._regrow(planes)
 
     def restore(self, texels: torch.Tensor, layout: Sequence[int]) -> None:
@@ -67,6 +79,14 @@ class TriPlanes:
             raise ValueError(f"TriPlanes: texels must have the rows of layout, got {list(texels.shape)}")
         self.texels = texels.to(self.texels.device, torch.float32).clone()
         self.layout = [int(value) for value in layout]
+
+    def _check_limit(self, planes: list[tuple[int, int, int, int]]) -> None:
+        wanted = sum(size_u * size_v for _, _, size_u, size_v in planes)
+        if self.max_texels is not None and wanted > self.max_texels:
+            raise SpslamError(
+                f"TriPlanes.cover: texels must stay within scene.max_texels = {self.max_texels}, got {wanted}; raise "
+                "it, choose a larger scene.plane_cell_m, or leave out far points by a smaller dataset.max_depth_m"
+            )
 
     def _rectangle(self, plane: int) -> tuple[int, int, int, int]:
         """(origin u, origin v, size u, size v)."""

@@ -182,6 +182,7 @@ class SlamState:
             plane_cell_m=config.scene.plane_cell_m,
             position_scale=config.scene.position_scale,
             max_voxels=config.scene.max_voxels,
+            max_texels=config.scene.max_texels,
         )
         origin = torch.from_numpy(np.asarray(first_pose)[:3, 3].copy())
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
