@@ -45,7 +45,7 @@ class DatasetOptions(Section):
     path: str | None = _text("folder of the data; `--data` overrides it, `generated` needs none")
     stride: int = _option("use every n-th frame", "frames", ge=1)
     min_depth_m: float = _option("depth nearer than this counts as not measured", "m", ge=0)
-    max_depth_m: float = _option("depth farther than this counts as not measured", "m", gt=0)
+    max_depth_m: float = _option("depth farther than this counts as not measured", "m", gt=0, le=1000)
     sequence: str | int | None = _text("7scenes: the sequence, `seq-03` or 3; null is the first that is there")
     depth_variant: Literal["filtered", "exact"] | None = _text(
         "synthetic_rgbd: the noisy depth or the exact one; null is the noisy one where it is there"
