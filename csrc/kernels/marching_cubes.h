@@ -118,34 +118,41 @@ SPS_INLINE Sample owners_sample(std::int64_t owner, int n, int region, int i, in
   return {owner >> 3, (static_cast<std::int64_t>(x) * (n + 1) + y) * (n + 1) + z};
 }
 
-// Copies the samples in the owners' words and notes whether the surface may cross the cell.
-SPS_INLINE void gather_samples(const MarchingCubesCells& cells, const MarchingCubesWork& work, std::int64_t cell) {
+// Copies the samples of a region from its owner.
+SPS_INLINE void copy_region(const MarchingCubesCells& cells, std::int64_t owner, int region, float* out) {
   const int n = cells.n;
-  const std::int64_t per_cell = samples_per_cell(n);
-  const std::int64_t* owners = work.owners + cell * kNeighbors;
-  float* out = work.samples + cell * per_cell;
-  bool any_inside = false, any_outside = false;
-  for (int region = 0; region < kNeighbors; ++region) {
-    int begin[3], end[3];
-    for (int a = 0, side = region; a < 3; ++a, side = side * 3 % 27) {
-      const int s = side / 9;
-      begin[a] = s == 0 ? 0 : s == kBetween ? 1 : n;
-      end[a] = s == kBetween ? n : begin[a] + 1;
-    }
-    for (int i = begin[0]; i < end[0]; ++i) {
-      for (int j = begin[1]; j < end[1]; ++j) {
-        const Sample from = owners_sample(owners[region], n, region, i, j, begin[2]);
-        const float* in = cells.values + from.cell * per_cell + from.index;
-        float* row = out + (static_cast<std::int64_t>(i) * (n + 1) + j) * (n + 1) + begin[2];
-        for (int k = 0; k < end[2] - begin[2]; ++k) {
-          row[k] = in[k] - cells.level;
-          any_inside |= row[k] < 0.0f;
-          any_outside |= row[k] >= 0.0f;
-        }
-      }
+  int begin[3], end[3];
+  for (int a = 0, side = region; a < 3; ++a, side = side * 3 % 27) {
+    const int s = side / 9;
+    begin[a] = s == 0 ? 0 : s == kBetween ? 1 : n;
+    end[a] = s == kBetween ? n : begin[a] + 1;
+  }
+  for (int i = begin[0]; i < end[0]; ++i) {
+    for (int j = begin[1]; j < end[1]; ++j) {
+      const Sample from = owners_sample(owner, n, region, i, j, begin[2]);
+      const float* in = cells.values + from.cell * samples_per_cell(n) + from.index;
+      float* row = out + (static_cast<std::int64_t>(i) * (n + 1) + j) * (n + 1) + begin[2];
+      for (int k = 0; k < end[2] - begin[2]; ++k) row[k] = in[k] - cells.level;
     }
   }
-  work.crossed[cell] = any_inside && any_outside;
+}
+
+// Copies a cell's samples, each from its owner, and notes whether the surface may cross the cell.
+SPS_INLINE void gather_samples(const MarchingCubesCells& cells, const MarchingCubesWork& work, std::int64_t cell) {
+  const std::int64_t per_cell = samples_per_cell(cells.n);
+  const float* own = cells.values + cell * per_cell;
+  float* out = work.samples + cell * per_cell;
+  for (std::int64_t s = 0; s < per_cell; ++s) out[s] = own[s] - cells.level;
+  for (int region = 0; region < kNeighbors; ++region) {
+    const std::int64_t owner = work.owners[cell * kNeighbors + region];
+    if (owner >> 3 != cell) copy_region(cells, owner, region, out);
+  }
+  int inside = 0, outside = 0;
+  for (std::int64_t s = 0; s < per_cell; ++s) {
+    inside |= out[s] < 0.0f;
+    outside |= out[s] >= 0.0f;
+  }
+  work.crossed[cell] = inside && outside;
 }
 
 // Calls f(i, j, k, case) for every cube of the cell that the surface crosses; bit k of the case says that corner k is
