@@ -6,10 +6,11 @@
 namespace spslam {
 namespace {
 
-constexpr int kScanThreads = 1024;
+constexpr int kScanThreads = 512;
 
 // One block for each array (blockIdx.x): counts into the running sum before each, the total past the last.
-__global__ void exclusive_sums(std::int64_t count, std::int64_t* first, std::int64_t* second) {
+__global__ void __launch_bounds__(kScanThreads)
+    exclusive_sums(std::int64_t count, std::int64_t* first, std::int64_t* second) {
   using BlockScan = cub::BlockScan<std::int64_t, kScanThreads>;
   __shared__ typename BlockScan::TempStorage storage;
   std::int64_t* values = blockIdx.x == 0 ? first : second;
@@ -33,6 +34,7 @@ MarchingCubesCounts marching_cubes_count<Cuda>(Cuda device, const MarchingCubesC
   const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
   marching_cubes_mark(device, cells, work);
   exclusive_sums<<<2, kScanThreads, 0, stream>>>(cells.count, work.vertex_offsets, work.face_offsets);
+  SPS_CUDA_CHECK(cudaGetLastError());
   std::int64_t vertices = 0, faces = 0;
   std::uint64_t faults = 0;
   const auto fetch = [&](void* to, const void* from) {
