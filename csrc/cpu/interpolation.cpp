@@ -1,7 +1,7 @@
+#include <algorithm>
 #include <cstring>
 #include <type_traits>
 
-#include "core/ordered_scatter.h"
 #include "core/parallel.h"
 #include "kernels/interpolation_launch.h"
 
@@ -16,6 +16,8 @@ void with_channels(std::int64_t channels, const F& f) {
   switch (channels) {
     case 8:
       return f(std::integral_constant<int, 8>{});
+    case 16:
+      return f(std::integral_constant<int, 16>{});
     case 32:
       return f(std::integral_constant<int, 32>{});
     default:
@@ -73,6 +75,31 @@ void gather_gradient_points(const Field& field, const T* grad, const T* table, s
   }
 }
 
+// Channels a thread takes so that `slices` share a row: whole cache lines, two threads must not write to one.
+template <class T>
+std::int64_t slice_width(std::int64_t channels, std::int64_t slices) {
+  constexpr std::int64_t kLine = 64 / static_cast<std::int64_t>(sizeof(T));
+  return std::min(channels, chunk_count(chunk_count(channels, slices), kLine) * kLine);
+}
+
+// Sums `width` neighbouring channels of one part of the table.
+template <int kWidth, class Field, class T>
+void scatter_part(const Field& field, int part, const T* grad, std::int64_t channels, std::int64_t width,
+                  std::int64_t num_points, T* out) {
+  const std::int64_t count = kWidth ? kWidth : width;
+  constexpr int kPartRows = Field::kRows / Field::kParts;
+  typename Field::PartStencil stencil;
+  for (std::int64_t n = 0; n < num_points; ++n) {
+    if (!field.load_part(n, part, stencil)) continue;
+    const T* g = grad + n * channels;
+    for (int k = 0; k < kPartRows; ++k) {
+      T* sum = out + stencil.rows[k] * channels;
+#pragma omp simd
+      for (std::int64_t c = 0; c < count; ++c) sum[c] += stencil.weights[k] * g[c];
+    }
+  }
+}
+
 }  // namespace
 
 template <>
@@ -104,21 +131,24 @@ struct InterpolationLoops<Cpu> {
     });
   }
 
+  // A row is summed in the order of the points, by one thread: threads share the work by parts of the table and by
+  // cache lines of its rows. To deal out the rows themselves was measured and is slower, with any number of threads:
+  // neighbouring points share rows, which a walk in order finds in the cache.
   template <class Field, class T>
   static void scatter(Cpu device, const Field& field, const T* grad, std::int64_t num_rows, std::int64_t channels,
                       std::int64_t num_points, T* out, std::int64_t*) {
     fill_zero(device, num_rows * channels, out);
-    with_channels(channels, [&](auto constant) {
-      const std::int64_t count = decltype(constant)::value ? decltype(constant)::value : channels;
-      ordered_scatter<typename Field::Stencil, Field::kRows, T>(
-          num_points, num_rows,
-          [&](std::int64_t n, typename Field::Stencil& stencil) { return field.load(n, stencil); },
-          [=](std::int64_t n, std::int64_t row, T weight) {
-            const T* g = grad + n * count;
-            T* sum = out + row * count;
-#pragma omp simd
-            for (std::int64_t c = 0; c < count; ++c) sum[c] += weight * g[c];
-          });
+    const std::int64_t width = slice_width<T>(channels, (get_num_threads() + Field::kParts - 1) / Field::kParts);
+    const std::int64_t slices = width > 0 ? chunk_count(channels, width) : 0;
+    parallel_for(Field::kParts * slices, 1, [&](std::int64_t begin, std::int64_t end) {
+      for (std::int64_t task = begin; task < end; ++task) {
+        const std::int64_t first = task % slices * width;
+        const std::int64_t count = std::min(width, channels - first);
+        with_channels(count, [&](auto constant) {
+          scatter_part<decltype(constant)::value>(field, static_cast<int>(task / slices), grad + first, channels, count,
+                                                  num_points, out + first);
+        });
+      }
     });
   }
 };

@@ -45,15 +45,6 @@ SPS_INLINE void trilinear_weights(const Vec3<T>& local, T (&weights)[8]) {
   for (int k = 0; k < 8; ++k) weights[k] = trilinear_weight(local, k);
 }
 
-// gradients[k] = d weight of corner k / d local.
-template <class T>
-SPS_INLINE void trilinear_weight_gradients(const Vec3<T>& local, Vec3<T> (&gradients)[8]) {
-  for (int k = 0; k < 8; ++k) {
-    const T x = k & 1 ? local.x : 1 - local.x, y = k & 2 ? local.y : 1 - local.y, z = k & 4 ? local.z : 1 - local.z;
-    gradients[k] = {(k & 1 ? 1 : -1) * y * z, (k & 2 ? 1 : -1) * x * z, (k & 4 ? 1 : -1) * x * y};
-  }
-}
-
 template <class T>
 SPS_INLINE T lerp(T a, T b, T t) {
   return a + t * (b - a);

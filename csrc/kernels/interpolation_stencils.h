@@ -1,5 +1,7 @@
 // Stencils: the rows of a table that a point is interpolated from, their weights, and the derivative by the point's
 // coordinates. One interface for voxels, a plane and three planes, so that gathering and scattering exist once.
+//
+// The table may consist of kParts parts that share no row; load_part gives the rows and weights in one of them.
 #pragma once
 
 #include "kernels/interpolation.h"
@@ -14,7 +16,7 @@ SPS_INLINE Vec3<T> load_vec3(const T* p) {
 // Eight vertices of a sparse volume, by the corner ids of each point.
 template <class T>
 struct TrilinearField {
-  static constexpr int kRows = 8, kAxes = 3;
+  static constexpr int kRows = 8, kAxes = 3, kParts = 1;
 
   const std::int32_t* corner_ids;  // [N, 8]
   const T* local_coords;           // [N, 3]
@@ -28,6 +30,8 @@ struct TrilinearField {
     SPS_INLINE Vec3<T> gradient(const T (&values)[kRows]) const { return trilinear_gradient(local, values); }
   };
 
+  using PartStencil = Stencil;
+
   // False where the point has no value.
   SPS_INLINE bool load(std::int64_t n, Stencil& stencil) const {
     const std::int32_t* ids = corner_ids + 8 * n;
@@ -36,12 +40,14 @@ struct TrilinearField {
     trilinear_weights(stencil.local, stencil.weights);
     return complete_cell(ids, num_vertices);
   }
+
+  SPS_INLINE bool load_part(std::int64_t n, int, Stencil& stencil) const { return load(n, stencil); }
 };
 
 // Four texels of one image [H, W].
 template <class T>
 struct BilinearField {
-  static constexpr int kRows = 4, kAxes = 2;
+  static constexpr int kRows = 4, kAxes = 2, kParts = 1;
 
   const T* uv;  // [N, 2]
   std::int64_t height, width;
@@ -57,6 +63,8 @@ struct BilinearField {
     }
   };
 
+  using PartStencil = Stencil;
+
   SPS_INLINE bool load(std::int64_t n, Stencil& stencil) const {
     stencil.cell = plane_cell(axis_cell(uv[2 * n], 0, static_cast<std::int32_t>(width)),
                               axis_cell(uv[2 * n + 1], 0, static_cast<std::int32_t>(height)), 0, 1, width);
@@ -66,12 +74,14 @@ struct BilinearField {
     }
     return true;
   }
+
+  SPS_INLINE bool load_part(std::int64_t n, int, Stencil& stencil) const { return load(n, stencil); }
 };
 
 // Four texels of each of the xy, xz and yz planes; their values add up (3).
 template <class T>
 struct TriPlaneField {
-  static constexpr int kRows = 12, kAxes = 3;
+  static constexpr int kRows = 12, kAxes = 3, kParts = 3;
 
   const T* points;  // [N, 3] m
   T inverse_cell_size;
@@ -93,6 +103,8 @@ struct TriPlaneField {
     }
   };
 
+  using PartStencil = PlaneCell<T>;
+
   SPS_INLINE bool load(std::int64_t n, Stencil& stencil) const {
     const Vec3<T> point = load_vec3(points + 3 * n);
     stencil.inverse_cell_size = inverse_cell_size;
@@ -103,6 +115,11 @@ struct TriPlaneField {
         stencil.weights[4 * plane + k] = stencil.cells[plane].weights[k];
       }
     }
+    return true;
+  }
+
+  SPS_INLINE bool load_part(std::int64_t n, int plane, PlaneCell<T>& cell) const {
+    cell = tri_plane_cell(load_vec3(points + 3 * n), inverse_cell_size, layout.planes[plane], plane);
     return true;
   }
 };

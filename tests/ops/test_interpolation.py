@@ -147,9 +147,10 @@ def test_non_contiguous(name, device, generator):
 
 
 @each_op
-def test_same_bits_for_any_number_of_threads(name, device, generator):
-    arguments, differentiable = _arguments(name, device, torch.float32, generator, points=20_000, channels=8)
-    weight = torch.randn(20_000, 8, generator=generator).to(device)
+@pytest.mark.parametrize("channels", [8, 32, 37])
+def test_same_bits_for_any_number_of_threads(name, channels, device, generator):
+    arguments, differentiable = _arguments(name, device, torch.float32, generator, points=20_000, channels=channels)
+    weight = torch.randn(20_000, channels, generator=generator).to(device)
     threads = ops.get_num_threads()
     results = []
     try:
