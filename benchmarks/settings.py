@@ -16,7 +16,8 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from benchmarks.timing import provenance
+from benchmarks.timing import environment
+from spslam import ops
 from spslam.config import load_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
@@ -55,7 +56,7 @@ def main() -> None:
     print_table(rows)
     if args.json:
         with open(args.json, "w", encoding="utf-8") as file:
-            json.dump({**provenance(torch.device("cpu")), "rows": rows}, file, indent=1)
+            json.dump({**environment(torch.device("cpu")), "rows": rows}, file, indent=1)
 
 
 def parse_job(sequence: str, setting: str) -> Job:
@@ -77,7 +78,7 @@ def in_own_process(job: Job, threads: int) -> dict:
 def run_job(job: Job, threads: int) -> dict:
     """Tracks and maps the sequence; returns ATE, RPE and time."""
     torch.set_num_threads(1)
-    torch.ops.spslam.set_num_threads(threads)
+    ops.set_num_threads(threads)
     preset, *overrides = job.setting.split(",")
     config = load_config(job.config, preset, overrides)
     dataset = Subset(open_dataset(config.dataset, job.folder or None), job.start, job.stop)
