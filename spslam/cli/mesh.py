@@ -20,10 +20,13 @@ def execute(args: argparse.Namespace) -> None:
     map_file = require_run_file(args.output, "map.safetensors")
     resolution = args.resolution or load_config(require_run_file(args.output, "config.yaml")).mesh.resolution_m
 
+    from spslam.evaluation.run_output import RunOutput
     from spslam.meshing import extract_mesh, save_mesh
     from spslam.scene import Scene
 
-    mesh = extract_mesh(Scene.load(map_file), resolution)
+    run = RunOutput.read(args.output)
+    poses = None if run.camera is None else run.trajectory.poses[~run.trajectory.lost]
+    mesh = extract_mesh(Scene.load(map_file), resolution, run.camera, poses)
     path = args.output / f"mesh.{args.format}"
     save_mesh(mesh, path)
     print(f"{path}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")

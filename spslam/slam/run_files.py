@@ -8,6 +8,7 @@ from typing import IO
 import cv2
 import numpy as np
 
+from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.report import write_report
@@ -95,10 +96,10 @@ class RunFiles:
         """The frames that could not be read: position in the data set and error, in order."""
         return [json.loads(line) for line in _whole_lines(self.skipped)]
 
-    def write_mesh(self, scene: Scene, resolution_m: float) -> float:
+    def write_mesh(self, scene: Scene, resolution_m: float, camera: Camera, poses: np.ndarray) -> float:
         """Extracts and writes the mesh; returns the seconds that took."""
         started = time.perf_counter()
-        save_mesh(extract_mesh(scene, resolution_m), self.mesh)
+        save_mesh(extract_mesh(scene, resolution_m, camera, poses), self.mesh)
         return time.perf_counter() - started
 
     def write_previews(self, dataset: RgbdDataset, indices: list[int], truth: np.ndarray | None, count: int) -> None:

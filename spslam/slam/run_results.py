@@ -60,7 +60,8 @@ def write_results(
         known = truth[frames.indices.numpy()]
         metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
     if mesh:
-        metrics["mesh_s"] = files.write_mesh(system.state.scene, config.mesh.resolution_m)
+        tracked = trajectory.poses[~trajectory.lost]
+        metrics["mesh_s"] = files.write_mesh(system.state.scene, config.mesh.resolution_m, system.camera, tracked)
     atomic_write(files.metrics, json.dumps(metrics, indent=1) + "\n")
     files.write_report(dataset, frames.indices.tolist(), truth, config.run.previews)
     files.checkpoint.unlink(missing_ok=True)
