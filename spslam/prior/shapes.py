@@ -16,6 +16,8 @@ from torch import Generator, Tensor
 from spslam.prior import signed_distance as sd
 
 Parameters = dict[str, Tensor]
+FINE_STEP = 1e-2
+"""A hundredth of a voxel keeps clear of float32 rounding."""
 _ITERATED = (sd.superquadric, sd.wavy_sheet)
 
 
@@ -26,8 +28,8 @@ class Solid(Protocol):
         """Distances at points [B,N,3], as [B,N]."""
         ...
 
-    def normals(self, points: Tensor) -> Tensor:
-        """Unit gradients of the signed distance at points [B,N,3]."""
+    def normals(self, points: Tensor, step: float | Tensor = FINE_STEP) -> Tensor:
+        """Unit gradients of the signed distance at points [B,N,3], by central differences over ``step`` or [B,1,1]."""
         ...
 
     def march_distance(self, points: Tensor) -> Tensor:
@@ -36,19 +38,15 @@ class Solid(Protocol):
 
 
 class _Normals:
-    """Central differences of the signed distance; a hundredth of a voxel keeps clear of float32 rounding."""
-
-    STEP = 1e-2
-
     def signed_distance(self, points: Tensor) -> Tensor:
         raise NotImplementedError
 
     def march_distance(self, points: Tensor) -> Tensor:
         return self.signed_distance(points)
 
-    def normals(self, points: Tensor) -> Tensor:
-        steps = self.STEP * torch.eye(3, dtype=points.dtype)
-        shifted = torch.cat([points + step for step in (*steps, *-steps)], dim=1)
+    def normals(self, points: Tensor, step: float | Tensor = FINE_STEP) -> Tensor:
+        axes = torch.eye(3, dtype=points.dtype)
+        shifted = torch.cat([points + step * axis for axis in (*axes, *-axes)], dim=1)
         ahead, behind = self.signed_distance(shifted).reshape(points.shape[0], 2, 3, points.shape[1]).unbind(1)
         return torch.nn.functional.normalize((ahead - behind).transpose(1, 2), dim=-1)
 

@@ -12,7 +12,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
-from spslam.prior.shapes import Solid, nearest_surface, random_solid
+from spslam.prior.shapes import FINE_STEP, Solid, nearest_surface, random_solid
 
 _WINDOW = 6.0
 _REACH = 4.0
@@ -31,13 +31,16 @@ class ViewSettings:
     truncation : half width of the band that queries are drawn from, in voxels.
     noise : standard deviation along the view ray; None draws one for each patch up to ``max_noise``, small ones more
         often.
+    max_normal_blur : reach of the differences that normals are measured over, drawn for each patch up to this; a depth
+        image's normals turn gradually at an edge.
     max_normal_jitter : standard deviation of each component of the normals, drawn for each patch up to this.
     """
 
-    rays: int = 192
+    rays: int = 128
     truncation: float = 2.0
     noise: float | None = None
-    max_noise: float = 0.15
+    max_noise: float = 0.3
+    max_normal_blur: float = 0.0
     max_normal_jitter: float = 0.2
 
 
@@ -88,7 +91,7 @@ def observe(kind: str, count: int, generator: Generator, settings: ViewSettings)
     view = _view_directions(solid, count, generator)
     window, surface, facing, reached = _trace(solid, view, settings.rays, generator)
     seen = reached & _survives(window, generator)
-    points, normals = _measure(surface, facing, view, generator, settings)
+    points, normals = _measure(solid, surface, view, generator, settings)
     queries, distance, valid = _query(solid, surface, view, generator, settings)
     valid = valid & reached
     return Patches(
@@ -117,8 +120,8 @@ class _Moved:
     def march_distance(self, points: Tensor) -> Tensor:
         return self.solid.march_distance(points + self.origin)
 
-    def normals(self, points: Tensor) -> Tensor:
-        return self.solid.normals(points + self.origin)
+    def normals(self, points: Tensor, step: float | Tensor = FINE_STEP) -> Tensor:
+        return self.solid.normals(points + self.origin, step)
 
 
 def _about_the_origin(solid: Solid, count: int, generator: Generator) -> Solid:
@@ -170,9 +173,9 @@ def _survives(window: Tensor, generator: Generator) -> Tensor:
 
 
 def _measure(
-    surface: Tensor, facing: Tensor, view: Tensor, generator: Generator, settings: ViewSettings
+    solid: Solid, surface: Tensor, view: Tensor, generator: Generator, settings: ViewSettings
 ) -> tuple[Tensor, Tensor]:
-    """Points with noise along the rays, and jittered unit normals."""
+    """Points with noise along the rays, and blurred, jittered unit normals."""
     count, pixels = surface.shape[:2]
     noise = torch.rand(count, 1, generator=generator).square() * settings.max_noise
     if settings.noise is not None:
@@ -180,7 +183,8 @@ def _measure(
     error = noise * torch.randn(count, pixels, generator=generator)
     jitter = settings.max_normal_jitter * torch.rand(count, 1, 1, generator=generator)
     jitter = jitter * torch.randn(count, pixels, 3, generator=generator)
-    return surface + error[..., None] * view, normalize(facing + jitter, dim=-1)
+    blur = (settings.max_normal_blur * torch.rand(count, 1, 1, generator=generator)).clamp_min(FINE_STEP)
+    return surface + error[..., None] * view, normalize(solid.normals(surface, blur) + jitter, dim=-1)
 
 
 def _query(

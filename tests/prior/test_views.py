@@ -8,7 +8,7 @@ from spslam.prior.views import Patches, ViewSettings, observe
 
 KINDS = TRAINING_KINDS + HELD_OUT_KINDS
 ON_SURFACE = 0.02
-CLEAN = ViewSettings(noise=0.0, max_normal_jitter=0.0)
+CLEAN = ViewSettings(noise=0.0, max_normal_jitter=0.0, max_normal_blur=0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,0 +1,70 @@
+"""The state of a pretraining run, and its file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from spslam.errors import WeightsError
+from spslam.io import atomic_write
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8
+_TENSORS = ("parameters", "exp_avg", "exp_avg_sq")
+# One key: safetensors doesn't keep the order of several.
+_KEY = "pretraining"
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """Steps done, parameters [P] with Adam's moments [P], and the running mean error in truncations."""
+
+    step: int
+    parameters: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    running_error: float
+
+    @classmethod
+    def start(cls, parameters: Tensor) -> TrainingState:
+        """Before the first step."""
+        return cls(0, parameters, torch.zeros_like(parameters), torch.zeros_like(parameters), 0.0)
+
+    def adam_step(self, gradient: Tensor, learning_rate: float, running_error: float) -> TrainingState:
+        """The state after one step of Adam."""
+        step = self.step + 1
+        exp_avg = _BETA1 * self.exp_avg + (1 - _BETA1) * gradient
+        exp_avg_sq = _BETA2 * self.exp_avg_sq + (1 - _BETA2) * gradient.square()
+        scale = (exp_avg_sq / (1 - _BETA2**step)).sqrt() + _EPSILON
+        parameters = self.parameters - learning_rate / (1 - _BETA1**step) * exp_avg / scale
+        return TrainingState(step, parameters, exp_avg, exp_avg_sq, running_error)
+
+
+def save_state(path: Path, state: TrainingState, settings: dict) -> None:
+    """Write a checkpoint, at once or not at all; raises OutputError."""
+    header = {"settings": settings, "step": state.step, "running_error": state.running_error}
+    tensors = {name: getattr(state, name) for name in _TENSORS}
+    atomic_write(path, save(tensors, metadata={_KEY: json.dumps(header, sort_keys=True)}))
+
+
+def load_state(path: Path, settings: dict) -> TrainingState:
+    """Read a checkpoint of these settings; raises WeightsError, naming the first option that differs."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {})[_KEY])
+            tensors = {name: file.get_tensor(name) for name in _TENSORS}
+            step, running_error = int(header["step"]), float(header["running_error"])
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise WeightsError(f"{path}: not a checkpoint of spslam pretrain: {error}") from error
+    for name, value in settings.items():
+        if header["settings"].get(name) != value:
+            raise WeightsError(
+                f"{path}: must be resumed with {name} = {header['settings'].get(name)}, got {value}; "
+                "remove the file to start anew"
+            )
+    return TrainingState(step, running_error=running_error, **tensors)

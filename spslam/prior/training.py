@@ -1,0 +1,162 @@
+"""The work of pretraining in tasks for threads: observing solids ahead of time, and gradients of shards of a batch.
+
+A task's size doesn't depend on the machine, each runs on one thread, and results are combined in a fixed order, so that
+the numbers are the same for any number of workers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from spslam.prior.encoder import DECODER_WIDTHS, ENCODER_WIDTHS, parameter_count
+from spslam.prior.model import (
+    decode,
+    encode_patches,
+    initial_parameters,
+    without_position,
+)
+from spslam.prior.shapes import TRAINING_KINDS
+from spslam.prior.views import Patches, ViewSettings, observe
+
+_BLOCK_STEPS = 8
+_ENCODER_LENGTH = parameter_count(ENCODER_WIDTHS)
+
+
+@dataclass(frozen=True)
+class PretrainSettings:
+    """What decides on the weights.
+
+    Attributes
+    ----------
+    steps, seed : number of optimisation steps, and the seed of everything drawn.
+    patches_per_kind : solids of each kind a step.
+    learning_rate, final_learning_rate : Adam's rate after ``warmup_steps``, and what it falls to along a cosine.
+    surface_emphasis : how much more a query on the surface counts, falling off over half a voxel.
+    feature_penalty : weight of the mean length of the interpolated features.
+    neighborhood, min_pair_weight : as in `spslam.ops.encode_points`.
+    views : how the solids are observed.
+    """
+
+    steps: int = 1000
+    seed: int = 0
+    patches_per_kind: int = 4
+    learning_rate: float = 4e-3
+    final_learning_rate: float = 1e-5
+    warmup_steps: int = 50
+    surface_emphasis: float = 1.0
+    feature_penalty: float = 1e-3
+    neighborhood: int = 64
+    min_pair_weight: float = 0.0
+    views: ViewSettings = field(default_factory=ViewSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "patches_per_kind"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"PretrainSettings: {name} must be at least 1, got {getattr(self, name)}")
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"PretrainSettings: seed must be in [0, 2^31), got {self.seed}")
+
+    def learning_rate_at(self, step: int) -> float:
+        """The rate of a step, 0-based: linear warm-up times a half cosine over the steps."""
+        cosine = 0.5 + 0.5 * math.cos(math.pi * step / self.steps)
+        warm = min(1.0, (step + 1) / self.warmup_steps)
+        return self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * warm * cosine
+
+
+def initial_networks(seed: int) -> Tensor:
+    """Random encoder and decoder parameters as one vector; the decoder's weights of the position are 0."""
+    generator = Generator().manual_seed(seed)
+    encoder = initial_parameters(ENCODER_WIDTHS, generator)
+    return torch.cat([encoder, without_position(initial_parameters(DECODER_WIDTHS, generator))])
+
+
+def split_networks(parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """Encoder and decoder parameters, out of their one vector."""
+    return parameters[:_ENCODER_LENGTH], parameters[_ENCODER_LENGTH:]
+
+
+@dataclass(frozen=True)
+class BatchGradient:
+    """Sums over queries: of the gradients, of the absolute errors in truncations; and the number of queries."""
+
+    gradient: Tensor
+    error: float
+    queries: int
+
+
+class TrainingPool:
+    """Threads that observe solids ahead of time and take gradients of one shard of a batch each."""
+
+    def __init__(self, workers: int, settings: PretrainSettings) -> None:
+        workers = max(1, min(workers, settings.patches_per_kind))
+        self._settings = settings
+        self._executor = ThreadPoolExecutor(workers, "pretrain", torch.set_num_threads, (1,))
+
+    def __enter__(self) -> TrainingPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown(cancel_futures=True)
+
+    def batches(self, first_step: int) -> Iterator[list[Patches]]:
+        """The batches from ``first_step`` on, each in shards with a patch of every kind."""
+        ahead: deque[list[Future[Patches]]] = deque()
+        last_block = (self._settings.steps - 1) // _BLOCK_STEPS
+        blocks = iter(range(first_step // _BLOCK_STEPS, last_block + 1))
+        for block in range(first_step // _BLOCK_STEPS, last_block + 1):
+            while len(ahead) < 2 and (wanted := next(blocks, None)) is not None:
+                ahead.append(self._observe(wanted))
+            kinds = [future.result() for future in ahead.popleft()]
+            for step in range(block * _BLOCK_STEPS, min((block + 1) * _BLOCK_STEPS, self._settings.steps)):
+                if step >= first_step:
+                    yield self._shards(kinds, step % _BLOCK_STEPS)
+
+    def gradient(self, parameters: Tensor, shards: list[Patches]) -> BatchGradient:
+        """The gradient of the loss over all shards, added in their order."""
+        tasks = [self._executor.submit(_shard_gradient, parameters, shard, self._settings) for shard in shards]
+        parts = [task.result() for task in tasks]
+        total = parts[0].gradient
+        for part in parts[1:]:
+            total = total + part.gradient
+        return BatchGradient(total, math.fsum(part.error for part in parts), sum(part.queries for part in parts))
+
+    def _observe(self, block: int) -> list[Future[Patches]]:
+        count = _BLOCK_STEPS * self._settings.patches_per_kind
+        return [
+            self._executor.submit(
+                observe, kind, count, _generator(self._settings.seed, block, index), self._settings.views
+            )
+            for index, kind in enumerate(TRAINING_KINDS)
+        ]
+
+    def _shards(self, kinds: list[Patches], step: int) -> list[Patches]:
+        count = self._settings.patches_per_kind
+        rows = range(step * count, (step + 1) * count)
+        return [Patches.cat([patches[row : row + 1] for patches in kinds]) for row in rows]
+
+
+def _generator(seed: int, block: int, kind: int) -> Generator:
+    """One of its own for each task. torch seeds from 32 bits; SeedSequence spreads the key over them."""
+    key = np.random.SeedSequence((seed, block, kind)).generate_state(1)[0]
+    return Generator().manual_seed(int(key))
+
+
+def _shard_gradient(parameters: Tensor, patches: Patches, settings: PretrainSettings) -> BatchGradient:
+    leaf = parameters.clone().requires_grad_()
+    encoder_params, decoder_params = split_networks(leaf)
+    fields = encode_patches(patches, encoder_params, settings.neighborhood, settings.min_pair_weight)
+    patch, _ = patches.valid.nonzero().unbind(1)
+    features, inside = fields.interpolate(patch, patches.queries[patches.valid])
+    features, target = features[inside], patches.sdf[patches.valid][inside]
+    error = (decode(features, decoder_params) - target).abs()
+    emphasis = 1 + settings.surface_emphasis * torch.exp(-(settings.views.truncation * target / 0.5).square())
+    loss = (error * emphasis).sum() + settings.feature_penalty * features.norm(dim=-1).sum()
+    return BatchGradient(torch.autograd.grad(loss, leaf)[0], error.sum().item(), len(target))

@@ -1,0 +1,134 @@
+"""Pretraining: it learns, and the bytes are the same however it is run."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from spslam.errors import WeightsError
+from spslam.prior import load_prior
+from spslam.prior import pretrain as pretraining
+from spslam.prior.pretrain import pretrain, training_files
+from spslam.prior.training import PretrainSettings, initial_networks, split_networks
+from spslam.prior.validation import first_zero_crossing, validate
+from spslam.prior.views import ViewSettings
+
+SMALL = PretrainSettings(steps=20, patches_per_kind=2, views=ViewSettings(rays=48))
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch):
+    monkeypatch.setattr(pretraining, "_LOG_EVERY", 5)
+    monkeypatch.setattr(pretraining, "_VALIDATE_EVERY", 20)
+    pretrain(tmp_path / "one.safetensors", SMALL, workers=1)
+    return tmp_path / "one.safetensors"
+
+
+def interrupted_after(steps):
+    def progress(done, total, error_mm):
+        if done == steps:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_weights_load_with_their_provenance(trained):
+    prior = load_prior(trained)
+    assert prior.neighborhood == SMALL.neighborhood
+    assert prior.min_pair_weight == SMALL.min_pair_weight
+    assert prior.metadata["settings"]["steps"] == 20
+    assert prior.metadata["script_version"] == pretraining.SCRIPT_VERSION
+    assert set(prior.metadata["validation"]) == {"torus", "wavy_sheet", "sphere_on_plane", "mean"}
+    assert not (prior.decoder_params[: 32 * 11].view(32, 11)[:, :3]).any()
+
+
+def test_number_of_workers_does_not_matter(trained, tmp_path):
+    pretrain(tmp_path / "two.safetensors", SMALL, workers=2)
+    assert (tmp_path / "two.safetensors").read_bytes() == trained.read_bytes()
+
+
+def test_resumed_training_gives_the_same_bytes(trained, tmp_path):
+    output = tmp_path / "resumed.safetensors"
+    for stop in (7, 15):
+        with pytest.raises(KeyboardInterrupt):
+            pretrain(output, SMALL, resume=stop > 7, workers=2, progress=interrupted_after(stop))
+    assert not output.exists()
+    assert training_files(output).checkpoint.exists()
+    pretrain(output, SMALL, resume=True)
+    assert output.read_bytes() == trained.read_bytes()
+    assert training_files(output).log.read_text() == training_files(trained).log.read_text()
+    assert not training_files(output).checkpoint.exists()
+
+
+def test_seed_matters(trained, tmp_path):
+    pretrain(tmp_path / "other.safetensors", replace(SMALL, seed=1))
+    assert not torch.equal(
+        load_prior(tmp_path / "other.safetensors").encoder_params, load_prior(trained).encoder_params
+    )
+
+
+def test_global_state_is_left_alone(tmp_path):
+    threads, numbers = torch.get_num_threads(), torch.get_rng_state()
+    pretrain(tmp_path / "prior.safetensors", replace(SMALL, steps=2))
+    assert torch.get_num_threads() == threads
+    assert torch.equal(torch.get_rng_state(), numbers)
+
+
+def test_log_holds_course_and_validation(trained):
+    entries = [json.loads(line) for line in training_files(trained).log.read_text().splitlines()]
+    assert [entry["step"] for entry in entries] == [5, 10, 15, 20, 20]
+    assert all(entry["error_mm"] > 0 for entry in entries[:4])
+    assert "mean" in entries[-1]["validation"]
+
+
+def test_checkpoint_of_other_settings_is_refused(tmp_path):
+    output = tmp_path / "prior.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        pretrain(output, SMALL, progress=interrupted_after(3))
+    with pytest.raises(WeightsError, match="must be resumed with seed = 0, got 4"):
+        pretrain(output, replace(SMALL, seed=4), resume=True)
+
+
+def test_damaged_checkpoint_gives_one_line(tmp_path):
+    output = tmp_path / "prior.safetensors"
+    training_files(output).checkpoint.write_bytes(b"no checkpoint")
+    with pytest.raises(WeightsError, match=r"prior\.checkpoint\.safetensors: not a checkpoint of spslam pretrain: .+"):
+        pretrain(output, SMALL, resume=True)
+
+
+@pytest.mark.parametrize("change", [{"steps": 0}, {"seed": -1}, {"patches_per_kind": 0}])
+def test_settings_out_of_range_are_named(change):
+    with pytest.raises(ValueError, match=f"PretrainSettings: {next(iter(change))} must be"):
+        PretrainSettings(**change)
+
+
+def test_learning_rate_warms_up_and_falls():
+    settings = PretrainSettings(steps=1000)
+    rates = [settings.learning_rate_at(step) for step in range(1000)]
+    assert rates[0] < rates[10] < max(rates) <= settings.learning_rate
+    assert rates[-1] == pytest.approx(settings.final_learning_rate, rel=0.1)
+
+
+def test_first_zero_crossing():
+    nan = torch.nan
+    sdf = torch.tensor([[1.0, 0.5, -0.5, 1.0], [-1.0, 1.0, 1.0, -3.0], [1.0, nan, -1.0, -1.0], [1.0, 1.0, 0.0, -1.0]])
+    depth = torch.tensor([0.0, 1.0, 2.0, 3.0]).expand(4, 4)
+    where, found = first_zero_crossing(sdf, depth)
+    assert found.tolist() == [True, True, False, True]
+    assert where.tolist() == [1.5, 2.25, 0.0, 2.0]
+
+
+def test_validation_is_repeatable():
+    networks = split_networks(initial_networks(0))
+    first, second = (validate(*networks, 64, 1e-3, ("torus",)) for _ in range(2))
+    assert first == second
+    assert first["mean"] == first["torus"]
+
+
+@pytest.mark.slow
+def test_a_minute_of_training_learns(tmp_path):
+    provenance = pretrain(tmp_path / "prior.safetensors", PretrainSettings(steps=400))
+    mean = provenance["validation"]["mean"]
+    assert mean["zero_crossing_mm"] < 2.0
+    assert mean["sign_accuracy"] > 0.99
