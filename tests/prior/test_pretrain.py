@@ -36,7 +36,7 @@ def interrupted_after(steps):
 def test_weights_load_with_their_provenance(trained):
     prior = load_prior(trained)
     assert prior.neighborhood == SMALL.neighborhood
-    assert prior.min_pair_weight == SMALL.min_pair_weight
+    assert prior.metadata["settings"]["min_pair_weight"] == SMALL.min_pair_weight
     assert prior.metadata["settings"]["steps"] == 20
     assert prior.metadata["script_version"] == pretraining.SCRIPT_VERSION
     assert set(prior.metadata["validation"]) == {"torus", "wavy_sheet", "sphere_on_plane", "mean"}
