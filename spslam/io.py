@@ -41,7 +41,11 @@ def atomic_write(path: str | os.PathLike, content: bytes | str | Callable[[Path]
 
 def _write(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
     if callable(content):
+        # Some writers make files that only their owner may read; a result is as readable as any other new file.
+        path.touch()
+        mode = path.stat().st_mode
         content(path)
+        path.chmod(mode)
     elif isinstance(content, str):
         path.write_bytes(content.encode())
     else:

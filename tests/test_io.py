@@ -34,3 +34,13 @@ def test_a_failing_writer_leaves_the_old_content(tmp_path):
 def test_a_missing_folder_is_an_output_error(tmp_path):
     with pytest.raises(OutputError, match=r"missing/a\.txt: can't be written: No such file"):
         atomic_write(tmp_path / "missing" / "a.txt", "x")
+
+
+def test_a_writer_of_private_files_leaves_an_ordinary_one(tmp_path):
+    def write_private(path):
+        path.unlink()
+        path.touch(mode=0o600)
+
+    atomic_write(tmp_path / "private", write_private)
+    atomic_write(tmp_path / "ordinary", b"")
+    assert (tmp_path / "private").stat().st_mode == (tmp_path / "ordinary").stat().st_mode
