@@ -1,4 +1,3 @@
-#ifndef SPS_CUDA  // the CUDA launch follows
 #include "spslam/render_step.h"
 
 #include "bindings/scene.h"
@@ -26,11 +25,11 @@ RenderOptions load_options(std::int64_t num_uniform, std::int64_t num_surface, d
                   "render_step: the samples of a ray must be from 1 to ", kMaxSamples);
   STD_TORCH_CHECK(weights.size() == 4, "render_step: weights must be rgb, depth, free_space, sdf");
   const auto f = [](double x) { return static_cast<float>(x); };
-  return {{static_cast<std::int32_t>(num_uniform), static_cast<std::int32_t>(num_surface), f(near), f(far),
-           f(truncation)},
-          key,
-          {f(weights[0]), f(weights[1]), f(weights[2]), f(weights[3])},
-          cosine_targets};
+  return {
+      {static_cast<std::int32_t>(num_uniform), static_cast<std::int32_t>(num_surface), f(near), f(far), f(truncation)},
+      key,
+      {f(weights[0]), f(weights[1]), f(weights[2]), f(weights[3])},
+      cosine_targets};
 }
 
 void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars,
@@ -53,12 +52,9 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
   poses = torch::stable::contiguous(poses);
   const std::int64_t num_texels = scene_tensors[5].numel() / kPlaneChannels;
   const auto f = [&](int i) { return static_cast<float>(intrinsics[i]); };
-  const RayBatch rays{data<std::int32_t>(pixels),
-                      data<std::int32_t>(ray_frames),
-                      num_rays,
-                      data<float>(poses),
-                      poses.size(0),
-                      {f(0), f(1), f(2), f(3)}};
+  const RayBatch rays{
+      data<std::int32_t>(pixels), data<std::int32_t>(ray_frames), num_rays, data<float>(poses), poses.size(0),
+      {f(0), f(1), f(2), f(3)}};
   const RenderOptions options = load_options(num_uniform, num_surface, near, far, truncation, cosine_targets, weights,
                                              philox_key(seed, stream, frame, iteration));
   const RenderGradients gradients{
@@ -71,13 +67,14 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
       output<float>(grad_geometry, kGeometryDecoder.num_params(), "grad_geometry"),
       output<float>(grad_color, kColorDecoder.num_params(), "grad_color"),
       static_cast<std::int32_t>(stamp)};
-  const std::int64_t bytes = render_step_workspace_size(scope.context, rays, options, gradients);
+  const std::int64_t bytes = render_step_workspace_size(scope.context, view, rays, options);
   Tensor workspace = empty(losses, {bytes}, ScalarType::Byte);
   spslam::render_step(scope.context, view, rays, options, gradients, workspace.mutable_data_ptr());
 }
 
 }  // namespace
 
+#ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("render_step(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor ray_frames, Tensor poses, float[] intrinsics, int num_uniform, int num_surface, "
@@ -86,10 +83,10 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
         "Tensor(d!)? embedding_stamps, Tensor(e!)? grad_texels, Tensor(f!)? texel_stamps, "
         "Tensor(g!)? grad_geometry, Tensor(h!)? grad_color, int stamp) -> ()");
 }
+#endif
 
 SPS_LIBRARY_IMPL(m) {
   m.impl("render_step", TORCH_BOX(&render_step));
 }
 
 }  // namespace spslam::bindings
-#endif

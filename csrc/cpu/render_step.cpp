@@ -203,7 +203,7 @@ class Step {
 }  // namespace render
 
 template <>
-std::int64_t render_step_workspace_size(Cpu, const RayBatch&, const RenderOptions&, const RenderGradients&) {
+std::int64_t render_step_workspace_size(Cpu, const SceneView&, const RayBatch&, const RenderOptions&) {
   return 0;
 }
 

@@ -32,8 +32,9 @@ GRADIENTS = dict(
 )
 # Float32 sums of some thousand terms against float64.
 LOSS_TOLERANCE = dict(rtol=2e-5, atol=1e-7)
-# Of the largest element: float32 rounding, and the sample or two that it puts beyond a cell's face or a threshold.
-GRADIENT_TOLERANCE = 1e-3
+# A hidden unit, cell face or threshold within rounding of a sample puts its gradient on the other side: one sample in
+# some runs. As shares of the largest element and of the norm.
+ELEMENT_TOLERANCE, NORM_TOLERANCE = 0.03, 0.02
 
 
 def _pose(center, target):
@@ -87,9 +88,10 @@ def _step(scene, rays, options=OPTIONS, gradients=None):
     return step.losses, found
 
 
-def _assert_close(got, want, tolerance=GRADIENT_TOLERANCE):
-    scale = want.abs().max().item()
-    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=tolerance * scale + 1e-12)
+def _assert_close(got, want):
+    error = (got.cpu().double() - want).abs()
+    assert error.max() <= ELEMENT_TOLERANCE * want.abs().max()
+    assert error.norm() <= NORM_TOLERANCE * want.norm()
 
 
 @pytest.mark.parametrize(

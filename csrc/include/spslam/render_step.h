@@ -49,8 +49,8 @@ struct RenderGradients {
 
 // Bytes of scratch that render_step needs.
 template <class Device>
-std::int64_t render_step_workspace_size(Device device, const RayBatch& rays, const RenderOptions& options,
-                                        const RenderGradients& gradients);
+std::int64_t render_step_workspace_size(Device device, const SceneView& scene, const RayBatch& rays,
+                                        const RenderOptions& options);
 
 template <class Device>
 void render_step(Device device, const SceneView& scene, const RayBatch& rays, const RenderOptions& options,
