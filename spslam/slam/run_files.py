@@ -112,7 +112,8 @@ class RunFiles:
             Trajectory(dataset.timestamps()[known], truth[known]).save_tum(self.previews / "truth.txt")
         for row in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int)).tolist():
             frame = dataset[indices[row]]
-            depth = np.clip(np.rint(1000 * frame.depth), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+            millimetres = np.nan_to_num(np.rint(1000 * frame.depth), nan=0.0)
+            depth = np.clip(millimetres, 0, np.iinfo(np.uint16).max).astype(np.uint16)
             _write_png(self.previews / f"frame-{row:06d}.png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
             _write_png(self.previews / f"depth-{row:06d}.png", depth)
 
