@@ -19,6 +19,8 @@ RUN_FILES = (
     "config.yaml",
     "log.jsonl",
     "map.safetensors",
+    "mesh.glb",
+    "mesh.obj",
     "mesh.ply",
     "metrics.json",
     "report.html",
@@ -65,6 +67,9 @@ def _remove_earlier_demo(output: Path) -> None:
         raise OutputError(f"{output}: holds a run over other data; use another --output")
     for name in RUN_FILES:
         (output / name).unlink(missing_ok=True)
+    # A killed run leaves the file that it was writing.
+    for path in output.glob(".*.tmp.*"):
+        path.unlink()
     shutil.rmtree(output / "previews", ignore_errors=True)
 
 

@@ -20,11 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> None:
+    require_run_file(args.output, "trajectory.txt")
+
     from spslam.evaluation.finished_run import add_metrics, trajectory_figures
     from spslam.evaluation.report import write_report
     from spslam.evaluation.run_output import RunOutput
 
-    require_run_file(args.output, "trajectory.txt")
     run = RunOutput.read(args.output)
     figures: dict[str, Any] = trajectory_figures(run)
     if not figures and args.gt_mesh is None:

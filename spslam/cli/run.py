@@ -39,9 +39,14 @@ def execute(args: argparse.Namespace) -> None:
 
 def run(config: Config, output: Path, frames: slice | None, resume: bool, mesh: bool, quiet: bool) -> dict[str, Any]:
     """Run the sequence of a configuration; an interruption says how to go on."""
-    from spslam.slam.run import run_sequence
+    from spslam.datasets import open_sequence
 
     data = None if config.dataset.path is None else Path(config.dataset.path)
+    # Wrong data is told before torch is loaded.
+    open_sequence(config.dataset, data, frames)
+
+    from spslam.slam.run import run_sequence
+
     try:
         return run_sequence(config, data, output, frames, resume, mesh, make_progress(quiet))
     except KeyboardInterrupt:

@@ -2,6 +2,15 @@
 
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.prefetch import Prefetcher, prefetch
-from spslam.datasets.registry import dataset_types, open_dataset
+from spslam.datasets.registry import dataset_types, open_dataset, open_sequence
 
-__all__ = ["Prefetcher", "RgbdDataset", "RgbdFrame", "Subset", "dataset_types", "open_dataset", "prefetch"]
+__all__ = [
+    "Prefetcher",
+    "RgbdDataset",
+    "RgbdFrame",
+    "Subset",
+    "dataset_types",
+    "open_dataset",
+    "open_sequence",
+    "prefetch",
+]

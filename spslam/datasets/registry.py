@@ -42,6 +42,29 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
     return dataset if stride == 1 else Subset(dataset, step=stride)
 
 
+def open_sequence(config: Any, data_dir: str | os.PathLike | None = None, frames: slice | None = None) -> RgbdDataset:
+    """The frames that a run is over: those of :func:`open_dataset`, or the part of them that ``frames`` names.
+
+    Frames are read until one is usable, so that data without any is refused before anything is written.
+
+    Raises
+    ------
+    DatasetError
+        As :func:`open_dataset`, and when no frame is selected or none can be read.
+    """
+    dataset = open_dataset(config, data_dir)
+    if frames is not None:
+        dataset = Subset(dataset, frames.start or 0, frames.stop, frames.step or 1)
+    fault = None
+    for index in range(len(dataset)):
+        try:
+            dataset[index]
+            return dataset
+        except DatasetError as error:
+            fault = fault or error
+    raise DatasetError(f"{dataset.name}: no frame can be read; the first: {fault}")
+
+
 def dataset_types() -> list[str]:
     """Names that ``dataset.type`` may have."""
     return list(_OPENERS)

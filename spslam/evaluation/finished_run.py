@@ -13,7 +13,8 @@ from spslam.errors import OutputError
 from spslam.evaluation.mesh import evaluate_surface, observed_mask
 from spslam.evaluation.run_output import RunOutput, match_times
 from spslam.evaluation.surface import Surface, TriangleSurface
-from spslam.evaluation.trajectory import align, ate, rpe
+from spslam.evaluation.trajectory import Alignment, ate, rpe
+from spslam.geometry import umeyama
 from spslam.io import atomic_write
 
 # Frames that decide what was observed; more of a sequence's neighbours add nothing but time.
@@ -30,8 +31,9 @@ def trajectory_figures(run: RunOutput) -> dict[str, float]:
 def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dict[str, float]:
     """Accuracy, completeness and F1 of the run's mesh, as metrics.json names them.
 
-    The mesh is carried into the truth's world by the rigid alignment of the trajectories; surface that no frame
-    observed is left out on both sides.
+    The mesh is carried into the truth's world by the rigid motion that best carries estimated onto true views (camera
+    centres and points a metre away from them: the centres of a straight path alone leave a rotation open); surface that
+    no frame observed is left out on both sides.
 
     Parameters
     ----------
@@ -49,7 +51,9 @@ def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dic
         raise OutputError(f"{run.folder}: has no mesh to evaluate; spslam mesh {run.folder} makes one")
     rows, indices = _frames_of(run, dataset)
     poses = run.trajectory.poses if run.truth is None else run.truth
-    vertices = mesh.vertices if run.truth is None else align(run.trajectory.poses, run.truth).apply(mesh.vertices)
+    vertices = (
+        mesh.vertices if run.truth is None else _align_views(run.trajectory.poses, run.truth).apply(mesh.vertices)
+    )
     depths = [dataset[int(index)].depth for index in indices]
 
     def observed(points: np.ndarray) -> np.ndarray:
@@ -63,6 +67,14 @@ def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
     metrics = {**run.metrics, **figures}
     atomic_write(Path(run.folder) / "metrics.json", json.dumps(metrics, indent=1) + "\n")
     return metrics
+
+
+def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
+    known = np.isfinite(reference).all(axis=(1, 2))
+    # Columns: the camera's centre, and the points a metre along its axes.
+    corners = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]], dtype=np.float64).T
+    points = ((poses[known] @ corners)[:, :3].transpose(0, 2, 1).reshape(-1, 3) for poses in (estimated, reference))
+    return Alignment(*umeyama(*points))
 
 
 def _frames_of(run: RunOutput, dataset: RgbdDataset) -> tuple[np.ndarray, np.ndarray]:

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from spslam.config import Config, dump_config
-from spslam.datasets import open_dataset
-from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
+from spslam.datasets import open_sequence
+from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError, DeviceError, OutputError
 from spslam.io import atomic_write
@@ -126,9 +126,7 @@ def _run(
     mesh: bool,
     progress: Progress | None,
 ) -> dict[str, Any]:
-    dataset = open_dataset(config.dataset, data_dir)
-    if frames is not None:
-        dataset = Subset(dataset, frames.start or 0, frames.stop, frames.step or 1)
+    dataset = open_sequence(config.dataset, data_dir, frames)
     system = SlamSystem(config, dataset.camera, _first_pose(config, dataset), device)
     files = RunFiles(output_dir)
     position, clock = _begin(files, system, dataset, data_dir, resume)

@@ -48,6 +48,15 @@ def test_perfect_run_has_perfect_figures(output, room):
     assert figures["completeness_cm"] < 0.1
 
 
+def test_straight_path_leaves_no_rotation_open(output, room):
+    run = RunOutput.read(output)
+    line = run.trajectory.poses[:1].repeat(6, axis=0)
+    line[:, :3, 3] += np.outer(np.arange(6), [0.02, 0, 0])
+    Trajectory(run.trajectory.timestamps, line).save_tum(output / "trajectory.txt")
+    Trajectory(run.trajectory.timestamps, np.linalg.inv(TURN) @ line).save_tum(output / "previews" / "truth.txt")
+    assert surface_figures(RunOutput.read(output), room, room.room)["accuracy_cm"] < 0.1
+
+
 def test_shifted_mesh_is_found_out(output, room):
     mesh = trimesh.load(output / "mesh.ply", process=False)
     mesh.apply_translation([0.08, 0, 0])

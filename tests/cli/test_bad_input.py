@@ -1,0 +1,146 @@
+"""Whatever is wrong with the input: one clear line, exit code 2, and nothing half-written."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from tests.cli.command import assert_refused, spslam
+from tests.datasets import layouts
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return layouts.write_seven_scenes(tmp_path / "scene")
+
+
+def run(tmp_path, *arguments):
+    return spslam("run", *arguments, "--output", "out", "--device", "cpu", cwd=tmp_path)
+
+
+def sequence(scene, name):
+    return scene / "seq-01" / name
+
+
+def break_images(scene):
+    for path in scene.rglob("*.color.png"):
+        layouts.truncate(path)
+
+
+def break_depths(scene):
+    for path in scene.rglob("*.depth.png"):
+        path.write_bytes(b"")
+
+
+def shrink_depths(scene):
+    for path in scene.rglob("*.depth.png"):
+        layouts.write_depth(path, np.ones((10, 10)))
+
+
+def remove_frames(scene):
+    for path in scene.rglob("frame-*"):
+        path.unlink()
+
+
+def replace_by_file(scene):
+    shutil.rmtree(scene)
+    scene.write_text("not a folder")
+
+
+def replace_by_other_layout(scene):
+    shutil.rmtree(scene)
+    layouts.write_tum(scene)
+
+
+def break_intrinsics(scene):
+    (scene / "camera-intrinsics.txt").write_text("1 2 3\n4 5 6\n")
+
+
+SPOILERS = {
+    "no such folder": shutil.rmtree,
+    "must be a folder": replace_by_file,
+    "7-Scenes frames": replace_by_other_layout,
+    "must hold 7-Scenes frames": remove_frames,
+    "color.png": break_images,
+    "depth.png": break_depths,
+    "depth must be as large as colour, got depth 10x10 and colour 32x24": shrink_depths,
+    "camera-intrinsics.txt": break_intrinsics,
+}
+
+
+@pytest.mark.parametrize("message", SPOILERS)
+def test_unusable_data_is_refused(tmp_path, scene, message):
+    SPOILERS[message](scene)
+    assert_refused(run(tmp_path, "7scenes", "--data", scene, "--quiet"), message)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "tracking.iteratons=3"], "tracking.iteratons is not an option; did you mean tracking.iterations?"),
+        (["--set", "tracking.iterations=0"], "tracking.iterations must be at least 1, got 0"),
+        (["--set", "tracking.iterations"], "--set must be section.key=value, got tracking.iterations"),
+        (["--seed", "-1"], "seed must be at least 0, got -1"),
+        (["--device", "gpu"], "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),
+        (["--frames", "10:20"], "frames must select at least one of 0..3, got 10:20"),
+        (["--set", "prior.weights=absent.safetensors"], "absent.safetensors"),
+    ],
+)
+def test_wrong_options_are_refused(tmp_path, scene, arguments, message):
+    result = spslam("run", "7scenes", "--data", scene, "--output", "out", *arguments, cwd=tmp_path)
+    assert_refused(result, message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_data_option_is_refused(tmp_path):
+    assert_refused(run(tmp_path, "7scenes"), "--data")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the device isn't absent here")
+@pytest.mark.parametrize("command", [["run", "demo"], ["demo"]])
+def test_absent_device_is_refused(tmp_path, command):
+    result = spslam(*command, "--device", "cuda", "--output", "out", cwd=tmp_path)
+    assert_refused(result, "device cuda is not available")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("notes.txt", "is not empty"), ("metrics.json", "holds"), ("checkpoint.safetensors", "--resume")],
+)
+def test_output_folder_in_use_is_refused_and_left_alone(tmp_path, scene, name, message):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    assert_refused(run(tmp_path, "7scenes", "--data", scene), message)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [name]
+    assert (tmp_path / "out" / name).read_text() == "mine"
+
+
+def test_output_that_is_a_file_is_refused(tmp_path, scene):
+    (tmp_path / "out").write_text("mine")
+    assert_refused(run(tmp_path, "7scenes", "--data", scene), "is a file")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_demo_does_not_replace_another_run(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "config.yaml").write_text("dataset: {type: tum}\n")
+    assert_refused(spslam("demo", "--output", "out", cwd=tmp_path), "holds a run over other data")
+    (tmp_path / "out" / "config.yaml").write_text("something: else\n")
+    assert_refused(spslam("demo", "--output", "out", cwd=tmp_path), "holds something that isn't a demo")
+    assert len(list((tmp_path / "out").iterdir())) == 1
+
+
+@pytest.mark.parametrize("command", ["eval", "mesh"])
+def test_commands_on_a_finished_run_refuse_other_folders(tmp_path, command):
+    assert_refused(spslam(command, "absent", cwd=tmp_path), "absent: no such folder")
+    (tmp_path / "file").write_text("")
+    assert_refused(spslam(command, "file", cwd=tmp_path), "must be the output folder of a run, got a file")
+    (tmp_path / "empty").mkdir()
+    assert_refused(spslam(command, "empty", cwd=tmp_path), "must be the output folder of a finished run, but has no ")
+
+
+def test_check_data_refuses_what_run_refuses(tmp_path):
+    assert_refused(spslam("check-data", "7scenes", "--data", "absent", cwd=tmp_path), "absent: no such folder")

@@ -1,0 +1,152 @@
+"""The commands from end to end, on a few small frames of the generated room."""
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from spslam.cli.progress import ProgressLines, summarize
+from spslam.config import load_config
+from tests.cli.command import ROOT, assert_refused, spslam
+
+SMALL = [
+    "--set=dataset.width=96",
+    "--set=dataset.height=72",
+    "--set=pixels.per_frame=3000",
+    "--set=mapping.first_iterations=20",
+    "--set=mapping.iterations=2",
+    "--set=run.checkpoint_every=2",
+    "--device=cpu",
+]
+FILES = {"config.yaml", "log.jsonl", "map.safetensors", "metrics.json", "previews", "report.html", "trajectory.txt"}
+
+
+def run(cwd, *arguments):
+    result = spslam("run", "demo", *SMALL, *arguments, cwd=cwd)
+    assert result.returncode == 0, result.stderr
+    return result
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with a finished run in `out`, and what the command said."""
+    folder = tmp_path_factory.mktemp("finished")
+    return folder, run(folder, "--frames", "0:8", "--output", "out")
+
+
+def test_run_leaves_all_files_and_says_where(finished):
+    folder, result = finished
+    assert {path.name for path in (folder / "out").iterdir()} == FILES | {"mesh.ply"}
+    assert re.search(r"^frames +8$", result.stdout, re.MULTILINE)
+    for word in ("frames/s", "ATE RMSE", "out/mesh.ply", "out/report.html"):
+        assert word in result.stdout
+    assert "8/8 frames" in result.stderr
+    metrics = json.loads((folder / "out" / "metrics.json").read_text())
+    assert metrics["frames"] == 8
+    assert metrics["ate_rmse_cm"] < 3
+
+
+def test_kept_configuration_is_the_one_that_ran(finished):
+    config = load_config(finished[0] / "out" / "config.yaml")
+    assert config == load_config(
+        "demo", overrides=[*(text.removeprefix("--set=") for text in SMALL[:-1]), "device=cpu"]
+    )
+
+
+def test_finished_run_is_not_overwritten(finished):
+    folder, _ = finished
+    before = (folder / "out" / "trajectory.txt").read_bytes()
+    for extra in ([], ["--resume"]):
+        result = spslam("run", "demo", *SMALL, "--frames", "0:8", "--output", "out", *extra, cwd=folder)
+        assert_refused(result, "holds a finished run; use another --output")
+    assert (folder / "out" / "trajectory.txt").read_bytes() == before
+
+
+def test_eval_adds_figures_of_the_mesh(finished):
+    folder, _ = finished
+    result = spslam("eval", "out", "--gt-mesh", "out/mesh.ply", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert "F1 at 5 cm" in result.stdout
+    # Against itself the mesh is off by what the alignment of estimated and true views carries it.
+    assert json.loads((folder / "out" / "metrics.json").read_text())["f1_5cm"] > 99
+    assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such mesh file")
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_mesh_is_made_from_the_map(finished, suffix):
+    folder, _ = finished
+    result = spslam("mesh", "out", "--resolution", "0.08", "--format", suffix, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert f"out/mesh.{suffix}: " in result.stdout
+    assert (folder / "out" / f"mesh.{suffix}").stat().st_size > 1000
+
+
+def test_no_mesh_and_quiet(tmp_path):
+    result = run(tmp_path, "--frames", "0:2", "--output", "out", "--no-mesh", "--quiet")
+    assert (result.stdout, result.stderr) == ("", "")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+
+
+def test_output_is_named_after_configuration_and_time(tmp_path):
+    run(tmp_path, "--frames", "0:1", "--no-mesh", "--quiet")
+    assert re.fullmatch(r"demo-\d{8}-\d{6}", next((tmp_path / "runs").iterdir()).name)
+
+
+def test_interruption_is_one_line_and_resumes_to_the_same_bytes(tmp_path):
+    arguments = [*SMALL, "--frames", "0:12", "--no-mesh", "--quiet"]
+    run(tmp_path, *arguments, "--output", "whole")
+    command = [sys.executable, "-m", "spslam.cli.main", "run", "demo", *arguments, "--output", tmp_path / "cut"]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    checkpoint = tmp_path / "cut" / "checkpoint.safetensors"
+    while not checkpoint.exists() and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 130, error
+    assert error == f"spslam: interrupted; the same command with --output {tmp_path / 'cut'} --resume goes on\n"
+    assert_refused(spslam("run", "demo", *arguments, "--output", "cut", cwd=tmp_path), "go on with --resume")
+    run(tmp_path, *arguments, "--output", "cut", "--resume")
+    for name in ("trajectory.txt", "map.safetensors"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_demo_replaces_an_earlier_run_over_the_room(finished, tmp_path):
+    shutil.copytree(finished[0] / "out", tmp_path / "runs" / "demo")
+    result = spslam("demo", "--frames", 1, "--device", "cpu", cwd=tmp_path, timeout=300)
+    assert result.returncode == 0, result.stderr
+    assert "F1 at 5 cm" in result.stdout
+    assert {path.name for path in (tmp_path / "runs" / "demo").iterdir()} == FILES | {"mesh.ply"}
+    assert json.loads((tmp_path / "runs" / "demo" / "metrics.json").read_text())["frames"] == 1
+
+
+def test_check_data_describes_the_room(tmp_path):
+    result = spslam("check-data", "demo", "--set", "dataset.width=64", "--set", "dataset.height=48", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for line in ("frames        300", "size          64x48 px", "true poses    300 of 300", "nothing looks wrong"):
+        assert line in result.stdout
+
+
+class Report:
+    lost, residual_cm, loss = False, 0.31, 0.2
+
+
+def test_progress_without_a_terminal_is_lines(capsys):
+    lines = ProgressLines()
+    lines(1, 3, None)
+    lines(2, 3, Report())
+    lines(3, 3, Report())
+    error = capsys.readouterr().err
+    assert re.fullmatch(r"3/3 frames, [\d.]+ frames/s, ok, 0\.31 cm off, loss 0\.200\n", error)
+
+
+def test_summary_leaves_out_what_was_not_measured(tmp_path):
+    assert summarize({"frames": 5}, tmp_path) == [("frames", "5")]
+    assert summarize({"frames": 5, "lost_frames": 1, "skipped_frames": 2, "fps": 3.21}, tmp_path) == [
+        ("frames", "5 (1 lost, 2 skipped)"),
+        ("speed", "3.2 frames/s"),
+    ]
