@@ -32,9 +32,12 @@ GRADIENTS = dict(
 )
 # Float32 sums of some thousand terms against float64.
 LOSS_TOLERANCE = dict(rtol=2e-5, atol=1e-7)
-# A hidden unit, cell face or threshold within rounding of a sample puts its gradient on the other side: one sample in
-# some runs. As shares of the largest element and of the norm.
-ELEMENT_TOLERANCE, NORM_TOLERANCE = 0.03, 0.02
+# Of gradients, as a share of the largest element: float32 sums of some thousand terms with cancellation.
+ELEMENT_TOLERANCE = 1e-3
+# The step on CUDA adds in another order than the reference, so a hidden unit, cell face or threshold within rounding of a
+# sample may fall on the other side: one sample in some draws, which is 1.5 % of an element. As shares of the largest
+# element and of the norm.
+CUDA_ELEMENT_TOLERANCE, CUDA_NORM_TOLERANCE = 0.03, 0.02
 
 
 def _pose(center, target):
@@ -90,8 +93,11 @@ def _step(scene, rays, options=OPTIONS, gradients=None):
 
 def _assert_close(got, want):
     error = (got.cpu().double() - want).abs()
-    assert error.max() <= ELEMENT_TOLERANCE * want.abs().max()
-    assert error.norm() <= NORM_TOLERANCE * want.norm()
+    if got.device.type == "cpu":
+        assert error.max() <= ELEMENT_TOLERANCE * want.abs().max()
+    else:
+        assert error.max() <= CUDA_ELEMENT_TOLERANCE * want.abs().max()
+        assert error.norm() <= CUDA_NORM_TOLERANCE * want.norm()
 
 
 @pytest.mark.parametrize(
