@@ -1,0 +1,83 @@
+"""The pixel database: what it keeps, and that it keeps within its budget."""
+
+import pytest
+import torch
+
+from spslam.errors import SpslamError
+from spslam.slam.pixel_database import RECORD_BYTES, PixelDatabase
+
+
+def frame(number, count):
+    """Records that tell their frame and place."""
+    return torch.stack([torch.full((count,), number), torch.arange(count), torch.zeros(count)], 1).int()
+
+
+def budget_mb(frames, pixels):
+    return frames * pixels * RECORD_BYTES / 2**20
+
+
+def test_records_come_back():
+    database = PixelDatabase(100, budget_mb(1000, 100))
+    for number in range(40):
+        database.add(frame(number, 100))
+    assert database.records.shape == (40, 100, 3)
+    assert all(torch.equal(database.records[number], frame(number, 100)) for number in range(40))
+    assert database.has_pixels.all()
+
+
+def test_a_frame_without_pixels_is_marked():
+    database = PixelDatabase(100, 1)
+    database.add(frame(0, 0))
+    database.add(frame(1, 100))
+    assert database.has_pixels.tolist() == [False, True]
+    assert not database.records[0].any()
+
+
+def test_fewer_records_are_repeated_and_more_are_cut():
+    database = PixelDatabase(100, 1)
+    database.add(frame(0, 30))
+    database.add(frame(1, 250))
+    assert torch.equal(database.records[0, :, 1], torch.arange(100).int() % 30)
+    assert torch.equal(database.records[1], frame(1, 250)[:100])
+
+
+def test_past_the_budget_all_frames_are_thinned_alike():
+    database = PixelDatabase(256, budget_mb(20, 256))
+    for number in range(50):
+        database.add(frame(number, 256))
+        assert database.nbytes <= budget_mb(20, 256) * 2**20
+    assert database.pixels_per_frame == 64
+    assert all(torch.equal(database.records[number], frame(number, 64)) for number in range(50))
+
+
+def test_thinning_does_not_depend_on_a_resume():
+    whole, resumed = PixelDatabase(256, budget_mb(20, 256)), PixelDatabase(256, budget_mb(20, 256))
+    for number in range(45):
+        whole.add(frame(number, 256))
+        resumed.add(frame(number, 256))
+        if number % 7 == 3:
+            state = {name: tensor.clone() for name, tensor in resumed.state_dict().items()}
+            resumed = PixelDatabase(256, budget_mb(20, 256))
+            resumed.load_state_dict(state)
+        assert whole.pixels_per_frame == resumed.pixels_per_frame
+    assert torch.equal(whole.records, resumed.records)
+    assert torch.equal(whole.has_pixels, resumed.has_pixels)
+
+
+def test_loading_copies():
+    database, other = PixelDatabase(100, 1), PixelDatabase(100, 1)
+    database.add(frame(3, 100))
+    other.load_state_dict(database.state_dict())
+    database.records.zero_()
+    assert torch.equal(other.records[0], frame(3, 100))
+
+
+def test_a_budget_too_small_is_refused():
+    with pytest.raises(SpslamError, match=r"must hold at least one frame of 100 pixels \(0.00 MB\), got 0.001"):
+        PixelDatabase(100, 0.001)
+    database = PixelDatabase(64, budget_mb(3, 64))
+    for number in range(3):
+        database.add(frame(number, 64))
+    with pytest.raises(SpslamError, match="cannot hold 4 frames of 64 pixels; raise it"):
+        database.add(frame(3, 64))
+    assert database.num_frames == 3

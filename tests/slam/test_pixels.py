@@ -1,0 +1,96 @@
+"""Pixels of a frame: which are drawn, and how they are packed."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame, unpack_points, usable_depth
+from spslam.slam.state import FrameTable, pose_tensor
+from spslam.slam.system import SlamSystem
+from tests.system.sequences import Recorded, settings
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return Recorded(3)
+
+
+def test_records_hold_what_the_images_do(dataset):
+    frame, camera = dataset[0], dataset.camera
+    records = sample_frame(frame, camera, settings()).records.numpy().view(np.uint32)
+    u, v = records[:, 0] & 0xFFFF, records[:, 0] >> 16
+    assert records.shape == (15000, 3)
+    np.testing.assert_array_equal(records[:, 1].view(np.float32), frame.depth[v, u])
+    np.testing.assert_array_equal(records[:, 2:].copy().view(np.uint8)[:, :3], frame.color[v, u])
+
+
+def test_foreshortening_is_that_of_the_normals(dataset):
+    frame, camera = dataset[0], dataset.camera
+    pixels = sample_frame(frame, camera, settings())
+    words = pixels.records.numpy().view(np.uint32)
+    u, v = words[:, 0] & 0xFFFF, words[:, 0] >> 16
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
+    expected = np.abs((pixels.normals.numpy() * rays).sum(1)) * 128
+    np.testing.assert_allclose(words[:, 2] >> 24, expected.clip(0, 255), atol=0.51)
+    assert ((words[:, 2] >> 24 == 0) == (expected < 0.5)).all()
+
+
+def test_kernels_unpack_the_same_points(dataset):
+    frame, camera = dataset[0], dataset.camera
+    config, pose = settings("mapping.first_iterations=0"), pose_tensor(frame.pose, torch.device("cpu"))
+    system = SlamSystem(config, camera, frame.pose)
+    system.process(frame)
+    scene, records = system.state.scene, sample_frame(dataset[1], camera, config).records[:2000]
+    rotation = torch.from_numpy(frame.pose[:3, :3]).float()
+    sdf, valid = scene.sdf(unpack_points(records, camera) @ rotation.T + pose[4:])
+    _, _, _, inliers = ops.gauss_newton_poses(
+        scene.view(), records[None], pose[None], system.tracker.intrinsics, truncation=0.08, kernel=0.02
+    )
+    assert float(inliers) > 0.3
+    assert float(inliers) == pytest.approx(float((valid & (sdf.abs() < 0.98)).float().mean()), abs=2e-3)
+
+
+def test_the_draw_depends_on_seed_and_frame_alone(dataset):
+    def records(index, *overrides):
+        return sample_frame(dataset[index], dataset.camera, settings(*overrides)).records
+
+    assert torch.equal(records(0), records(0))
+    assert not torch.equal(records(0), records(0, "seed=1"))
+    assert not torch.equal(records(0)[:, 0], records(1)[:, 0])
+
+
+def test_only_usable_depth_is_drawn(dataset):
+    frame = dataset[0]
+    frame.depth[:, :100] = 0
+    frame.depth[:40] = np.nan
+    pixels = sample_frame(frame, dataset.camera, settings())
+    u, v = pixels.records[:, 0] & 0xFFFF, pixels.records[:, 0] >> 16
+    assert (u >= 100).all()
+    assert (v >= 40).all()
+    assert pixels.valid_share == pytest.approx(60 * 80 / (160 * 120))
+
+
+def test_a_frame_without_depth_has_no_records(dataset):
+    frame = dataset[0]
+    frame.depth[:] = 0
+    pixels = sample_frame(frame, dataset.camera, settings())
+    assert pixels.records.shape == pixels.normals.shape == (0, 3)
+    assert pixels.valid_share == 0
+    assert not pixels.lattice.any()
+
+
+def test_the_lattice_fits_the_frame_table(dataset):
+    frame = dataset[0]
+    lattice = sample_frame(frame, dataset.camera, settings()).lattice
+    assert lattice.shape == FrameTable(dataset.camera).lattices.shape[1:]
+    half = LATTICE_STEP_PX // 2
+    np.testing.assert_allclose(lattice[2, 3], frame.depth[half + 32, half + 48], rtol=1e-3)
+
+
+def test_usable_depth():
+    depth = np.array([[np.nan, np.inf, -np.inf, -1, 0, 0.0999, 0.1, 5, 10, 10.001]], np.float32)
+    expected = np.array([[0, 0, 0, 0, 0, 0, 0.1, 5, 10, 0]], np.float32)
+    usable = usable_depth(depth, np.float32(0.1), 10)
+    assert usable.dtype == np.float32
+    np.testing.assert_array_equal(usable, expected)

@@ -1,0 +1,194 @@
+"""Tracker and mapper on a small map: prediction, lost frames, what moves and what is held."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam.slam.pixels import sample_frame
+from spslam.slam.state import FrameTable, Moments, SlamState, pose_tensor
+from spslam.slam.system import SlamSystem
+from spslam.slam.tracker import Tracker
+from tests.system.sequences import Recorded, settings
+
+CPU = torch.device("cpu")
+
+
+def shifted(x):
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def table(camera, xs, lost=()):
+    frames = FrameTable(camera)
+    for row, x in enumerate(xs):
+        frames.append(pose_tensor(shifted(x), CPU), row / 30, row, row in lost, torch.zeros(frames.lattices.shape[1:]))
+    return frames
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return Recorded(12)
+
+
+def processed(dataset, count, *overrides, preset=None):
+    system = SlamSystem(settings(*overrides, preset=preset), dataset.camera, dataset.poses()[0])
+    for i in range(count):
+        system.process(dataset[i])
+    return system
+
+
+def test_frame_table_grows_and_keeps_its_rows(dataset):
+    frames = table(dataset.camera, range(200), lost={7})
+    assert len(frames) == len(frames.poses) == len(frames.lattices) == 200
+    assert frames.poses[:, 4].tolist() == list(range(200))
+    assert frames.lost.nonzero()[:, 0].tolist() == [7]
+    np.testing.assert_allclose(frames.matrices(-2), [shifted(198), shifted(199)])
+    frames.poses[0, 4] = -1
+    assert frames.poses[0, 4] == -1
+
+
+@pytest.mark.parametrize(
+    ("xs", "lost", "expected"),
+    [([1.0], (), 1.0), ([1.0, 1.5], (), 2.0), ([1.0, 1.5, 1.6], {2}, 1.6), ([1.0, 1.5, 1.6], {1}, 1.6)],
+)
+def test_prediction_is_constant_speed_but_after_loss(dataset, xs, lost, expected):
+    start = Tracker(settings(), dataset.camera).predict(table(dataset.camera, xs, lost))
+    torch.testing.assert_close(start, pose_tensor(shifted(expected), CPU))
+
+
+@pytest.mark.parametrize("preset", ["balanced", "paper"])
+def test_a_view_off_the_map_is_lost_and_keeps_its_start(dataset, preset):
+    system = processed(dataset, 1, preset=preset)
+    pixels = sample_frame(dataset[1], dataset.camera, system.config)
+    away = dataset.poses()[0]
+    away[:3, 3] += 50
+    start = pose_tensor(away, CPU)
+    result = system.tracker.track(system.state.scene, pixels, start, 1)
+    assert result.lost
+    assert result.inlier_share < 0.1
+    torch.testing.assert_close(result.pose, start)
+
+
+@pytest.mark.parametrize("preset", ["balanced", "paper"])
+def test_a_frame_near_the_map_is_found(dataset, preset):
+    system = processed(dataset, 1, preset=preset)
+    pixels = sample_frame(dataset[1], dataset.camera, system.config)
+    result = system.tracker.track(system.state.scene, pixels, pose_tensor(dataset.poses()[1], CPU), 1)
+    assert not result.lost
+    assert result.inlier_share > 0.5
+    assert result.residual_cm < 2
+    assert np.linalg.norm(result.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
+
+
+def test_little_depth_is_lost_without_a_try(dataset):
+    system = processed(dataset, 1)
+    frame = dataset[1]
+    frame.depth[2:] = 0
+    pixels = sample_frame(frame, dataset.camera, system.config)
+    result = system.tracker.track(system.state.scene, pixels, pose_tensor(frame.pose, CPU), 1)
+    assert result.lost
+    assert result.iterations == 0
+    assert np.isnan(result.residual_cm)
+
+
+def test_tracking_leaves_the_map_alone(dataset):
+    system = processed(dataset, 1, preset="paper")
+    before = {name: tensor.clone() for name, tensor in system.state.scene.state_dict().items()}
+    pixels = sample_frame(dataset[1], dataset.camera, system.config)
+    system.tracker.track(system.state.scene, pixels, pose_tensor(dataset.poses()[1], CPU), 1)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in system.state.scene.state_dict().items())
+
+
+def test_a_lost_frame_does_not_touch_the_map(dataset):
+    system = processed(dataset, 5)
+    before, voxels = system.state.scene.volume.embeddings.clone(), system.state.scene.volume.num_voxels
+    frame = dataset[5]
+    frame.depth[:] = 0
+    assert system.process(frame).mapping_iterations == 0
+    assert system.state.scene.volume.num_voxels == voxels
+    assert torch.equal(system.state.scene.volume.embeddings, before)
+    assert not system.state.usable[5]
+    assert system.state.unmapped
+
+
+def test_the_first_pose_is_held_and_others_move(dataset):
+    system = processed(dataset, 6, "mapping.every=100", "mapping.pose_rate=0.001")
+    before = system.state.frames.poses.clone()
+    system.mapper.optimize(system.state, 3)
+    after = system.state.frames.poses
+    assert torch.equal(after[0], before[0])
+    assert (after[1:] != before[1:]).any(1).all()
+    torch.testing.assert_close(after[:, :4].norm(dim=1), torch.ones(6))
+
+
+def test_poses_stay_where_they_are_not_optimised(dataset):
+    system = processed(dataset, 4, "mapping.every=100", preset="fast")
+    before = system.state.frames.poses.clone()
+    geometry, texels = system.state.scene.volume.embeddings.clone(), system.state.scene.planes.texels.clone()
+    assert system.mapper.optimize(system.state, 2) is not None
+    assert torch.equal(system.state.frames.poses, before)
+    assert torch.equal(system.state.scene.volume.embeddings, geometry)
+    assert not torch.equal(system.state.scene.planes.texels, texels)
+
+
+def test_nothing_to_optimise_is_no_error(dataset):
+    system = SlamSystem(settings(), dataset.camera)
+    assert system.mapper.optimize(system.state, 5) is None
+    system.process(dataset[0])
+    assert system.mapper.optimize(system.state, 0) is None
+
+
+def test_moments_follow_the_map_as_it_grows(dataset):
+    system = processed(dataset, 1, "mapping.reset_moments=false")
+    state = system.state
+    layout, texels = list(state.scene.planes.layout), state.scene.planes.texels.clone()
+    first, touched = state.moments["texels"].first.clone(), state.moments["texels"].stamps.clone()
+    far = dataset[1]
+    pixels = sample_frame(far, dataset.camera, system.config)
+    pose = dataset.poses()[0]
+    pose[:3, 3] -= 3
+    state.frames.append(pose_tensor(pose, CPU), 0.1, 1, False, pixels.lattice)
+    state.pixels.add(pixels.records)
+    voxels = state.scene.volume.num_voxels
+    system.mapper.integrate(state, pixels)
+    assert state.scene.planes.layout != layout
+    assert state.scene.volume.num_voxels > voxels
+    for old, new in ((texels, state.scene.planes.texels), (first, state.moments["texels"].first)):
+        for plane in range(3):
+            row, u, v, size_u, size_v = layout[5 * plane : 5 * plane + 5]
+            new_row, new_u, new_v, new_size_u, new_size_v = state.scene.planes.layout[5 * plane : 5 * plane + 5]
+            grid = new[new_row : new_row + new_size_u * new_size_v].view(new_size_u, new_size_v, -1)
+            kept = grid[u - new_u : u - new_u + size_u, v - new_v : v - new_v + size_v]
+            assert torch.equal(kept.reshape(size_u * size_v, -1), old[row : row + size_u * size_v])
+    assert len(state.moments["texels"].stamps) == len(state.scene.planes.texels)
+    assert (state.moments["texels"].stamps > 0).sum() == (touched > 0).sum()
+    system.mapper.optimize(state, 1)
+    assert len(state.moments["embeddings"].first) >= state.scene.volume.num_voxels
+
+
+@pytest.mark.parametrize(("reset", "expected"), [("true", 2), ("false", 6)])
+def test_moments_start_anew_where_told_so(dataset, reset, expected):
+    system = processed(dataset, 1, f"mapping.reset_moments={reset}", "mapping.first_iterations=4")
+    system.mapper.optimize(system.state, 2)
+    assert system.state.steps == expected
+    assert system.state.stamp == 6
+
+
+def test_gradients_are_spent_after_an_iteration(dataset):
+    system = processed(dataset, 1)
+    assert not any(moments.gradient.any() for moments in system.state.moments.values())
+
+
+def test_moments_grow_with_zeros():
+    moments = Moments.like(torch.ones(4, 2))
+    moments.first += 1
+    moments.fit(5)
+    assert len(moments.first) == len(moments.stamps) >= 5
+    assert moments.first[:4].eq(1).all()
+    assert not moments.first[4:].any()
+
+
+def test_a_state_without_frames_is_usable_for_nothing(dataset):
+    state = SlamState.start(settings(), dataset.camera, np.eye(4), None, CPU)
+    assert state.usable.shape == (0,)
