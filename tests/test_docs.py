@@ -13,6 +13,16 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 
+def python_blocks(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("block", python_blocks(ROOT / "README.md") + python_blocks(ROOT / "docs" / "configuration.md"))
+def test_examples_run(tmp_path, monkeypatch, block):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, "example", "exec"), {})
+
+
 def generator():
     spec = importlib.util.spec_from_file_location("generate_configuration", ROOT / "docs" / "generate_configuration.py")
     module = importlib.util.module_from_spec(spec)

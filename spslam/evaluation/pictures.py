@@ -59,11 +59,12 @@ def overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """
     right, up, back = _axes(poses)
     low, high = np.percentile(mesh.vertices, (1, 99), axis=0)
-    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    center = (low + high) / 2
     away = np.cos(_ELEVATION) * back + np.sin(_ELEVATION) * up
     down = np.cross(-away, right)
     pose = pose_from(np.stack([right, down, -away], axis=1), center)
-    distance = _fitting_distance(mesh.vertices, pose, low, high, radius)
+    inside = mesh.vertices[np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)][::7]
+    distance = _fitting_distance(np.concatenate([inside, poses[:, :3, 3]]), pose)
     pose[:3, 3] = center + distance * away
     picture, _ = render_mesh(mesh.vertices, faces, mesh.colors, _OVERVIEW, pose, cull_back=True, supersampling=2)
     path = _OVERVIEW.project((poses[:, :3, 3] - pose[:3, 3]) @ pose[:3, :3])
@@ -99,13 +100,8 @@ def _cropped(picture: np.ndarray, margin: int = 20) -> np.ndarray:
     return np.ascontiguousarray(picture[top : rows[-1] + margin, left : columns[-1] + margin])
 
 
-def _fitting_distance(
-    vertices: np.ndarray, pose: np.ndarray, low: np.ndarray, high: np.ndarray, radius: float
-) -> float:
-    """How far back the overview must stand to hold the vertices within the bounds."""
-    inside = vertices[np.all((vertices >= low) & (vertices <= high), axis=1)][::7]
-    if not len(inside):
-        return 3 * max(radius, 0.1)
-    x, y, z = ((inside - pose[:3, 3]) @ pose[:3, :3]).T
+def _fitting_distance(points: np.ndarray, pose: np.ndarray) -> float:
+    """How far back from ``pose`` the overview's camera must stand to hold all points [N,3] in view."""
+    x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     half_width, half_height = 0.46 * _OVERVIEW.width / _OVERVIEW.fx, 0.46 * _OVERVIEW.height / _OVERVIEW.fy
     return float(max((np.abs(x) / half_width - z).max(), (np.abs(y) / half_height - z).max(), 0.1))

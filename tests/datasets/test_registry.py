@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from spslam.datasets import dataset_types, open_dataset
+from spslam.datasets import dataset_types, open_dataset, open_sequence
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
 from tests.datasets.layouts import (
@@ -71,3 +71,23 @@ def test_errors():
         open_dataset(SimpleNamespace(type="tum"))
     with pytest.raises(DatasetError, match="nowhere: no such folder"):
         open_dataset(SimpleNamespace(type="tum"), "nowhere")
+
+
+def test_sequence_is_the_part_asked_for(tmp_path):
+    write_seven_scenes(tmp_path / "scene", count=6)
+    config = SimpleNamespace(type="7scenes")
+    assert len(open_sequence(config, tmp_path / "scene")) == 6
+    assert len(open_sequence(config, tmp_path / "scene", slice(1, None, 2))) == 3
+    with pytest.raises(DatasetError, match="frames must select at least one of 0..5, got 6:9:1"):
+        open_sequence(config, tmp_path / "scene", slice(6, 9))
+
+
+def test_sequence_may_begin_with_a_broken_frame_but_not_be_broken_throughout(tmp_path):
+    write_seven_scenes(tmp_path / "scene", count=2)
+    config = SimpleNamespace(type="7scenes")
+    first, second = sorted((tmp_path / "scene" / "seq-01").glob("*.depth.png"))
+    first.write_bytes(b"")
+    assert len(open_sequence(config, tmp_path / "scene")) == 2
+    second.write_bytes(b"")
+    with pytest.raises(DatasetError, match="no frame can be read; the first: .*frame-000000.depth.png"):
+        open_sequence(config, tmp_path / "scene")
