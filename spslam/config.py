@@ -64,6 +64,8 @@ def dump_config(config: Config, header: Mapping[str, Any] | None = None) -> str:
 def resolve_config_path(path: str | os.PathLike) -> Path:
     """The file that a path or a shipped configuration's name stands for; ``configs/NAME.yaml`` is found anywhere."""
     given = Path(path)
+    if str(given) in config_names():  # though there may be a folder of that name, say the data's
+        return _config_dir() / f"{given}.yaml"
     if given.is_file():
         return given
     if given.is_dir():

@@ -68,7 +68,6 @@ class SceneOptions(Section):
     voxel_size_m: float = _option("edge of a voxel of the sparse volume", "m", gt=0, le=1)
     truncation_m: float = _option("truncation distance tr of the signed distance", "m", gt=0, le=4)
     plane_cell_m: float = _option("edge of a cell of the feature planes", "m", gt=0, le=4)
-    plane_channels: Literal[32] = _option("channels of a feature plane; the kernels are built for 32", "channels")
     position_scale: float = _option("factor from metres to the position the geometry decoder is given", "1/m", gt=0)
     first_pose: Literal["dataset", "identity"] = _text(
         "pose of the first frame: the data set's where it has one, or the identity"

@@ -79,6 +79,8 @@ def test_dump_reads_back_equal(tmp_path, preset):
 def test_shipped_configuration_is_found_by_name_and_by_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert resolve_config_path("7scenes") == resolve_config_path("configs/7scenes.yaml")
+    (tmp_path / "7scenes").mkdir()
+    assert load_config("7scenes").dataset.type == "7scenes"
     (tmp_path / "7scenes.yaml").write_text("dataset: {type: tum}")
     assert load_config("7scenes.yaml").dataset.type == "tum"
 

@@ -49,6 +49,8 @@ def test_run_leaves_all_files_and_says_where(finished):
     metrics = json.loads((folder / "out" / "metrics.json").read_text())
     assert metrics["frames"] == 8
     assert metrics["ate_rmse_cm"] < 3
+    page = (ROOT / "docs" / "outputs.md").read_text()
+    assert not [key for key in metrics if f"`{key}`" not in page]
 
 
 def test_kept_configuration_is_the_one_that_ran(finished):
