@@ -1,34 +1,48 @@
-# `make dev` builds the kernels in place; `make test` builds them and runs the tests; `make help` lists the rest.
-PYTHON ?= python
-JOBS ?= 2
+# `make demo` and `make test` set up everything they need in .venv; `make help` lists the rest.
+# PYTHON=... uses an environment of your own instead, in which `pip install -e '.[dev]'` was done.
+TORCH ?= 2.13.0
+JOBS ?= $(shell nproc)
 SPSLAM_CUDA ?= OFF
 CUDA_ARCHS ?= 90-real
-# This machine's best instruction set is all that development needs.
-ISA := $(shell $(PYTHON) -c "import torch; print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(torch.backends.cpu.get_cpu_capability(), 'baseline'))")
 
-.PHONY: help dev test test-gpu lint demo
+ifeq ($(origin PYTHON), undefined)
+PYTHON := .venv/bin/python
+ENVIRONMENT := .venv/ready
+endif
+# This machine's best instruction set is all that development needs.
+NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
+  print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
+
+.PHONY: help demo test test-gpu dev lint
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
-dev: ## build the kernels in place for this machine
-	cmake -S . -B build/dev-$(SPSLAM_CUDA) -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR) -DSPSLAM_CUDA=$(SPSLAM_CUDA) \
-	  -DSPSLAM_CUDA_ARCHS="$(CUDA_ARCHS)" -DSPSLAM_CPU_ISAS=$(ISA) \
-	  -DSPSLAM_TORCH_DIR=$$($(PYTHON) -c "import importlib.util as u; print(u.find_spec('torch').submodule_search_locations[0])")
-	cmake --build build/dev-$(SPSLAM_CUDA) -j $(JOBS)
-	cmake --install build/dev-$(SPSLAM_CUDA) > /dev/null
+demo: dev ## track and map a generated room with known truth, into runs/demo
+	$(PYTHON) -m spslam.cli.main demo
 
 test: dev ## build, then run the tests on the CPU
 	$(PYTHON) -m pytest
 
-test-gpu: ## run the tests on a CUDA device, against the installed or in-place build
+test-gpu: ## run the tests that need a CUDA device, with the kernels that are there
 	$(PYTHON) -m pytest -m cuda
 
-lint: ## style and types
+dev: $(ENVIRONMENT) ## build the kernels in place for this machine; SPSLAM_CUDA=ON for CUDA too
+	PATH="$(dir $(abspath $(PYTHON))):$$PATH" cmake -S . -B build/dev-$(SPSLAM_CUDA) -G Ninja \
+	  -DCMAKE_INSTALL_PREFIX=$(CURDIR) -DSPSLAM_CUDA=$(SPSLAM_CUDA) -DSPSLAM_CUDA_ARCHS="$(CUDA_ARCHS)" \
+	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
+	PATH="$(dir $(abspath $(PYTHON))):$$PATH" cmake --build build/dev-$(SPSLAM_CUDA) -j $(JOBS)
+	PATH="$(dir $(abspath $(PYTHON))):$$PATH" cmake --install build/dev-$(SPSLAM_CUDA) > /dev/null
+
+lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	clang-format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh')
+	$(PYTHON) -m clang_format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh')
 	$(PYTHON) -m mypy
 
-demo: dev ## a generated room with known truth, into runs/demo
-	$(PYTHON) -m spslam.cli.main demo
+# torch first and pinned: a plain 'torch' may bring gigabytes of CUDA libraries.
+.venv/ready: pyproject.toml
+	python3 -m venv .venv
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check torch==$(TORCH) setuptools
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check $$(.venv/bin/python cmake/requirements.py dev)
+	touch $@

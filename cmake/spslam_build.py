@@ -38,3 +38,7 @@ def get_requires_for_build_wheel(config_settings=None):
 
 def get_requires_for_build_editable(config_settings=None):
     return _setuptools.get_requires_for_build_editable(config_settings) + _torch_requirement()
+
+
+if __name__ == "__main__":
+    print(torch_dir() or "")

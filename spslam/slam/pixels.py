@@ -35,6 +35,11 @@ class FramePixels:
     lattice: torch.Tensor
     valid_share: float
 
+    def to(self, device: torch.device) -> "FramePixels":
+        """The same on another device."""
+        on_device = (tensor.to(device, non_blocking=True) for tensor in (self.records, self.normals, self.lattice))
+        return FramePixels(*on_device, self.valid_share)
+
 
 def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixels:
     """Draws `pixels.per_frame` pixels with valid depth, with replacement, and finds their normals.

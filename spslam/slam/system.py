@@ -107,6 +107,7 @@ class SlamSystem:
         """
         if pixels is None:
             pixels = sample_frame(frame, self.camera, self.config)
+        pixels = pixels.to(self.device)
         number = len(self.state.frames)
         tracked, tracking_ms = _timed(lambda: self._track(pixels, number))
         self.state.frames.append(tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice)
