@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 SECONDS_BETWEEN_LINES = 5.0
 
 
-def make_progress(quiet: bool) -> Callable[[int, int, Any], None] | None:
+def make_progress(quiet: bool) -> ProgressBar | ProgressLines | None:
     """A callback for ``run_sequence``: a bar on a terminal, a line every few seconds elsewhere, None if quiet."""
     if quiet:
         return None
@@ -31,10 +32,15 @@ class ProgressBar:
             bar = (
                 "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
             )
-            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", file=sys.stderr, bar_format=bar)
+            # Some terminals say that they have no columns; a bar for them would be empty.
+            columns = shutil.get_terminal_size().columns
+            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", ncols=columns, bar_format=bar)
         self._bar.set_postfix_str(describe(report), refresh=False)
         self._bar.update(done - self._bar.n)
-        if done == total:
+
+    def close(self) -> None:
+        """End the line, so that what is printed next stands on its own."""
+        if self._bar is not None:
             self._bar.close()
 
 
@@ -54,6 +60,9 @@ class ProgressLines:
         print(
             f"{done}/{total} frames, {self._rate.fps():.1f} frames/s, {describe(report)}", file=sys.stderr, flush=True
         )
+
+    def close(self) -> None:
+        """Nothing is left open."""
 
 
 class Rate:

@@ -47,12 +47,16 @@ def run(config: Config, output: Path, frames: slice | None, resume: bool, mesh: 
 
     from spslam.slam.run import run_sequence
 
+    progress = make_progress(quiet)
     try:
-        return run_sequence(config, data, output, frames, resume, mesh, make_progress(quiet))
+        return run_sequence(config, data, output, frames, resume, mesh, progress)
     except KeyboardInterrupt:
         if (output / "checkpoint.safetensors").is_file():
             raise KeyboardInterrupt(f"the same command with --output {output} --resume goes on") from None
         raise
+    finally:
+        if progress is not None:
+            progress.close()
 
 
 def default_output(config: str) -> Path:
