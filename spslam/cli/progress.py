@@ -32,9 +32,10 @@ class ProgressBar:
             bar = (
                 "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
             )
-            # Some terminals say that they have no columns; a bar for them would be empty.
-            columns = shutil.get_terminal_size().columns
-            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", ncols=columns, bar_format=bar)
+            # Some terminals say that they are 0 by 0; a bar for them would be empty.
+            columns, rows = shutil.get_terminal_size()
+            size = {"ncols": columns, "nrows": rows}
+            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", bar_format=bar, **size)
         self._bar.set_postfix_str(describe(report), refresh=False)
         self._bar.update(done - self._bar.n)
 

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from spslam.cli.progress import ProgressLines, summarize
+from spslam.cli.progress import ProgressBar, ProgressLines, summarize
 from spslam.config import load_config
 from tests.cli.command import ROOT, assert_refused, spslam
 
@@ -144,6 +144,18 @@ def test_progress_without_a_terminal_is_lines(capsys):
     lines(3, 3, Report())
     error = capsys.readouterr().err
     assert re.fullmatch(r"3/3 frames, [\d.]+ frames/s, ok, 0\.31 cm off, loss 0\.200\n", error)
+
+
+def test_progress_on_a_terminal_is_a_bar_that_ends_its_line(capsys):
+    bar = ProgressBar()
+    bar(4, 9, Report())  # a resumed run
+    time.sleep(0.2)  # tqdm draws ten times a second
+    bar(5, 9, Report())
+    bar.close()
+    error = capsys.readouterr().err
+    assert "| 5/9 [" in error
+    assert "frames/s, ok, 0.31 cm off, loss 0.200]" in error
+    assert error.endswith("\n")
 
 
 def test_summary_leaves_out_what_was_not_measured(tmp_path):
