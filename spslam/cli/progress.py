@@ -34,8 +34,7 @@ class ProgressBar:
             )
             # Some terminals say that they are 0 by 0; a bar for them would be empty.
             columns, rows = shutil.get_terminal_size()
-            size = {"ncols": columns, "nrows": rows}
-            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", bar_format=bar, **size)
+            self._bar = tqdm(total=total, initial=done - 1, unit=" frames", ncols=columns, nrows=rows, bar_format=bar)
         self._bar.set_postfix_str(describe(report), refresh=False)
         self._bar.update(done - self._bar.n)
 
