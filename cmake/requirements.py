@@ -1,6 +1,6 @@
-"""Prints the package's requirements, and those of the extras named as arguments, a line each: what pip has no option for.
+"""Prints the package's requirements, and those of the extras named, a line each: pip has no option for that.
 
-    python cmake/requirements.py dev
+python cmake/requirements.py dev
 """
 
 import pathlib

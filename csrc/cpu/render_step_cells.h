@@ -40,9 +40,9 @@ inline void sample_keys(const Ray& ray, float inverse_voxel, const float* depths
     const float y = std::floor((o.y + depths[s] * d.y) * inverse_voxel);
     const float z = std::floor((o.z + depths[s] * d.z) * inverse_voxel);
     const bool inside = (x >= kLow) & (x <= kHigh) & (y >= kLow) & (y <= kHigh) & (z >= kLow) & (z <= kHigh);
-    const std::int64_t key = pack_voxel({static_cast<std::int32_t>(inside ? x : 0.0f),
-                                         static_cast<std::int32_t>(inside ? y : 0.0f),
-                                         static_cast<std::int32_t>(inside ? z : 0.0f)});
+    const std::int64_t key =
+        pack_voxel({static_cast<std::int32_t>(inside ? x : 0.0f), static_cast<std::int32_t>(inside ? y : 0.0f),
+                    static_cast<std::int32_t>(inside ? z : 0.0f)});
     keys[s] = inside ? key : kEmptyVoxelKey;
   }
 }

@@ -63,8 +63,7 @@ inline void supervise_samples(const LossWeights& scale, float truncation, Ray& r
     const float free = target.free ? free_space_residual(sdf) : 0.0f;
     ray.losses.sdf += near_scale * near * near;
     ray.losses.free_space += free_scale * free * free;
-    chunk.grad_sdf[i] =
-        2.0f * (scale.sdf * near_scale * truncation * near + scale.free_space * free_scale * free);
+    chunk.grad_sdf[i] = 2.0f * (scale.sdf * near_scale * truncation * near + scale.free_space * free_scale * free);
   }
 }
 

@@ -37,8 +37,7 @@ class FramePixels:
 
     def to(self, device: torch.device) -> "FramePixels":
         """The same on another device."""
-        on_device = (tensor.to(device, non_blocking=True) for tensor in (self.records, self.normals, self.lattice))
-        return FramePixels(*on_device, self.valid_share)
+        return FramePixels(self.records.to(device), self.normals.to(device), self.lattice.to(device), self.valid_share)
 
 
 def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixels:

@@ -34,8 +34,8 @@ GRADIENTS = dict(
 LOSS_TOLERANCE = dict(rtol=2e-5, atol=1e-7)
 # Of gradients, as a share of the largest element: float32 sums of some thousand terms with cancellation.
 ELEMENT_TOLERANCE = 1e-3
-# The step on CUDA adds in another order than the reference, so a hidden unit, cell face or threshold within rounding of a
-# sample may fall on the other side: one sample in some draws, which is 1.5 % of an element. As shares of the largest
+# The step on CUDA adds in another order than the reference, so a hidden unit, cell face or threshold within rounding of
+# a sample may fall on the other side: one sample in some draws, which is 1.5 % of an element. As shares of the largest
 # element and of the norm.
 CUDA_ELEMENT_TOLERANCE, CUDA_NORM_TOLERANCE = 0.03, 0.02
 
