@@ -98,8 +98,9 @@ def extract_mesh(
         scene: the map. Not changed.
         resolution_m: edge wanted for the cubes, see `extract_surface`.
         camera: of the views that `poses` tells of.
-        poses: float [F, 4, 4] T_world_camera, the trajectory. Where given, with the camera, surface that no view has
-            seen from the front is dropped: second sheets behind walls, and what grew beyond the pictures' borders.
+        poses: float [F, 4, 4] T_world_camera, the trajectory. Where given, with the camera, and not empty, surface that
+            no view has seen from the front is dropped: second sheets behind walls, and what grew beyond the pictures'
+            borders.
         min_support: surface is dropped where the fusion weight is below this share of the largest one within a voxel
             around, as on the lips behind depth edges. 0 keeps everything.
         min_part_faces: connected parts of fewer faces are dropped.
@@ -124,7 +125,7 @@ def extract_mesh(
         faces = faces[face_support(volume, points, faces, CHUNK_POINTS) >= min_support]
     vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
     normals = vertex_normals(vertices, kept)
-    if camera is not None and poses is not None:
+    if camera is not None and poses is not None and len(poses):
         kept = kept[faced_by_a_camera(vertices, normals, kept, camera, poses)]
     kept = kept[in_large_part(kept, len(vertices), min_part_faces)]
     kept, used = compact(kept, len(vertices))

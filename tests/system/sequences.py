@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from spslam.config import Config, load_config
+from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.generated import GeneratedDataset
-from spslam.slam import run as run_module
 from spslam.slam.run import run_sequence
 from tests.datasets.layouts import matrix_text, write_color, write_depth
 
@@ -62,7 +62,7 @@ def settings(*overrides: str, preset: str | None = None) -> Config:
 def run_on(monkeypatch, dataset: RgbdDataset, output: Path, *overrides: str, **arguments) -> dict:
     """`run_sequence` over a data set made by a test; returns the metrics."""
     config = settings(*overrides, preset=arguments.pop("preset", None))
-    monkeypatch.setattr(run_module, "open_dataset", lambda *_: dataset)
+    monkeypatch.setattr(registry, "open_dataset", lambda *_: dataset)
     return run_sequence(config, None, output, mesh=arguments.pop("mesh", False), **arguments)
 
 

@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
 from spslam.slam import run as run_module
 from spslam.slam.run import run_sequence
@@ -217,7 +218,7 @@ def test_other_frames_of_the_same_number_are_refused(monkeypatch, interrupted):
 
 
 def test_another_folder_is_refused(monkeypatch, interrupted, tmp_path):
-    monkeypatch.setattr(run_module, "open_dataset", lambda *_: Recorded(8))
+    monkeypatch.setattr(registry, "open_dataset", lambda *_: Recorded(8))
     with pytest.raises(OutputError, match="belongs to a run over other data"):
         run_sequence(settings(), tmp_path, interrupted, resume=True, mesh=False)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from spslam.camera import Camera
+from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError, OutputError, SpslamError
 from spslam.scene import Scene
@@ -48,7 +49,7 @@ def test_unreadable_frame_is_skipped_and_counted(monkeypatch, tmp_path):
 
 
 def test_no_readable_frame_is_one_line(monkeypatch, tmp_path):
-    with pytest.raises(DatasetError, match="no frame could be read; the first: frame-000000.color.png: can't be read"):
+    with pytest.raises(DatasetError, match="no frame can be read; the first: frame-000000.color.png: can't be read"):
         run_on(monkeypatch, Recorded(3, unreadable(0, 1, 2)), tmp_path / "out")
 
 
@@ -212,7 +213,7 @@ def test_tiny_images_work(monkeypatch, tmp_path):
 
 
 def test_every_nth_frame(monkeypatch, tmp_path):
-    monkeypatch.setattr(run_module, "open_dataset", lambda *_: Recorded(9))
+    monkeypatch.setattr(registry, "open_dataset", lambda *_: Recorded(9))
     metrics = run_module.run_sequence(settings(), None, tmp_path / "out", slice(1, None, 3), mesh=False)
     found = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt")
     assert metrics["frames"] == 3
