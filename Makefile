@@ -9,6 +9,8 @@ ifeq ($(origin PYTHON), undefined)
 PYTHON := .venv/bin/python
 ENVIRONMENT := .venv/ready
 endif
+# Commands that come with the environment are looked for beside its Python first.
+RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 # This machine's best instruction set is all that development needs.
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
@@ -28,16 +30,16 @@ test-gpu: ## run the tests that need a CUDA device, with the kernels that are th
 	$(PYTHON) -m pytest -m cuda
 
 dev: $(ENVIRONMENT) ## build the kernels in place for this machine; SPSLAM_CUDA=ON for CUDA too
-	PATH="$(dir $(abspath $(PYTHON))):$$PATH" cmake -S . -B build/dev-$(SPSLAM_CUDA) -G Ninja \
+	$(RUN) cmake -S . -B build/dev-$(SPSLAM_CUDA) -G Ninja \
 	  -DCMAKE_INSTALL_PREFIX=$(CURDIR) -DSPSLAM_CUDA=$(SPSLAM_CUDA) -DSPSLAM_CUDA_ARCHS="$(CUDA_ARCHS)" \
 	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
-	PATH="$(dir $(abspath $(PYTHON))):$$PATH" cmake --build build/dev-$(SPSLAM_CUDA) -j $(JOBS)
-	PATH="$(dir $(abspath $(PYTHON))):$$PATH" cmake --install build/dev-$(SPSLAM_CUDA) > /dev/null
+	$(RUN) cmake --build build/dev-$(SPSLAM_CUDA) -j $(JOBS)
+	$(RUN) cmake --install build/dev-$(SPSLAM_CUDA) > /dev/null
 
 lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	$(PYTHON) -m clang_format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh')
+	$(RUN) clang-format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh')
 	$(PYTHON) -m mypy
 
 # torch first and pinned: a plain 'torch' may bring gigabytes of CUDA libraries.
