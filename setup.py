@@ -37,7 +37,8 @@ class CMakeBuild(build_ext):
         arguments = [f"-DSPSLAM_TORCH_DIR={torch}", f"-DCMAKE_INSTALL_PREFIX={destination}"]
         arguments += [f"-D{name}={os.environ[name]}" for name in OPTIONS if os.environ.get(name)]
         arguments += shlex.split(os.environ.get("CMAKE_ARGS", ""))
-        subprocess.check_call(["cmake", "-S", str(source), "-B", str(build), "-G", "Ninja", *arguments])
+        # --fresh: what an earlier build found (ninja, torch) lay in pip's temporary environment, and is gone.
+        subprocess.check_call(["cmake", "--fresh", "-S", str(source), "-B", str(build), "-G", "Ninja", *arguments])
         jobs = os.environ.get("MAX_JOBS") or os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL")
         subprocess.check_call(["cmake", "--build", str(build), *(["-j", jobs] if jobs else [])])
         subprocess.check_call(["cmake", "--install", str(build)])
