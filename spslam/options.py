@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 PresetName = Literal["paper", "balanced", "fast"]
-DatasetType = Literal["generated", "7scenes", "tum", "replica", "synthetic_rgbd", "folder"]
+DatasetType = Literal["generated", "7scenes", "tum", "replica", "synthetic_rgbd", "scannet", "folder"]
 PRESETS: tuple[str, ...] = get_args(PresetName)
 DATASET_TYPES: tuple[str, ...] = get_args(DatasetType)
 
@@ -46,6 +46,7 @@ class DatasetOptions(Section):
     stride: int = _option("use every n-th frame", "frames", ge=1)
     min_depth_m: float = _option("depth nearer than this counts as not measured", "m", ge=0)
     max_depth_m: float = _option("depth farther than this counts as not measured", "m", gt=0, le=1000)
+    border_px: int = _option("depth this close to the image's border counts as not measured", "px", ge=0, le=1000)
     sequence: str | int | None = _text("7scenes: the sequence, `seq-03` or 3; null is the first that is there")
     depth_variant: Literal["filtered", "exact"] | None = _text(
         "synthetic_rgbd: the noisy depth or the exact one; null is the noisy one where it is there"

@@ -39,13 +39,14 @@ class RgbdDataset(ABC):
     """A sequence of frames of one camera, read one at a time and from any thread.
 
     ``dataset[i]`` reads frame i (0 <= i < len) and checks it: raises IndexError outside the range and
-    DatasetError, naming the file, for a frame that can't be used. Depth outside ``depth_range`` (metres) comes
-    as 0. Reading the same frame again gives the same values.
+    DatasetError, naming the file, for a frame that can't be used. Depth outside ``depth_range`` (metres) and within
+    ``border_px`` pixels of the image's border comes as 0. Reading the same frame again gives the same values.
     """
 
     name: str
     camera: Camera
     depth_range: tuple[float, float] = (0.0, float("inf"))
+    border_px: int = 0
 
     @abstractmethod
     def __len__(self) -> int:
@@ -74,6 +75,7 @@ class RgbdDataset(ABC):
         frame = self.read(index)
         self._check_sizes(frame)
         _clear_depth_outside(frame.depth, *self.depth_range)
+        _clear_border(frame.depth, self.border_px)
         return frame
 
     def __iter__(self) -> Iterator[RgbdFrame]:
@@ -120,6 +122,7 @@ class Subset(RgbdDataset):
         self.name = dataset.name
         self.camera = dataset.camera
         self.depth_range = dataset.depth_range
+        self.border_px = dataset.border_px
 
     @property
     def source(self) -> RgbdDataset:
@@ -157,6 +160,12 @@ def _clear_depth_outside(depth: np.ndarray, nearest: float, farthest: float) -> 
         cv2.threshold(depth, np.nextafter(np.float32(nearest), np.float32(0)), 0, cv2.THRESH_TOZERO, dst=depth)
     if farthest < float("inf"):
         cv2.threshold(depth, farthest, 0, cv2.THRESH_TOZERO_INV, dst=depth)
+
+
+def _clear_border(depth: np.ndarray, width: int) -> None:
+    if width > 0:
+        depth[:width] = depth[-width:] = 0
+        depth[:, :width] = depth[:, -width:] = 0
 
 
 def _size(shape: tuple[int, ...]) -> str:

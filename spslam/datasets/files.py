@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,8 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
-from spslam.datasets.images import read_color, read_depth
+from spslam.datasets.images import read_color, read_depth, resized_color
+from spslam.datasets.text import read_pose
 from spslam.errors import DatasetError
 
 
@@ -54,6 +55,7 @@ class FileDataset(RgbdDataset):
     true_poses : float64 [F,4,4], NaN where unknown, or None.
     units_per_metre, invalid_depth : see :func:`spslam.datasets.images.read_depth`.
     undistortion : applied to each colour image.
+    resize_color : bring each colour image to its depth image's size.
     """
 
     name: str
@@ -63,7 +65,9 @@ class FileDataset(RgbdDataset):
     units_per_metre: float | None
     invalid_depth: Sequence[int] = ()
     undistortion: Undistortion | None = None
+    resize_color: bool = False
     depth_range: tuple[float, float] = field(default=(0.0, float("inf")))
+    border_px: int = 0
 
     def __post_init__(self) -> None:
         if self.true_poses is not None and not np.isfinite(self.true_poses).any():
@@ -86,6 +90,8 @@ class FileDataset(RgbdDataset):
         depth = read_depth(paths.depth, self.units_per_metre, self.invalid_depth)
         if self.undistortion is not None:
             color = self.undistortion(color)
+        if self.resize_color:
+            color = resized_color(color, depth.shape[1], depth.shape[0])
         return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index))
 
     def describe(self, index: int) -> str:
@@ -142,3 +148,22 @@ def pair_numbered(
         timestamp = (number - numbers[0]) / frames_per_second
         frames[number] = FramePaths(color or depth, depth or color, timestamp, fault)  # type: ignore[arg-type]
     return frames
+
+
+def attach_poses(
+    frames: Mapping[int, FramePaths], pose_path: Callable[[int], Path]
+) -> tuple[list[FramePaths], np.ndarray]:
+    """The frames in order, and their poses [F,4,4] from a file each; NaN where the file is missing or says so.
+
+    A frame whose pose file is malformed becomes one with a fault.
+    """
+    poses = np.full((len(frames), 4, 4), np.nan)
+    attached = []
+    for row, (number, frame) in enumerate(frames.items()):
+        path = pose_path(number)
+        try:
+            poses[row] = read_pose(path) if path.is_file() else np.nan
+        except DatasetError as error:
+            frame = replace(frame, fault=frame.fault or str(error))
+        attached.append(frame)
+    return attached, poses

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -20,7 +20,12 @@ def read_color(path: Path) -> np.ndarray:
 
     A rotation noted in EXIF is ignored: the depth image beside it isn't rotated either. Raises DatasetError.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return decode_color(_read_bytes(path), path.suffix, str(path))
+
+
+def decode_color(content: bytes, suffix: str, name: str) -> np.ndarray:
+    """As :func:`read_color` from an image file's bytes; ``suffix`` says which kind, ``name`` is what errors name."""
+    image = _decode(content, suffix, name, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
@@ -38,12 +43,20 @@ def read_depth(path: Path, units_per_metre: float | None, invalid: Sequence[int]
     DatasetError
         For a file that is missing, truncated, not an image, or of another kind (8-bit, several channels).
     """
-    stored = _load_array(path) if path.suffix == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    if path.suffix == ".npy":
+        stored = _load_array(path)
+    else:
+        stored = _decode(_read_bytes(path), path.suffix, str(path), cv2.IMREAD_UNCHANGED)
     if stored.ndim != 2 or stored.dtype not in (np.uint16, np.float32, np.float64):
         channels = 1 if stored.ndim == 2 else stored.shape[-1]
         raise DatasetError(
             f"{path}: depth must be 16-bit or floating-point with one channel, got {stored.dtype} with {channels}"
         )
+    return depth_in_metres(stored, units_per_metre, invalid)
+
+
+def depth_in_metres(stored: np.ndarray, units_per_metre: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
+    """Stored depth [H,W], uint16 or floating-point, as float32 metres; arguments as for :func:`read_depth`."""
     if units_per_metre is None:
         units_per_metre = 1000.0 if stored.dtype == np.uint16 else 1.0
     depth = np.divide(stored, np.float32(units_per_metre), dtype=np.float32, casting="same_kind")
@@ -54,12 +67,12 @@ def read_depth(path: Path, units_per_metre: float | None, invalid: Sequence[int]
     return depth
 
 
-def first_size(paths: Iterable[Path]) -> tuple[int, int]:
-    """(width, height) of the first colour image that can be read; raises the first one's DatasetError if none."""
+def first_size(paths: Iterable[Path], read: Callable[[Path], np.ndarray] = read_color) -> tuple[int, int]:
+    """(width, height) of the first image that ``read`` can read; raises the first one's DatasetError if none."""
     first_error = None
     for path in paths:
         try:
-            height, width = read_color(path).shape[:2]
+            height, width = read(path).shape[:2]
         except DatasetError as error:
             first_error = first_error or error
         else:
@@ -67,18 +80,25 @@ def first_size(paths: Iterable[Path]) -> tuple[int, int]:
     raise first_error or DatasetError("first_size: paths must not be empty, got none")
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
-    content = _read_bytes(path)
-    mark = _END_MARKS.get(path.suffix.lower())
+def resized_color(color: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A colour image of the same view in another size; larger ones are averaged, smaller ones interpolated."""
+    if color.shape[:2] == (height, width):
+        return color
+    shrinks = color.shape[0] >= height and color.shape[1] >= width
+    return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def _decode(content: bytes, suffix: str, name: str, flags: int) -> np.ndarray:
+    mark = _END_MARKS.get(suffix.lower())
     # Checked beforehand because some versions of OpenCV return the half they could decode.
     if mark is not None and mark not in content[-_TAIL_BYTES:] and mark not in content[len(content) // 2 :]:
-        raise DatasetError(f"{path}: the image is truncated ({len(content)} bytes, no end mark)")
+        raise DatasetError(f"{name}: the image is truncated ({len(content)} bytes, no end mark)")
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except cv2.error as error:
-        raise DatasetError(f"{path}: can't be decoded as an image: {error.err}") from error
+        raise DatasetError(f"{name}: can't be decoded as an image: {error.err}") from error
     if image is None:
-        raise DatasetError(f"{path}: can't be decoded as an image")
+        raise DatasetError(f"{name}: can't be decoded as an image")
     return image
 
 

@@ -11,6 +11,7 @@ from spslam.datasets.base import RgbdDataset, Subset
 from spslam.datasets.folder import open_folder
 from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.replica import open_replica
+from spslam.datasets.scannet import open_scannet
 from spslam.datasets.seven_scenes import open_seven_scenes
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
 from spslam.datasets.tum import open_tum
@@ -23,9 +24,10 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
     Parameters
     ----------
     config : any object with the attribute ``type`` (one of :func:`dataset_types`) and, each optional or None:
-        ``path``, ``stride`` (every n-th frame), ``min_depth_m``, ``max_depth_m`` (depth outside comes as 0), and the
-        options of the kind: ``sequence`` (7scenes), ``depth_variant`` (synthetic_rgbd), ``depth_scale`` (folder),
-        ``frames``, ``width``, ``height``, ``noise``, ``seed`` (generated).
+        ``path``, ``stride`` (every n-th frame), ``min_depth_m``, ``max_depth_m`` (depth outside comes as 0),
+        ``border_px`` (so does depth this close to the image's border), and the options of the kind: ``sequence``
+        (7scenes), ``depth_variant`` (synthetic_rgbd), ``depth_scale`` (folder), ``frames``, ``width``, ``height``,
+        ``noise``, ``seed`` (generated).
     data_dir : the data's folder; overrides ``config.path``. Not needed by ``generated``.
 
     Raises
@@ -38,6 +40,7 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
         raise DatasetError(f"dataset.type must be one of {', '.join(dataset_types())}, got {config.type}")
     dataset = opener(config, _option(config, "path") if data_dir is None else data_dir)
     dataset.depth_range = (_option(config, "min_depth_m", 0.0), _option(config, "max_depth_m", float("inf")))
+    dataset.border_px = _option(config, "border_px", 0)
     stride = _option(config, "stride", 1)
     return dataset if stride == 1 else Subset(dataset, step=stride)
 
@@ -86,6 +89,10 @@ def _open_replica(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
     return open_replica(_folder(config, path))
 
 
+def _open_scannet(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    return open_scannet(_folder(config, path))
+
+
 def _open_folder(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
     return open_folder(_folder(config, path), _option(config, "depth_scale"))
 
@@ -101,6 +108,7 @@ _OPENERS: dict[str, Callable[[Any, str | os.PathLike | None], RgbdDataset]] = {
     "synthetic_rgbd": _open_synthetic_rgbd,
     "tum": _open_tum,
     "replica": _open_replica,
+    "scannet": _open_scannet,
     "folder": _open_folder,
     "generated": _open_generated,
 }

@@ -9,15 +9,12 @@ registered to each other by the data set's authors; both are taken as one camera
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, FramePaths, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import first_size
-from spslam.datasets.text import read_intrinsics_matrix, read_pose, read_rows
+from spslam.datasets.text import read_intrinsics_matrix, read_rows
 from spslam.errors import DatasetError
 
 INTRINSICS_FILE = "camera-intrinsics.txt"
@@ -54,7 +51,10 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
             "a scene holds them in seq-01, seq-02, ..."
         )
     camera = _find_camera(sequence_folder, list(colors.values()))
-    frames, poses = _attach_poses(sequence_folder, pair_numbered(colors, depths, FRAMES_PER_SECOND))
+    frames, poses = attach_poses(
+        pair_numbered(colors, depths, FRAMES_PER_SECOND),
+        lambda number: sequence_folder / f"frame-{number:06d}.pose.txt",
+    )
     name = f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}"
     return FileDataset(name, camera, frames, poses, units_per_metre=1000.0, invalid_depth=(65535,))
 
@@ -101,15 +101,3 @@ def _find_camera(sequence_folder: Path, colors: list[Path]) -> Camera:
             return read_intrinsics_matrix(folder / INTRINSICS_FILE, width, height)
     return _DEFAULT_CAMERA.resized(width, height)
 
-
-def _attach_poses(folder: Path, frames: dict[int, FramePaths]) -> tuple[list[FramePaths], np.ndarray]:
-    poses = np.full((len(frames), 4, 4), np.nan)
-    attached = []
-    for row, (number, frame) in enumerate(frames.items()):
-        path = folder / f"frame-{number:06d}.pose.txt"
-        try:
-            poses[row] = read_pose(path) if path.is_file() else np.nan
-        except DatasetError as error:
-            frame = replace(frame, fault=frame.fault or str(error))
-        attached.append(frame)
-    return attached, poses

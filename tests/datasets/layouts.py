@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -99,6 +101,64 @@ def write_tum(folder: Path, count: int = 5, depth_delay: float = 0.004) -> Path:
         truth.append(f"{start - 0.05 + 0.01 * i:.4f} " + " ".join(f"{value:.9f}" for value in numbers))
     (folder / "groundtruth.txt").write_text("\n".join(truth) + "\n")
     return folder
+
+
+def encoded(image: np.ndarray, suffix: str) -> bytes:
+    done, content = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    assert done
+    return content.tobytes()
+
+
+def sens_head(frames: int, color: int = 1, depth: int = 1, color_size=(WIDTH, HEIGHT), version: int = 4) -> bytes:
+    """The head of a .sens file with frames of the size of the others here."""
+    intrinsics = np.eye(4, dtype="<f4")
+    intrinsics[:3, :3] = CAMERA_MATRIX
+    name = b"StructureSensor"
+    return b"".join(
+        [
+            struct.pack("<IQ", version, len(name)),
+            name,
+            *(matrix.astype("<f4").tobytes() for matrix in (2 * intrinsics, np.eye(4), intrinsics, np.eye(4))),
+            struct.pack("<2i4If", color, depth, *color_size, WIDTH, HEIGHT, 1000.0),
+            struct.pack("<Q", frames),
+        ]
+    )
+
+
+def sens_frame(pose: np.ndarray, time_us: int, color: bytes, depth: bytes) -> bytes:
+    head = np.asarray(pose, dtype="<f4").tobytes() + struct.pack("<4Q", time_us, time_us + 5, len(color), len(depth))
+    return head + color + depth
+
+
+def zipped_depth(index: int) -> bytes:
+    return zlib.compress(np.round(1000 * depth_metres(index)).astype("<u2").tobytes())
+
+
+def write_sens(path: Path, count: int = 4) -> Path:
+    """A .sens file as its format is published; IMU readings follow the frames."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frames = [
+        sens_frame(pose, 7_000_000 + 33_333 * i, encoded(color_image(i), ".png"), zipped_depth(i))
+        for i, pose in enumerate(poses(count))
+    ]
+    path.write_bytes(sens_head(count) + b"".join(frames) + struct.pack("<Q", 1) + bytes(128))
+    return path
+
+
+def write_scannet(scan: Path, count: int = 4) -> Path:
+    """The folders that ScanNet's exporter makes; colour is twice as large as depth."""
+    for i, pose in enumerate(poses(count)):
+        write_color(scan / "color" / f"{i}.jpg", color_image(i).repeat(2, axis=0).repeat(2, axis=1))
+        write_depth(scan / "depth" / f"{i}.png", depth_metres(i))
+        (scan / "pose").mkdir(exist_ok=True)
+        (scan / "pose" / f"{i}.txt").write_text(matrix_text(pose))
+    (scan / "intrinsic").mkdir()
+    padded = np.eye(4)
+    padded[:3, :3] = CAMERA_MATRIX
+    (scan / "intrinsic" / "intrinsic_depth.txt").write_text(matrix_text(padded))
+    padded[:2] *= 2
+    (scan / "intrinsic" / "intrinsic_color.txt").write_text(matrix_text(padded))
+    return scan
 
 
 def write_folder(folder: Path, count: int = 3, units_per_metre: float = 1000.0) -> Path:

@@ -10,6 +10,7 @@ from tests.datasets.layouts import (
     depth_metres,
     write_folder,
     write_replica,
+    write_scannet,
     write_seven_scenes,
     write_synthetic_rgbd,
     write_tum,
@@ -20,6 +21,7 @@ WRITERS = {
     "synthetic_rgbd": write_synthetic_rgbd,
     "replica": write_replica,
     "tum": write_tum,
+    "scannet": write_scannet,
     "folder": write_folder,
 }
 
@@ -64,7 +66,7 @@ def test_the_argument_overrides_the_path(tmp_path):
 
 
 def test_errors():
-    assert dataset_types() == ["7scenes", "synthetic_rgbd", "tum", "replica", "folder", "generated"]
+    assert dataset_types() == ["7scenes", "synthetic_rgbd", "tum", "replica", "scannet", "folder", "generated"]
     with pytest.raises(DatasetError, match="dataset.type must be one of 7scenes, .*, generated, got kitti"):
         open_dataset(SimpleNamespace(type="kitti"))
     with pytest.raises(DatasetError, match="dataset.path must name the folder of the tum data"):

@@ -1,0 +1,158 @@
+"""ScanNet (Dai et al. 2017): Structure Sensor on a tablet, poses by BundleFusion.
+
+A scan is read from ``sceneNNNN_NN.sens`` as it is distributed, or from what the data set's own exporter makes of it:
+``color/N.jpg``, ``depth/N.png`` (16-bit millimetres), ``pose/N.txt`` (4x4 camera to world, OpenCV axes; infinite where
+unknown) and ``intrinsic/intrinsic_depth.txt``. Colour is larger than depth (1296x968 against 640x480). The authors
+registered the two to each other ("they can be resampled to the same resolution"), so colour is brought to depth's size
+and depth's intrinsics hold for both.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
+from spslam.datasets.images import depth_in_metres, first_size, read_depth, resized_color
+from spslam.datasets.sens import SensFile
+from spslam.datasets.text import camera_from_matrix, checked_pose, read_intrinsics_matrix
+from spslam.errors import DatasetError
+
+FRAMES_PER_SECOND = 30.0
+_COLOR_NAME, _DEPTH_NAME = r"(\d+)\.(?:jpg|jpeg|png)", r"(\d+)\.png"
+_INTRINSICS = "intrinsic_depth.txt", "intrinsic_color.txt"
+
+
+def open_scannet(path: Path) -> RgbdDataset:
+    """A scan: its ``.sens`` file, the folder that holds one, or an exported folder (which wins if both are there).
+
+    A frame whose pose isn't finite has no pose. A frame whose image is missing or broken, or whose pose is no rigid
+    motion, is one that raises when it is read.
+
+    Raises
+    ------
+    DatasetError
+        For a missing path, another layout, several ``.sens`` files, missing or unreadable intrinsics.
+    """
+    if path.suffix == ".sens":
+        return SensDataset(SensFile(path))
+    for folder in (require_folder(path), path / "frames"):
+        if (folder / "color").is_dir() and (folder / "depth").is_dir():
+            return _open_exported(folder, f"scannet/{path.name}")
+    files = sorted(path.glob("*.sens"))
+    if len(files) != 1:
+        raise DatasetError(
+            f"{path}: must hold one .sens file, or the folders color and depth exported from one, "
+            f"got {', '.join(file.name for file in files) or 'neither'}"
+        )
+    return SensDataset(SensFile(files[0]))
+
+
+class SensDataset(RgbdDataset):
+    """The frames of a ``.sens`` file.
+
+    Times are those of the colour images, in seconds from the first; a file without times is taken at 30 Hz. Frames are
+    put in order of time; of frames with the same time all but the first raise when they are read, and so does one frame
+    that stands for the missing rest of a file that was cut.
+
+    Raises
+    ------
+    DatasetError
+        For a file without a whole frame, or without intrinsics of depth.
+    """
+
+    def __init__(self, file: SensFile) -> None:
+        header, index = file.header, file.index
+        if not len(index):
+            raise DatasetError(f"{file.path}: must hold a whole frame, got none of {header.frames}")
+        self.name = f"scannet/{file.path.stem}"
+        self.camera = _sens_camera(file)
+        self._file = file
+        self._times, self._order = _ordered_times(index.times_us)
+        self._faults = {
+            int(row): f"{file.describe(self._order[row])}: must be later than frame {self._order[row - 1]}, "
+            f"got the same time {self._times[row]:g} s"
+            for row in np.flatnonzero(np.diff(self._times, prepend=-1.0) <= 0)
+        }
+        self._poses = self._read_poses(index.poses)
+        if len(index) < header.frames:
+            self._stand_in_for_the_rest(header.frames)
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def timestamps(self) -> np.ndarray:
+        return self._times.copy()
+
+    def poses(self) -> np.ndarray | None:
+        return self._poses.copy() if np.isfinite(self._poses).any() else None
+
+    def read(self, index: int) -> RgbdFrame:
+        if index in self._faults:
+            raise DatasetError(self._faults[index])
+        frame = int(self._order[index])
+        color = resized_color(self._file.color(frame), self.camera.width, self.camera.height)
+        depth = depth_in_metres(self._file.depth(frame), self._file.header.units_per_metre)
+        pose = self._poses[index]
+        return RgbdFrame(
+            index, float(self._times[index]), color, depth, pose.copy() if np.isfinite(pose).all() else None
+        )
+
+    def describe(self, index: int) -> str:
+        return self._file.describe(int(self._order[index]))
+
+    def _read_poses(self, stored: np.ndarray) -> np.ndarray:
+        poses = np.full((len(self._order), 4, 4), np.nan)
+        for row, frame in enumerate(self._order):
+            try:
+                poses[row] = checked_pose(stored[frame], f"{self._file.describe(frame)}, pose")
+            except DatasetError as error:
+                self._faults.setdefault(row, str(error))
+        return poses
+
+    def _stand_in_for_the_rest(self, announced: int) -> None:
+        found = len(self._order)
+        self._faults[found] = f"{self._file.path}: the file is truncated: {found} of {announced} frames are whole"
+        self._times = np.append(self._times, self._times[-1] + 1 / FRAMES_PER_SECOND)
+        self._order = np.append(self._order, found)
+        self._poses = np.append(self._poses, np.full((1, 4, 4), np.nan), axis=0)
+
+
+def _sens_camera(file: SensFile) -> Camera:
+    header = file.header
+    matrix, (width, height) = header.depth_intrinsics.astype(np.float64), header.depth_size
+    return camera_from_matrix(matrix, width, height, f"{file.path}, intrinsics of depth")
+
+
+def _ordered_times(times_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds from the first, ascending, and the frames in that order."""
+    if (times_us == times_us[0]).all():
+        return np.arange(len(times_us)) / FRAMES_PER_SECOND, np.arange(len(times_us))
+    order = np.argsort(times_us, kind="stable")
+    return (times_us[order] - times_us[order[0]]).astype(np.float64) / 1e6, order
+
+
+def _open_exported(folder: Path, name: str) -> FileDataset:
+    colors, depths = find_numbered(folder / "color", _COLOR_NAME), find_numbered(folder / "depth", _DEPTH_NAME)
+    if not colors or not depths:
+        empty = folder / ("depth" if colors else "color")
+        raise DatasetError(f"{empty}: must hold a ScanNet scan's images (0.jpg, 0.png, ...), got none")
+    size = first_size(depths.values(), lambda path: read_depth(path, 1000.0))
+    camera = _find_camera(folder, size, list(colors.values()))
+    paired = pair_numbered(colors, depths, FRAMES_PER_SECOND)
+    frames, poses = attach_poses(paired, lambda number: folder / "pose" / f"{number}.txt")
+    return FileDataset(name, camera, frames, poses, units_per_metre=1000.0, resize_color=True)
+
+
+def _find_camera(folder: Path, size: tuple[int, int], colors: list[Path]) -> Camera:
+    for parent in (folder / "intrinsic", folder):
+        if (parent / _INTRINSICS[0]).is_file():
+            return read_intrinsics_matrix(parent / _INTRINSICS[0], *size)
+    for parent in (folder / "intrinsic", folder):
+        if (parent / _INTRINSICS[1]).is_file():
+            return read_intrinsics_matrix(parent / _INTRINSICS[1], *first_size(colors)).resized(*size)
+    raise DatasetError(f"{folder / 'intrinsic' / _INTRINSICS[0]}: no such file; it must hold depth's intrinsics")
+
