@@ -15,7 +15,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
 
-.PHONY: help demo test test-gpu dev lint
+.PHONY: help demo test test-gpu dev lint example-cpp
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -34,12 +34,22 @@ dev: $(ENVIRONMENT) ## build the kernels in place for this machine; SPSLAM_CUDA=
 	  -DCMAKE_INSTALL_PREFIX=$(CURDIR) -DSPSLAM_CUDA=$(SPSLAM_CUDA) -DSPSLAM_CUDA_ARCHS="$(CUDA_ARCHS)" \
 	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
 	$(RUN) cmake --build build/dev-$(SPSLAM_CUDA) -j $(JOBS)
-	$(RUN) cmake --install build/dev-$(SPSLAM_CUDA) > /dev/null
+	$(RUN) cmake --install build/dev-$(SPSLAM_CUDA) --component python > /dev/null
+
+example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, without torch, and run examples/cpp on them
+	$(RUN) cmake -S . -B build/cxx -G Ninja -DSPSLAM_CUDA=OFF -DSPSLAM_CPU_ISAS=baseline -DSPSLAM_TORCH_DIR= \
+	  -DCMAKE_INSTALL_PREFIX=$(CURDIR)/build/prefix
+	$(RUN) cmake --build build/cxx -j $(JOBS)
+	$(RUN) cmake --install build/cxx > /dev/null
+	$(RUN) cmake -S examples/cpp -B build/example-cpp -G Ninja -DCMAKE_PREFIX_PATH=$(CURDIR)/build/prefix
+	$(RUN) cmake --build build/example-cpp
+	$(RUN) ctest --test-dir build/example-cpp --output-on-failure
 
 lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	$(RUN) clang-format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh')
+	$(RUN) clang-format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh' \
+	  'examples/*.h' 'examples/*.cpp' 'bindings/*.h' 'bindings/*.cpp')
 	$(PYTHON) -m mypy
 
 # torch first and pinned: a plain 'torch' may bring gigabytes of CUDA libraries.

@@ -1,5 +1,6 @@
 # The libraries: torch-free kernels for each instruction set and for CUDA, and a torch op library over each.
 include(CheckLanguage)
+include(GNUInstallDirs)
 find_package(Threads REQUIRED)
 
 if(SPSLAM_CUDA STREQUAL "AUTO")
@@ -31,7 +32,15 @@ file(GLOB SPSLAM_BINDING_SOURCES CONFIGURE_DEPENDS csrc/bindings/*.cpp)
 function(spslam_kernel_includes target)
   target_include_directories(${target} PUBLIC
     $<BUILD_INTERFACE:${CMAKE_CURRENT_SOURCE_DIR}/csrc/include>
-    $<BUILD_INTERFACE:${CMAKE_CURRENT_SOURCE_DIR}/csrc>)
+    $<BUILD_INTERFACE:${CMAKE_CURRENT_SOURCE_DIR}/csrc>
+    $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}>)
+endfunction()
+
+# Makes a kernel library available as Spslam::<name>, here and, of export set `set`, where it is installed.
+function(spslam_export target name set)
+  add_library(Spslam::${name} ALIAS ${target})
+  set_target_properties(${target} PROPERTIES EXPORT_NAME ${name})
+  install(TARGETS ${target} EXPORT ${set} ARCHIVE DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT development)
 endfunction()
 
 # Links `name` as a torch op library: LibTorch's stable ABI, no Python symbol, no undefined symbol.
@@ -42,7 +51,7 @@ function(spslam_op_library name)
   target_link_options(${name} PRIVATE -Wl,-z,defs -Wl,--exclude-libs,ALL)
   target_link_libraries(${name} PRIVATE ${SPSLAM_TORCH_DIR}/lib/libtorch_cpu.so)
   set_target_properties(${name} PROPERTIES PREFIX "" SKIP_BUILD_RPATH ON)
-  install(TARGETS ${name} LIBRARY DESTINATION spslam)
+  install(TARGETS ${name} LIBRARY DESTINATION spslam COMPONENT python)
 endfunction()
 
 set(_isa_flags_baseline "")
@@ -52,9 +61,11 @@ foreach(isa IN LISTS SPSLAM_CPU_ISAS)
   set(kernels spslam_cpu_${isa})
   add_library(${kernels} STATIC ${SPSLAM_CPU_SOURCES})
   spslam_kernel_includes(${kernels})
+  target_compile_features(${kernels} PUBLIC cxx_std_17)
   target_link_libraries(${kernels} PUBLIC Threads::Threads)
+  spslam_export(${kernels} cpu_${isa} SpslamCpuTargets)
   # Vectorised, but with NaN and infinity kept: no -ffast-math.
-  target_compile_options(${kernels} PRIVATE -O3 -Wall -Wextra -fopenmp-simd -fno-math-errno -fno-trapping-math
+  target_compile_options(${kernels} PRIVATE -O3 -Wall -Wextra -Wno-psabi -fopenmp-simd -fno-math-errno -fno-trapping-math
     -ffp-contract=fast ${_isa_flags_${isa}})
   if(SPSLAM_TORCH_DIR)
     if(isa STREQUAL "baseline")
@@ -70,6 +81,9 @@ endforeach()
 if(SPSLAM_CUDA)
   add_library(spslam_cuda STATIC ${SPSLAM_CUDA_SOURCES})
   spslam_kernel_includes(spslam_cuda)
+  target_compile_features(spslam_cuda PUBLIC cxx_std_17)
+  target_link_libraries(spslam_cuda PUBLIC CUDA::cudart_static)
+  spslam_export(spslam_cuda cuda SpslamCudaTargets)
   target_compile_options(spslam_cuda PRIVATE $<$<COMPILE_LANGUAGE:CUDA>:--extended-lambda --expt-relaxed-constexpr>)
   if(SPSLAM_TORCH_DIR)
     spslam_op_library(_ops_cuda)
@@ -82,6 +96,6 @@ if(SPSLAM_CUDA)
       set_target_properties(torch_cuda_stub PROPERTIES OUTPUT_NAME torch_cuda C_VISIBILITY_PRESET default)
       set(torch_cuda torch_cuda_stub)
     endif()
-    target_link_libraries(_ops_cuda PRIVATE spslam_cuda CUDA::cudart_static ${torch_cuda})
+    target_link_libraries(_ops_cuda PRIVATE spslam_cuda ${torch_cuda})
   endif()
 endif()
