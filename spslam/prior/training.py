@@ -45,7 +45,7 @@ class PretrainSettings:
     views : how the solids are observed.
     """
 
-    steps: int = 1000
+    steps: int = 4000
     seed: int = 0
     patches_per_kind: int = 4
     learning_rate: float = 4e-3
