@@ -25,13 +25,11 @@ Tensor depth_normals(Tensor depth, Tensor pixels, double fx, double fy, double c
   depth = contiguous(depth);
   pixels = contiguous(pixels);
   DeviceScope scope(depth);
-  const DepthImage image{data<float>(depth),
-                         static_cast<std::int32_t>(depth.size(1)),
-                         static_cast<std::int32_t>(depth.size(0)),
-                         static_cast<float>(fx),
-                         static_cast<float>(fy),
-                         static_cast<float>(cx),
-                         static_cast<float>(cy)};
+  const DepthImage image{
+      data<float>(depth),
+      static_cast<std::int32_t>(depth.size(1)),
+      static_cast<std::int32_t>(depth.size(0)),
+      {static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx), static_cast<float>(cy)}};
   const Tensor normals = empty(depth, {pixels.size(0), 3}, ScalarType::Float);
   spslam::depth_normals(scope.context, image, data<std::int32_t>(pixels), pixels.size(0),
                         static_cast<std::int32_t>(step_px), static_cast<float>(max_jump), mutable_data<float>(normals));

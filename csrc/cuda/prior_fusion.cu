@@ -4,6 +4,7 @@
 #include <stdexcept>
 
 #include "core/cuda_check.cuh"
+#include "kernels/depth_normal.h"
 #include "kernels/prior_fusion_launch.h"
 
 namespace spslam {
@@ -149,6 +150,17 @@ void encode_points<Cuda>(Cuda device, const float* points, const float* normals,
   encode_pairs(device, points, normals, pairs, params, settings, space);
   const std::int64_t vertices = group_pairs(device, static_cast<int>(pairs), space);
   average_pairs(device, vertices, space, allocate(vertices));
+}
+
+template <>
+void depth_normals<Cuda>(Cuda device, const DepthImage& image, const std::int32_t* pixels, std::int64_t n,
+                         std::int32_t step_px, float max_jump, float* normals) {
+  for_each(device, n, [=] __device__(std::int64_t i) {
+    const Vec3<float> normal = depth_normal(image, pixels[2 * i], pixels[2 * i + 1], step_px, max_jump);
+    normals[3 * i] = normal.x;
+    normals[3 * i + 1] = normal.y;
+    normals[3 * i + 2] = normal.z;
+  });
 }
 
 SPS_INSTANTIATE_PRIOR_FUSION(Cuda)

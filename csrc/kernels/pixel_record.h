@@ -4,6 +4,7 @@
 // foreshortening n . d of the surface normal n and the ray direction d with camera z = 1, 0 where unknown.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 
 #include "core/macros.h"
@@ -33,6 +34,18 @@ SPS_INLINE Pixel unpack_pixel(const std::int32_t* words) {
   const float c = static_cast<float>(rgbc >> 24) * kForeshorteningStep;
   pixel.foreshortening = c == 0.0f ? 1.0f : (c < kMinForeshortening ? kMinForeshortening : c);
   return pixel;
+}
+
+// The record of a pixel of that depth, colour [3] and surface normal [3] (0 = unknown) in the view of a camera. The
+// foreshortening is computed in double, so that its rounded step does not hang on the order of operations.
+SPS_INLINE void pack_pixel(std::int32_t u, std::int32_t v, float depth, const std::uint8_t* color, const float* normal,
+                           double fx, double fy, double cx, double cy, std::int32_t* words) {
+  const double facing = normal[0] * ((u - cx) / fx) + normal[1] * ((v - cy) / fy) + normal[2];
+  const double steps = std::rint(std::fabs(facing) * (1.0 / kForeshorteningStep));
+  const std::uint32_t c = static_cast<std::uint32_t>(steps < 255.0 ? steps : 255.0);
+  words[0] = static_cast<std::int32_t>(static_cast<std::uint32_t>(u) | static_cast<std::uint32_t>(v) << 16);
+  __builtin_memcpy(words + 1, &depth, sizeof(float));
+  words[2] = static_cast<std::int32_t>(color[0] | color[1] << 8 | color[2] << 16 | c << 24);
 }
 
 // Direction of a pixel's ray in camera axes, with z = 1, so that a sample's depth is its factor.

@@ -1,4 +1,4 @@
-// The scene prior, for one element: the normal of a pixel, the pair of a point and a vertex, fusion into an embedding.
+// The scene prior, for one element: the pair of a point and a vertex, fusion into an embedding.
 #pragma once
 
 #include <cmath>
@@ -11,59 +11,6 @@
 #include "spslam/prior_fusion.h"
 
 namespace spslam {
-
-// Depth smoothed over a 5x5 window: Gaussian of 2 px in the image, Tukey's biweight in depth. It is as curved at 0 as a
-// Gaussian of 3 cm and, unlike it, exactly 0 beyond 6 cm. 0 where the pixel is invalid.
-SPS_INLINE float smoothed_depth(const DepthImage& image, std::int32_t u, std::int32_t v) {
-  constexpr int kRadius = 2;
-  constexpr float kSpatial[kRadius + 1] = {1.0f, 0.8824969f, 0.6065307f};
-  constexpr float kInverseRange2 = 1.0f / (0.06f * 0.06f);
-  const float center = image.depth[static_cast<std::int64_t>(v) * image.width + u];
-  if (!(center > 0.0f)) return 0.0f;
-  float weights = 0.0f, differences = 0.0f;
-  for (int dv = -kRadius; dv <= kRadius; ++dv) {
-    if (v + dv < 0 || v + dv >= image.height) continue;
-    const float* row = image.depth + static_cast<std::int64_t>(v + dv) * image.width;
-    const float row_weight = kSpatial[dv < 0 ? -dv : dv];
-    for (int du = -kRadius; du <= kRadius; ++du) {
-      if (u + du < 0 || u + du >= image.width) continue;
-      const float z = row[u + du];
-      const float difference = z - center;
-      const float closeness = 1.0f - difference * difference * kInverseRange2;
-      if (!(closeness > 0.0f && z > 0.0f)) continue;
-      const float weight = closeness * closeness * row_weight * kSpatial[du < 0 ? -du : du];
-      weights += weight;
-      differences += weight * difference;
-    }
-  }
-  return center + differences / weights;
-}
-
-SPS_INLINE Vec3<float> unproject(const DepthImage& image, std::int32_t u, std::int32_t v, float z) {
-  return {(static_cast<float>(u) - image.cx) / image.fx * z, (static_cast<float>(v) - image.cy) / image.fy * z, z};
-}
-
-// Normal of the surface at a pixel from central differences over step_px; 0 at the image's border, at invalid pixels
-// and where a neighbour's depth differs by max_jump of the pixel's or more.
-SPS_INLINE Vec3<float> depth_normal(const DepthImage& image, std::int32_t u, std::int32_t v, std::int32_t step_px,
-                                    float max_jump) {
-  const Vec3<float> unknown{0.0f, 0.0f, 0.0f};
-  if (u < step_px || v < step_px || u >= image.width - step_px || v >= image.height - step_px) return unknown;
-  const float z = smoothed_depth(image, u, v);
-  const float left = smoothed_depth(image, u - step_px, v), right = smoothed_depth(image, u + step_px, v);
-  const float up = smoothed_depth(image, u, v - step_px), down = smoothed_depth(image, u, v + step_px);
-  if (!(z > 0.0f && left > 0.0f && right > 0.0f && up > 0.0f && down > 0.0f)) return unknown;
-  const float jump = std::fmax(std::fmax(std::fabs(left - z), std::fabs(right - z)),
-                               std::fmax(std::fabs(up - z), std::fabs(down - z)));
-  if (!(jump < max_jump * z)) return unknown;
-  const Vec3<float> horizontal = unproject(image, u + step_px, v, right) - unproject(image, u - step_px, v, left);
-  const Vec3<float> vertical = unproject(image, u, v + step_px, down) - unproject(image, u, v - step_px, up);
-  const Vec3<float> normal = cross(horizontal, vertical);
-  const float length = std::sqrt(dot(normal, normal));
-  if (!(length > 0.0f)) return unknown;
-  const float side = dot(normal, unproject(image, u, v, z)) > 0.0f ? -1.0f : 1.0f;
-  return (side / length) * normal;
-}
 
 // The vertices that a point reaches: per axis `side` of them, the first at `first` from the cell's lowest corner.
 struct Neighborhood {

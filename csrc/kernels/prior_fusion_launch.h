@@ -8,21 +8,6 @@
 namespace spslam {
 
 template <class Device>
-void depth_normals(Device device, const DepthImage& image, const std::int32_t* pixels, std::int64_t n,
-                   std::int32_t step_px, float max_jump, float* normals) {
-  constexpr std::int64_t kGrain = 128;
-  for_each(
-      device, n,
-      [=] SPS_HOST_DEVICE(std::int64_t i) {
-        const Vec3<float> normal = depth_normal(image, pixels[2 * i], pixels[2 * i + 1], step_px, max_jump);
-        normals[3 * i] = normal.x;
-        normals[3 * i + 1] = normal.y;
-        normals[3 * i + 2] = normal.z;
-      },
-      kGrain);
-}
-
-template <class Device>
 void fuse_prior(Device device, const std::int32_t* voxel_ids, const float* features, const float* feature_weights,
                 std::int64_t count, std::int64_t num_voxels, float max_weight, float* embeddings, float* weights) {
   for_each(device, count, [=] SPS_HOST_DEVICE(std::int64_t i) {
@@ -42,11 +27,9 @@ void random_embeddings(Device device, const std::int32_t* voxel_coords, std::int
   });
 }
 
-#define SPS_INSTANTIATE_PRIOR_FUSION(Device)                                                                      \
-  template void depth_normals<Device>(Device, const DepthImage&, const std::int32_t*, std::int64_t, std::int32_t, \
-                                      float, float*);                                                             \
-  template void fuse_prior<Device>(Device, const std::int32_t*, const float*, const float*, std::int64_t,         \
-                                   std::int64_t, float, float*, float*);                                          \
+#define SPS_INSTANTIATE_PRIOR_FUSION(Device)                                                              \
+  template void fuse_prior<Device>(Device, const std::int32_t*, const float*, const float*, std::int64_t, \
+                                   std::int64_t, float, float*, float*);                                  \
   template void random_embeddings<Device>(Device, const std::int32_t*, std::int64_t, std::int64_t, float, float*);
 
 }  // namespace spslam

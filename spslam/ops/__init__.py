@@ -6,6 +6,7 @@ from spslam.ops.gauss_newton import gauss_newton_poses, track_gauss_newton
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
+from spslam.ops.pixel_sampling import PixelSampling, sample_frame_pixels
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_points, fuse_prior_, random_embeddings
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
@@ -27,6 +28,7 @@ __all__ = [
     "ENCODER_PARAMETERS",
     "Activation",
     "Intrinsics",
+    "PixelSampling",
     "RayBatch",
     "RenderOptions",
     "RenderStep",
@@ -52,6 +54,7 @@ __all__ = [
     "render_step",
     "rendering_losses",
     "sample_along_rays",
+    "sample_frame_pixels",
     "sample_indices",
     "set_num_threads",
     "solve_normal_equations",

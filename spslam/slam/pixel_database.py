@@ -52,13 +52,13 @@ class PixelDatabase:
 
         Args:
             records: int32 [N, 3] in random order; N = 0 marks a frame without depth. Other N than P are cut or
-                repeated.
+                repeated. On the database's device this waits for nothing.
         """
         self._reserve(self.num_frames + 1)
         count = self.pixels_per_frame
         if len(records):
-            repeated = records[torch.arange(count) % len(records)] if len(records) < count else records[:count]
-            self._storage[self.num_frames] = repeated.to(self._storage.device)
+            repeated = records.repeat(-(-count // len(records)), 1) if len(records) < count else records
+            self._storage[self.num_frames].copy_(repeated[:count], non_blocking=True)
         self._has_pixels[self.num_frames] = len(records) > 0
         self.num_frames += 1
 

@@ -6,6 +6,7 @@ turns a depth difference along the ray into a distance to the surface's tangent 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,29 +16,53 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 
-FORESHORTENING_SCALE = 128.0
 LATTICE_STEP_PX = 16
 
 
 @dataclass(frozen=True)
 class FramePixels:
-    """What tracking and mapping need of a frame.
+    """What tracking and mapping need of a frame, in one buffer, so that an upload is one copy.
 
     Attributes:
-        records: int32 [P, 3] packed pixels in random order, so that any prefix is an even sample; P = 0 without depth.
-        normals: float32 [P, 3] unit normals in camera axes, turned to the camera; 0 where unknown.
-        lattice: float16 [h, w] depth (m) at every `LATTICE_STEP_PX`-th pixel, 0 where invalid, for co-visibility.
+        buffer: int32 words of the records, the normals and the lattice, as `ops.sample_frame_pixels` returns them.
+        capacity: records that the buffer holds; without depth they are 0 and none of them counts.
+        lattice_shape: rows and columns of the lattice.
         valid_share: share of the image's pixels with usable depth.
     """
 
-    records: torch.Tensor
-    normals: torch.Tensor
-    lattice: torch.Tensor
+    buffer: torch.Tensor
+    capacity: int
+    lattice_shape: tuple[int, int]
     valid_share: float
 
-    def to(self, device: torch.device) -> "FramePixels":
-        """The same on another device."""
-        return FramePixels(self.records.to(device), self.normals.to(device), self.lattice.to(device), self.valid_share)
+    @property
+    def count(self) -> int:
+        """P, the number of records; 0 without depth."""
+        return self.capacity if self.valid_share > 0 else 0
+
+    @cached_property
+    def records(self) -> torch.Tensor:
+        """int32 [P, 3] packed pixels in random order, so that any prefix is an even sample; a view of the buffer."""
+        return self.buffer[: 3 * self.count].view(-1, 3)
+
+    @cached_property
+    def normals(self) -> torch.Tensor:
+        """float32 [P, 3] unit normals in camera axes, turned to the camera, 0 where unknown; a view of the buffer."""
+        return self.buffer[3 * self.capacity :][: 3 * self.count].view(torch.float32).view(-1, 3)
+
+    @cached_property
+    def lattice(self) -> torch.Tensor:
+        """float16 [h, w] depth (m) at every `LATTICE_STEP_PX`-th pixel, 0 where invalid, for co-visibility; a view."""
+        rows, columns = self.lattice_shape
+        return self.buffer[6 * self.capacity :].view(torch.float16)[: rows * columns].view(rows, columns)
+
+    def to(self, device: torch.device, non_blocking: bool = False) -> "FramePixels":
+        """The same on another device; one copy."""
+        return self.holding(self.buffer.to(device, non_blocking=non_blocking))
+
+    def holding(self, buffer: torch.Tensor) -> "FramePixels":
+        """The same in another buffer, to which the words were copied."""
+        return FramePixels(buffer, self.capacity, self.lattice_shape, self.valid_share)
 
 
 def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixels:
@@ -48,40 +73,28 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
         camera: pinhole intrinsics of the frame.
         config: sections `dataset` (depth range), `pixels` and `prior` (normals).
     """
-    depth = usable_depth(frame.depth, config.dataset.min_depth_m, config.dataset.max_depth_m)
-    valid = np.flatnonzero(depth)
-    count = config.pixels.per_frame if len(valid) else 0
-    draw = ops.sample_indices(config.seed, ops.Stream.PIXEL_DATABASE, frame.index, 0, count, max(len(valid), 1)).numpy()
-    chosen = valid[draw]
-    v, u = np.divmod(chosen, camera.width)
-    normals = ops.depth_normals(
-        torch.from_numpy(depth),
-        torch.from_numpy(np.stack([u, v], 1).astype(np.int32)),
+    sampling = ops.PixelSampling(
+        count=config.pixels.per_frame,
+        min_depth=config.dataset.min_depth_m,
+        max_depth=config.dataset.max_depth_m,
+        step_px=config.prior.normal_step_px,
+        max_jump=config.prior.max_jump,
+        lattice_step=LATTICE_STEP_PX,
+    )
+    buffer, num_valid = ops.sample_frame_pixels(
+        torch.from_numpy(np.ascontiguousarray(frame.depth, np.float32)),
+        torch.from_numpy(np.ascontiguousarray(frame.color)),
         camera.fx,
         camera.fy,
         camera.cx,
         camera.cy,
-        config.prior.normal_step_px,
-        config.prior.max_jump,
+        sampling,
+        config.seed,
+        ops.Stream.PIXEL_DATABASE,
+        frame.index,
     )
-    offset = LATTICE_STEP_PX // 2
-    lattice = depth[offset::LATTICE_STEP_PX, offset::LATTICE_STEP_PX]
-    return FramePixels(
-        records=torch.from_numpy(
-            _pack(u, v, depth.ravel()[chosen], frame.color.reshape(-1, 3)[chosen], normals, camera)
-        ),
-        normals=normals,
-        lattice=torch.from_numpy(lattice.astype(np.float16)),
-        valid_share=len(valid) / depth.size,
-    )
-
-
-def usable_depth(depth: np.ndarray, min_depth_m: float, max_depth_m: float) -> np.ndarray:
-    """float32 [H, W] depth (m) with everything outside the range, and what is not finite, set to 0."""
-    usable = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
-    return np.where((usable >= min_depth_m) & (usable <= max_depth_m), usable, np.float32(0)).astype(
-        np.float32, copy=False
-    )
+    shape = sampling.lattice_shape(*frame.depth.shape)
+    return FramePixels(buffer, sampling.count, shape, num_valid / frame.depth.size)
 
 
 def unpack_points(records: torch.Tensor, camera: Camera) -> torch.Tensor:
@@ -90,18 +103,3 @@ def unpack_points(records: torch.Tensor, camera: Camera) -> torch.Tensor:
     v = ((records[:, 0] >> 16) & 0xFFFF).float()
     z = records[:, 1].contiguous().view(torch.float32)
     return torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
-
-
-def _pack(
-    u: np.ndarray, v: np.ndarray, depth: np.ndarray, color: np.ndarray, normals: torch.Tensor, camera: Camera
-) -> np.ndarray:
-    n = normals.numpy()
-    foreshortening = np.abs(n[:, 0] * ((u - camera.cx) / camera.fx) + n[:, 1] * ((v - camera.cy) / camera.fy) + n[:, 2])
-    records = np.empty((len(u), 3), np.uint32)
-    records[:, 0] = u.astype(np.uint32) | (v.astype(np.uint32) << 16)
-    records[:, 1] = depth.astype(np.float32).view(np.uint32)
-    bytes_ = np.empty((len(u), 4), np.uint8)
-    bytes_[:, :3] = color
-    bytes_[:, 3] = np.clip(np.rint(foreshortening * FORESHORTENING_SCALE), 0, 255)
-    records[:, 2] = bytes_.view(np.uint32)[:, 0]
-    return records.view(np.int32)

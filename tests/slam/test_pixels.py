@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from spslam import ops
-from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame, unpack_points, usable_depth
+from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame, unpack_points
 from spslam.slam.state import FrameTable, pose_tensor
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
@@ -88,9 +88,13 @@ def test_the_lattice_fits_the_frame_table(dataset):
     np.testing.assert_allclose(lattice[2, 3], frame.depth[half + 32, half + 48], rtol=1e-3)
 
 
-def test_usable_depth():
-    depth = np.array([[np.nan, np.inf, -np.inf, -1, 0, 0.0999, 0.1, 5, 10, 10.001]], np.float32)
-    expected = np.array([[0, 0, 0, 0, 0, 0, 0.1, 5, 10, 0]], np.float32)
-    usable = usable_depth(depth, np.float32(0.1), 10)
-    assert usable.dtype == np.float32
-    np.testing.assert_array_equal(usable, expected)
+def test_one_buffer_holds_everything(dataset):
+    frame, camera = dataset[0], dataset.camera
+    pixels = sample_frame(frame, camera, settings())
+    copy = pixels.holding(pixels.buffer.clone())
+    for name in ("records", "normals", "lattice"):
+        assert torch.equal(getattr(copy, name), getattr(pixels, name))
+        storage = getattr(copy, name).untyped_storage()
+        assert storage.data_ptr() == copy.buffer.untyped_storage().data_ptr()
+    assert copy.count == len(copy.records) == 15000
+    assert pixels.to(torch.device("cpu")).valid_share == pixels.valid_share

@@ -16,11 +16,16 @@ constexpr std::int64_t kEncoderParameters = kEncoderHidden * (kEncoderInputs + 1
                                             kEncoderHidden * (kEncoderHidden + 1) +
                                             kPriorFeatures * (kEncoderHidden + 1);
 
-// A depth image (m, 0 = invalid) and its pinhole camera (px).
+// A pinhole camera, px.
+struct DepthCamera {
+  float fx, fy, cx, cy;
+};
+
+// A depth image (m); 0, negative and not finite are invalid.
 struct DepthImage {
   const float* depth;
   std::int32_t width, height;
-  float fx, fy, cx, cy;
+  DepthCamera camera;
 };
 
 // Unit normals in camera axes, turned to the camera, of pixels (u, v); 0 where the surface is not smooth around one.

@@ -1,0 +1,92 @@
+#include "spslam/pixel_sampling.h"
+
+#include <algorithm>
+
+#include "core/half.h"
+#include "cpu/depth_normals.h"
+#include "kernels/pixel_record.h"
+
+namespace spslam {
+namespace {
+
+// Kept by each thread that samples frames: fresh pages for every frame cost as much as the work in them.
+struct FrameScratch {
+  ScratchBuffer<float> depth;
+  ScratchBuffer<std::int32_t> valid;
+};
+thread_local FrameScratch scratch;
+
+// Copies usable depth into the padded image, the rest as 0, and lists the places of usable pixels.
+std::int64_t list_valid(const RgbdImage& image, const PixelSampling& sampling, PaddedDepth& depth,
+                        std::int32_t* valid) {
+  const float low = sampling.min_depth, high = sampling.max_depth;
+  std::int64_t count = 0;
+  for (std::int32_t v = 0; v < image.height; ++v) {
+    const float* from = image.depth + static_cast<std::int64_t>(v) * image.width;
+    float* to = depth.row(v);
+    SPS_SIMD for (std::int32_t u = 0; u < image.width; ++u) {
+      const float z = valid_depth(from[u]);
+      to[u] = (z >= low) & (z <= high) ? z : 0.0f;
+    }
+    const std::int32_t first = v * image.width;
+    for (std::int32_t u = 0; u < image.width; ++u) {
+      valid[count] = first + u;
+      count += to[u] > 0.0f;
+    }
+  }
+  return count;
+}
+
+void write_lattice(const RgbdImage& image, std::int32_t step, PaddedDepth& depth, std::uint16_t* lattice) {
+  for (std::int32_t v = step / 2; v < image.height; v += step) {
+    const float* row = depth.row(v);
+    for (std::int32_t u = step / 2; u < image.width; u += step) *lattice++ = half_bits(row[u]);
+  }
+}
+
+// Draws pixels [first, first + n) of the frame.
+void draw_batch(const RgbdImage& image, PaddedDepth& depth, const std::int32_t* valid, std::int64_t num_valid,
+                PhiloxKey key, const PixelSampling& sampling, std::int64_t first, int n, const SampledPixels& out) {
+  std::int32_t u[kPixelBatch], v[kPixelBatch];
+  for (int i = 0; i < n; ++i) {
+    const std::int32_t place = valid[philox_index(key, static_cast<std::uint32_t>(first + i), num_valid)];
+    v[i] = place / image.width;
+    u[i] = place - v[i] * image.width;
+  }
+  const DepthImage depth_image{image.depth,
+                               image.width,
+                               image.height,
+                               {static_cast<float>(image.fx), static_cast<float>(image.fy),
+                                static_cast<float>(image.cx), static_cast<float>(image.cy)}};
+  float* normals = out.normals + 3 * first;
+  normals_of_batch(depth_image, depth, u, v, n, sampling.step_px, sampling.max_jump, normals);
+  for (int i = 0; i < n; ++i) {
+    const std::uint8_t* color = image.color + 3 * (static_cast<std::int64_t>(v[i]) * image.width + u[i]);
+    pack_pixel(u[i], v[i], depth.row(v[i])[u[i]], color, normals + 3 * i, image.fx, image.fy, image.cx, image.cy,
+               out.records + kPixelWords * (first + i));
+  }
+}
+
+}  // namespace
+
+std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling,
+                           const SampledPixels& out) {
+  PaddedDepth depth(image.width, image.height);
+  depth.allocate(scratch.depth);
+  // One place more than there are pixels: the list is written before it is known whether the pixel counts.
+  std::int32_t* valid = scratch.valid.reserve(static_cast<std::int64_t>(image.width) * image.height + 1);
+  const std::int64_t num_valid = list_valid(image, sampling, depth, valid);
+  write_lattice(image, sampling.lattice_step, depth, out.lattice);
+  if (num_valid == 0) {
+    std::fill(out.records, out.records + kPixelWords * sampling.count, 0);
+    std::fill(out.normals, out.normals + 3 * sampling.count, 0.0f);
+    return 0;
+  }
+  for (std::int64_t first = 0; first < sampling.count; first += kPixelBatch) {
+    const int n = static_cast<int>(std::min<std::int64_t>(kPixelBatch, sampling.count - first));
+    draw_batch(image, depth, valid, num_valid, key, sampling, first, n, out);
+  }
+  return num_valid;
+}
+
+}  // namespace spslam

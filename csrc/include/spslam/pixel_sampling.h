@@ -1,0 +1,42 @@
+// The pixels of a frame that tracking and mapping work on. On the CPU only: frames arrive there.
+#pragma once
+
+#include <cstdint>
+
+#include "core/philox.h"
+
+namespace spslam {
+
+// A frame's images, pixel by pixel of the same view, and its camera (px).
+struct RgbdImage {
+  const float* depth;         // [height, width], m; 0, negative and not finite are invalid
+  const std::uint8_t* color;  // [height, width, 3]
+  std::int32_t width, height;
+  double fx, fy, cx, cy;
+};
+
+struct PixelSampling {
+  std::int64_t count;          // pixels to draw
+  float min_depth, max_depth;  // m; others, 0 and not finite ones are not drawn
+  std::int32_t step_px;        // of the normals' differences
+  float max_jump;              // of depth beside a normal, as a share
+  std::int32_t lattice_step;   // px; the first lattice pixel lies at half of it
+};
+
+// Where the results go.
+struct SampledPixels {
+  std::int32_t* records;   // [count, 3], see kernels/pixel_record.h
+  float* normals;          // [count, 3], camera axes, towards the camera; 0 where unknown
+  std::uint16_t* lattice;  // [lattice_size(height), lattice_size(width)] float16 depth (m), 0 where invalid
+};
+
+constexpr std::int32_t lattice_size(std::int32_t size, std::int32_t step) {
+  return size > step / 2 ? (size - step / 2 + step - 1) / step : 0;
+}
+
+// Draws pixels among those of valid depth, with replacement: the i-th takes element i of the key's draws. Returns how
+// many pixels were valid; where none was, records and normals are 0. Runs on the calling thread alone.
+std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling,
+                           const SampledPixels& out);
+
+}  // namespace spslam

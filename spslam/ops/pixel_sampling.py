@@ -1,0 +1,118 @@
+"""The pixels of a frame that tracking and mapping work on: drawn, with normals, and packed for one upload."""
+
+from dataclasses import dataclass
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._checks import check, check_tensor
+
+_MAX_SIDE = 2**16 - 1  # a record has 16 bits a coordinate
+_MAX_COUNT = 2**30
+
+
+@dataclass(frozen=True)
+class PixelSampling:
+    """How `sample_frame_pixels` draws.
+
+    Attributes:
+        count: pixels to draw, P.
+        min_depth, max_depth: pixels nearer or farther, m, are not drawn.
+        step_px, max_jump: of the normals, see `depth_normals`.
+        lattice_step: distance of the lattice's pixels, px; the first lies at half of it.
+    """
+
+    count: int
+    min_depth: float
+    max_depth: float
+    step_px: int
+    max_jump: float
+    lattice_step: int
+
+    def lattice_shape(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the lattice of an image."""
+        first, step = self.lattice_step // 2, self.lattice_step
+        return len(range(first, height, step)), len(range(first, width, step))
+
+
+def sample_frame_pixels(
+    depth: torch.Tensor,
+    color: torch.Tensor,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sampling: PixelSampling,
+    seed: int,
+    stream: int,
+    frame: int,
+) -> tuple[torch.Tensor, int]:
+    """Draws pixels of valid depth, with replacement, finds their normals and packs them (section III.D of SP-SLAM).
+
+    Pixel i of the result is number `sample_indices(seed, stream, frame, 0, P, valid)[i]` of the valid ones, row by
+    row; its normal is that of `depth_normals`. Its record is three words: u | v << 16; the bits of the float32 depth
+    (m); r | g << 8 | b << 16 | c << 24, c being |n . d| times 128, rounded and at most 255 (n the normal, d the ray
+    direction with camera z = 1; 0 = unknown). Runs on the calling thread, without Python's lock.
+
+    Args:
+        depth: float32 [H, W] on the CPU, metres; not finite, 0 and outside the range is invalid.
+        color: uint8 [H, W, 3].
+        fx, fy, cx, cy: pinhole camera, px.
+        sampling: how many, and what is valid.
+        seed, stream, frame: key of the draw, as in `philox_uniform`.
+
+    Returns:
+        buffer int32 [3 P + 3 P + ceil(h w / 2)]: the records [P, 3], the normals [P, 3] as the bits of float32, and
+        float16 depth [h, w] (m, 0 where invalid) at every `lattice_step`-th pixel, two a word; and the number of valid
+        pixels. Where that is 0, records and normals are 0. The same bits on every run.
+
+    Raises:
+        ValueError: wrong shapes or devices, or a number out of range.
+        TypeError: wrong dtypes.
+
+    Example:
+        >>> sampling = PixelSampling(4, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, lattice_step=16)
+        >>> depth, color = torch.ones(32, 48), torch.zeros(32, 48, 3, dtype=torch.uint8)
+        >>> buffer, valid = sample_frame_pixels(depth, color, 50.0, 50.0, 24.0, 16.0, sampling, 0, 0, 0)
+        >>> buffer.shape, valid
+        (torch.Size([27]), 1536)
+    """
+    name = "sample_frame_pixels"
+    check_tensor(name, "depth", depth, ["H", "W"], torch.float32)
+    height, width = depth.shape
+    check(depth.device.type == "cpu", name, "depth", "be on cpu", depth.device)
+    check(
+        max(height, width) <= _MAX_SIDE and height * width < 2**31, name, "depth", "fit 16 bits a side", (height, width)
+    )
+    check_tensor(name, "color", color, [height, width, 3], torch.uint8, like=depth)
+    check(fx > 0, name, "fx", "be positive", fx)
+    check(fy > 0, name, "fy", "be positive", fy)
+    check(0 <= sampling.count <= _MAX_COUNT, name, "count", "be in [0, 2^30]", sampling.count)
+    check(sampling.min_depth >= 0, name, "min_depth", "be at least 0", sampling.min_depth)
+    check(1 <= sampling.step_px <= _MAX_SIDE, name, "step_px", "be in [1, 65535]", sampling.step_px)
+    check(sampling.max_jump > 0, name, "max_jump", "be positive", sampling.max_jump)
+    check(1 <= sampling.lattice_step <= _MAX_SIDE, name, "lattice_step", "be in [1, 65535]", sampling.lattice_step)
+    buffer, num_valid = torch.ops.spslam.sample_frame_pixels(
+        depth,
+        color,
+        fx,
+        fy,
+        cx,
+        cy,
+        sampling.count,
+        sampling.min_depth,
+        sampling.max_depth,
+        sampling.step_px,
+        sampling.max_jump,
+        sampling.lattice_step,
+        seed,
+        stream,
+        frame,
+    )
+    return buffer, num_valid
+
+
+@torch.library.register_fake("spslam::sample_frame_pixels")
+def _(depth, color, fx, fy, cx, cy, count, min_depth, max_depth, step_px, max_jump, lattice_step, *key):
+    height, width = (max(0, -((lattice_step // 2 - size) // lattice_step)) for size in depth.shape)
+    return depth.new_empty((6 * count + (height * width + 1) // 2,), dtype=torch.int32), 0

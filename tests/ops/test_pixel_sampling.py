@@ -1,0 +1,183 @@
+"""Pixels drawn from a frame, against NumPy: bit for bit."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from tests.reference import pixel_sampling as reference
+
+CAMERA = (61.0, 59.5, 33.2, 21.7)
+SAMPLING = ops.PixelSampling(1000, min_depth=0.1, max_depth=6.0, step_px=3, max_jump=0.05, lattice_step=16)
+KEY = (2**33 + 5, ops.Stream.PIXEL_DATABASE, 17)
+
+
+def frame(generator, height=50, width=70, noise=0.004):
+    """Depth of a slanted wall with a box before it, holes and what sensors return for nothing; random colours."""
+    v, u = np.mgrid[:height, :width]
+    depth = 2.0 + 0.01 * (u - 31) - 0.004 * (v - 23)
+    depth[10:30, 20:40] -= 0.5
+    depth += noise * torch.randn(height, width, generator=generator).numpy()
+    depth[40:44, 5:9] = 0
+    depth[5, 50], depth[6, 52], depth[20, 10], depth[8, 8], depth[9, 9] = np.nan, np.inf, -1, 0.05, 6.1
+    color = torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
+    return torch.from_numpy(depth.astype(np.float32)), color
+
+
+def split(buffer, sampling, shape):
+    """Records, normals and lattice as the buffer holds them."""
+    words, rest = buffer.split([6 * sampling.count, len(buffer) - 6 * sampling.count])
+    records, normals = words.view(2, sampling.count, 3)
+    rows, columns = sampling.lattice_shape(*shape)
+    lattice = rest.view(torch.float16)
+    assert len(lattice) - rows * columns in (0, 1)
+    return records, normals.view(torch.float32), lattice[: rows * columns].view(rows, columns)
+
+
+def check_against_numpy(depth, color, sampling):
+    buffer, num_valid = ops.sample_frame_pixels(depth, color, *CAMERA, sampling, *KEY)
+    records, normals, lattice = split(buffer, sampling, depth.shape)
+    want = reference.sample_frame_pixels(depth.numpy(), color.numpy(), *CAMERA, sampling, *KEY)
+    assert num_valid == want[3]
+    np.testing.assert_array_equal(records.numpy(), want[0])
+    np.testing.assert_array_equal(normals.numpy(), want[1])
+    np.testing.assert_array_equal(lattice.numpy(), want[2])
+    return records, normals
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.004, 0.05])
+def test_pixels_are_those_of_numpy(noise, generator):
+    records, normals = check_against_numpy(*frame(generator, noise=noise), SAMPLING)
+    known = normals.any(1)
+    assert 0.3 < known.float().mean() < 1
+    assert torch.equal((records[:, 2] >> 24) & 0xFF == 0, ~known)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"count": 1},
+        {"count": 16},
+        {"count": 0},
+        {"count": 40_003},
+        {"lattice_step": 1},
+        {"lattice_step": 7},
+        {"lattice_step": 500},
+        {"step_px": 1},
+        {"step_px": 30},
+        {"max_jump": 10.0},
+        {"min_depth": 0.0, "max_depth": 1000.0},
+        {"min_depth": 2.1, "max_depth": 2.2},
+    ],
+)
+def test_any_setting(change, generator):
+    check_against_numpy(*frame(generator), dataclasses.replace(SAMPLING, **change))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 90), (90, 1), (5, 3), (33, 129)])
+def test_any_size_of_image(shape, generator):
+    depth = torch.rand(shape, generator=generator) * 3
+    color = torch.randint(0, 256, (*shape, 3), generator=generator, dtype=torch.uint8)
+    check_against_numpy(depth, color, SAMPLING)
+
+
+def test_half_precision_of_every_size_of_depth():
+    exponents = torch.arange(-26, 9).repeat_interleave(64)
+    depth = (2.0**exponents * (1 + torch.linspace(0, 1, 64).repeat(35) ** 2)).view(35, 64)
+    depth[3, :33] = 1 + torch.arange(33) / 2**14  # ties, to even
+    sampling = dataclasses.replace(SAMPLING, count=0, lattice_step=1, min_depth=0.0, max_depth=1e9)
+    buffer, _ = ops.sample_frame_pixels(depth, torch.zeros(35, 64, 3, dtype=torch.uint8), *CAMERA, sampling, *KEY)
+    assert torch.equal(split(buffer, sampling, depth.shape)[2], depth.half())
+    huge = torch.tensor([[65519.0, 65520.0, 1e30]])
+    buffer, _ = ops.sample_frame_pixels(
+        huge, torch.zeros(1, 3, 3, dtype=torch.uint8), *CAMERA, dataclasses.replace(sampling, max_depth=1e38), *KEY
+    )
+    assert torch.equal(split(buffer, sampling, huge.shape)[2], huge.half())
+
+
+def test_without_valid_depth_all_is_zero(generator):
+    depth, color = frame(generator)
+    for nothing in (torch.zeros_like(depth), torch.full_like(depth, torch.nan), torch.zeros(0, 0)):
+        shape = nothing.shape
+        buffer, num_valid = ops.sample_frame_pixels(nothing, color[: shape[0], : shape[1]], *CAMERA, SAMPLING, *KEY)
+        assert num_valid == 0
+        assert not buffer.any()
+
+
+def test_strided_images(generator):
+    depth, color = frame(generator)
+    want = ops.sample_frame_pixels(depth, color, *CAMERA, SAMPLING, *KEY)
+    got = ops.sample_frame_pixels(
+        depth.T.contiguous().T,
+        color.flip(2).flip(2).permute(2, 0, 1).contiguous().permute(1, 2, 0),
+        *CAMERA,
+        SAMPLING,
+        *KEY,
+    )
+    assert torch.equal(got[0], want[0])
+    assert got[1] == want[1]
+
+
+def test_the_key_decides(generator):
+    depth, color = frame(generator)
+    buffers = [
+        ops.sample_frame_pixels(depth, color, *CAMERA, SAMPLING, *key)[0]
+        for key in (KEY, KEY, (1, *KEY[1:]), (*KEY[:2], 18), (KEY[0], 3, KEY[2]))
+    ]
+    assert torch.equal(buffers[0], buffers[1])
+    assert all(not torch.equal(buffers[0], other) for other in buffers[2:])
+
+
+def test_threads_sample_side_by_side(generator):
+    frames = [frame(generator, height=40 + 7 * i) for i in range(6)]
+    want = [ops.sample_frame_pixels(*f, *CAMERA, SAMPLING, *KEY)[0] for f in frames]
+    wrong = []
+
+    def work(i):
+        for _ in range(20):
+            if not torch.equal(ops.sample_frame_pixels(*frames[i], *CAMERA, SAMPLING, *KEY)[0], want[i]):
+                wrong.append(i)
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(frames))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_wrong_arguments_are_named(generator):
+    depth, color = frame(generator)
+
+    def sample(depth=depth, color=color, fx=CAMERA[0], **change):
+        return ops.sample_frame_pixels(depth, color, fx, *CAMERA[1:], dataclasses.replace(SAMPLING, **change), *KEY)
+
+    for change, message in (
+        ({"count": -1}, r"count must be in \[0, 2\^30\], got -1"),
+        ({"min_depth": -1.0}, "min_depth must be at least 0, got -1.0"),
+        ({"step_px": 0}, r"step_px must be in \[1, 65535\], got 0"),
+        ({"max_jump": 0.0}, "max_jump must be positive, got 0.0"),
+        ({"lattice_step": 0}, r"lattice_step must be in \[1, 65535\], got 0"),
+        ({"fx": 0.0}, "fx must be positive, got 0.0"),
+        ({"color": color[1:]}, r"color must have shape \[50, 70, 3\], got \[49, 70, 3\]"),
+        ({"depth": torch.zeros(1, 70_000), "color": color}, r"depth must fit 16 bits a side, got \(1, 70000\)"),
+    ):
+        with pytest.raises(ValueError, match=f"sample_frame_pixels: {message}"):
+            sample(**change)
+    with pytest.raises(TypeError, match="sample_frame_pixels: depth must be float32, got float64"):
+        sample(depth=depth.double())
+    with pytest.raises(TypeError, match="sample_frame_pixels: color must be uint8, got float32"):
+        sample(color=color.float())
+
+
+def test_opcheck(generator):
+    depth, color = frame(generator)
+    numbers = (100, 0.1, 6.0, 3, 0.05, 16, 7, 0, 3)
+    torch.library.opcheck(
+        torch.ops.spslam.sample_frame_pixels,
+        (depth, color, *CAMERA, *numbers),
+        test_utils=("test_schema", "test_autograd_registration"),
+    )

@@ -1,0 +1,35 @@
+"""Sampling a frame's pixels, in NumPy: mask, draw, normals, packing, lattice, one after the other."""
+
+import numpy as np
+import torch
+
+from spslam import ops
+
+
+def usable_depth(depth: np.ndarray, min_depth: float, max_depth: float) -> np.ndarray:
+    """float32 [H, W] depth (m) with everything outside the range, and what is not finite, set to 0."""
+    usable = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.where((usable >= min_depth) & (usable <= max_depth), usable, np.float32(0)).astype(np.float32)
+
+
+def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSampling, seed, stream, frame):
+    """Records int32 [P, 3], normals float32 [P, 3], lattice float16 [h, w] and the number of valid pixels."""
+    depth = usable_depth(depth, sampling.min_depth, sampling.max_depth)
+    valid = np.flatnonzero(depth)
+    count = sampling.count if len(valid) else 0
+    chosen = valid[ops.sample_indices(seed, stream, frame, 0, count, max(len(valid), 1)).numpy()]
+    v, u = np.divmod(chosen, depth.shape[1])
+    pixels = torch.from_numpy(np.stack([u, v], 1).astype(np.int32))
+    normals = ops.depth_normals(
+        torch.from_numpy(depth), pixels, fx, fy, cx, cy, sampling.step_px, sampling.max_jump
+    ).numpy()
+    facing = np.abs(normals[:, 0] * ((u - cx) / fx) + normals[:, 1] * ((v - cy) / fy) + normals[:, 2])
+    rgbc = np.empty((count, 4), np.uint8)
+    rgbc[:, :3] = color.reshape(-1, 3)[chosen]
+    rgbc[:, 3] = np.clip(np.rint(facing * 128), 0, 255)
+    records = np.empty((count, 3), np.uint32)
+    records[:, 0] = u.astype(np.uint32) | (v.astype(np.uint32) << 16)
+    records[:, 1] = depth.ravel()[chosen].view(np.uint32)
+    records[:, 2] = rgbc.view(np.uint32)[:, 0]
+    step = sampling.lattice_step
+    return records.view(np.int32), normals, depth[step // 2 :: step, step // 2 :: step].astype(np.float16), len(valid)
