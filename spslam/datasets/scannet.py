@@ -155,4 +155,3 @@ def _find_camera(folder: Path, size: tuple[int, int], colors: list[Path]) -> Cam
         if (parent / _INTRINSICS[1]).is_file():
             return read_intrinsics_matrix(parent / _INTRINSICS[1], *first_size(colors)).resized(*size)
     raise DatasetError(f"{folder / 'intrinsic' / _INTRINSICS[0]}: no such file; it must hold depth's intrinsics")
-

@@ -113,9 +113,7 @@ class SensFile:
 
     def depth(self, frame: int) -> np.ndarray:
         """Depth image of a frame as stored, uint16 [H,W]. Raises DatasetError."""
-        content = self._bytes(
-            self.index.offsets[frame] + self.index.color_bytes[frame], self.index.depth_bytes[frame]
-        )
+        content = self._bytes(self.index.offsets[frame] + self.index.color_bytes[frame], self.index.depth_bytes[frame])
         name, (width, height) = f"{self.describe(frame)}, depth", self.header.depth_size
         if self.header.depth_compression == _ZLIB:
             try:
@@ -159,7 +157,9 @@ def _read_header(file: BinaryIO, path: Path) -> SensHeader:
         )
     sizes = (color_width, color_height), (depth_width, depth_height)
     if not all(0 < side <= _LARGEST_SIDE_PX for size in sizes for side in size):
-        raise DatasetError(f"{path}: image sizes must be within 1 and {_LARGEST_SIDE_PX} px, got {sizes[0]}, {sizes[1]}")
+        raise DatasetError(
+            f"{path}: image sizes must be within 1 and {_LARGEST_SIDE_PX} px, got {sizes[0]}, {sizes[1]}"
+        )
     if not 0 < units_per_metre < float("inf"):
         raise DatasetError(f"{path}: depth_shift must be positive, got {units_per_metre}")
     return SensHeader(

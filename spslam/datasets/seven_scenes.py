@@ -100,4 +100,3 @@ def _find_camera(sequence_folder: Path, colors: list[Path]) -> Camera:
         if (folder / INTRINSICS_FILE).is_file():
             return read_intrinsics_matrix(folder / INTRINSICS_FILE, width, height)
     return _DEFAULT_CAMERA.resized(width, height)
-

@@ -109,7 +109,9 @@ def test_times(tmp_path):
     timeless = open_scannet(write(tmp_path / "b.sens", [frame(i, time_us=0) for i in range(3)]))
     np.testing.assert_allclose(timeless.timestamps(), np.arange(3) / 30)
     twice = open_scannet(write(tmp_path / "c.sens", [frame(0), frame(1), frame(2, time_us=34_333)]))
-    with pytest.raises(DatasetError, match=r"c.sens, frame 2: must be later than frame 1, got the same time 0.033333 s"):
+    with pytest.raises(
+        DatasetError, match=r"c.sens, frame 2: must be later than frame 1, got the same time 0.033333 s"
+    ):
         twice[2]
     assert twice[1].pose is not None
     huge = open_scannet(write(tmp_path / "d.sens", [frame(i, time_us=2**64 - 50 + i) for i in range(2)]))
@@ -178,7 +180,10 @@ MATRICES, COMPRESSIONS = 12 + 15, 12 + 15 + 256
         (lambda content: changed(content, COMPRESSIONS, struct.pack("<2i", 2, 2)), "got 2 and 2"),
         (lambda content: changed(content, COMPRESSIONS + 8, bytes(4)), r"image sizes must be within 1 and 32768 px"),
         (lambda content: changed(content, COMPRESSIONS + 24, bytes(4)), "depth_shift must be positive, got 0.0"),
-        (lambda content: changed(content, MATRICES + 128, bytes(64)), "intrinsics of depth: .*matrix must have the form"),
+        (
+            lambda content: changed(content, MATRICES + 128, bytes(64)),
+            "intrinsics of depth: .*matrix must have the form",
+        ),
         (lambda content: content[:350], "must hold a whole frame, got none of 2"),
     ],
 )
