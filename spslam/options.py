@@ -47,9 +47,11 @@ class DatasetOptions(Section):
     min_depth_m: float = _option("depth nearer than this counts as not measured", "m", ge=0)
     max_depth_m: float = _option("depth farther than this counts as not measured", "m", gt=0, le=1000)
     border_px: int = _option("depth this close to the image's border counts as not measured", "px", ge=0, le=1000)
-    sequence: str | int | None = _text("7scenes: the sequence, `seq-03` or 3; null is the first that is there")
-    depth_variant: Literal["filtered", "exact"] | None = _text(
-        "synthetic_rgbd: the noisy depth or the exact one; null is the noisy one where it is there"
+    sequence: str | int | None = _text(
+        "7scenes: the sequence, `seq-03` or 3; `train` or `test` is the first of that split, null the first there is"
+    )
+    depth_variant: Literal["filtered", "noisy", "exact"] | None = _text(
+        "synthetic_rgbd: depth with filtered noise, with noise, or exact; null is the first that is there"
     )
     depth_scale: float | None = _option("folder: depth units a metre; null is what the files say", "1/m", gt=0)
     frames: int = _option("generated: length of the sequence; 300 go round the room once", "frames", ge=1)

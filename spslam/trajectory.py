@@ -65,9 +65,10 @@ class Trajectory:
         atomic_write(path, "\n".join(lines) + "\n")
 
     @classmethod
-    def load_tum(cls, path: str | os.PathLike) -> Trajectory:
+    def load_tum(cls, path: str | os.PathLike, skip_unknown: bool = False) -> Trajectory:
         """Read the TUM format; rows stay in the file's order. A file without a pose gives an empty trajectory.
 
+        With ``skip_unknown`` rows with a number that isn't finite are left out; they say that the pose is unknown.
         Raises DatasetError, naming file and line, for a missing file or a line that isn't eight finite numbers
         with a quaternion of a length above 0.
         """
@@ -81,19 +82,21 @@ class Trajectory:
             if line.startswith(_LOST):
                 lost_frames = [int(word) for word in line[len(_LOST) :].split() if word.isdigit()]
             elif line.strip() and not line.startswith("#"):
-                rows.append(_parse_row(path, number, line))
+                row = _parse_row(path, number, line, skip_unknown)
+                if np.all(np.isfinite(row)):
+                    rows.append(row)
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
         lost = np.zeros(len(table), dtype=bool)
         lost[[frame for frame in lost_frames if frame < len(table)]] = True
         return cls(table[:, 0], pose7_to_matrix(table[:, [7, 4, 5, 6, 1, 2, 3]]), lost)
 
 
-def _parse_row(path: Path, number: int, line: str) -> list[float]:
+def _parse_row(path: Path, number: int, line: str, may_be_unknown: bool) -> list[float]:
     try:
         row = [float(word) for word in line.replace(",", " ").split()]
     except ValueError:
         row = []
-    if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
+    if len(row) != 8 or not any(row[4:]) or not (may_be_unknown or np.all(np.isfinite(row))):
         raise DatasetError(
             f"{path}, line {number}: must be `timestamp tx ty tz qx qy qz qw`, got {line.strip()[:80]!r}"
         )

@@ -14,11 +14,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> None:
-    from spslam.datasets import open_dataset
+    from spslam.datasets import open_dataset, sequence_options
     from spslam.datasets.inspection import inspect_dataset
 
     config = load_config(args.config, None, overrides(args))
-    found = inspect_dataset(open_dataset(config.dataset))
+    for number, options in enumerate(sequence_options(config.dataset)):
+        if number:
+            print()
+        _print(inspect_dataset(open_dataset(options)))
+
+
+def _print(found: Inspection) -> None:
     for name, text in _rows(found):
         print(f"{name:<14}{text}")
     for problem in found.problems:

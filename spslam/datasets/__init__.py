@@ -2,7 +2,7 @@
 
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.prefetch import Prefetcher, prefetch
-from spslam.datasets.registry import dataset_types, open_dataset, open_sequence
+from spslam.datasets.registry import dataset_types, open_dataset, open_sequence, sequence_options
 
 __all__ = [
     "Prefetcher",
@@ -13,4 +13,5 @@ __all__ = [
     "open_dataset",
     "open_sequence",
     "prefetch",
+    "sequence_options",
 ]

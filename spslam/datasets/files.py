@@ -13,7 +13,7 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.images import read_color, read_depth, resized_color
-from spslam.datasets.text import read_pose
+from spslam.datasets.text import read_pose, read_pose_table
 from spslam.errors import DatasetError
 
 
@@ -140,14 +140,34 @@ def pair_numbered(
     frames = {}
     numbers = sorted({*colors, *depths})
     for number in numbers:
-        color, depth = colors.get(number), depths.get(number)
-        fault = None
-        if color is None or depth is None:
-            kind, present = ("colour", depth) if color is None else ("depth", color)
-            fault = f"{present}: the {kind} image of this frame is missing"
-        timestamp = (number - numbers[0]) / frames_per_second
-        frames[number] = FramePaths(color or depth, depth or color, timestamp, fault)  # type: ignore[arg-type]
+        frames[number] = paired(colors.get(number), depths.get(number), (number - numbers[0]) / frames_per_second)
     return frames
+
+
+def paired(color: Path | None, depth: Path | None, timestamp: float) -> FramePaths:
+    """The frame of a colour and a depth image, one of which may be missing: then it is one with a fault."""
+    fault = None
+    if color is None or depth is None:
+        kind, present = ("colour", depth) if color is None else ("depth", color)
+        fault = f"{present}: the {kind} image of this frame is missing"
+    return FramePaths(color or depth, depth or color, timestamp, fault)  # type: ignore[arg-type]
+
+
+def attach_pose_table(frames: Mapping[int, FramePaths], table_path: Path) -> tuple[list[FramePaths], np.ndarray | None]:
+    """The frames in order, and their poses [F,4,4] from row ``number`` of a table, see ``text.read_pose_table``.
+
+    NaN for frames beyond the table; None where there is no table. A frame whose pose is no rigid motion becomes one
+    with a fault.
+    """
+    if not table_path.is_file():
+        return list(frames.values()), None
+    table, faults = read_pose_table(table_path)
+    numbers = np.array(list(frames), dtype=np.int64)
+    poses = np.full((len(frames), 4, 4), np.nan)
+    known = numbers < len(table)
+    poses[known] = table[numbers[known]]
+    attached = [replace(frame, fault=frame.fault or faults.get(number)) for number, frame in frames.items()]
+    return attached, poses
 
 
 def attach_poses(

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, FramePaths, require_folder
+from spslam.datasets.files import FileDataset, FramePaths, attach_pose_table, paired, require_folder
 from spslam.datasets.images import first_size, read_depth
-from spslam.datasets.text import camera_from_matrix, read_intrinsics_matrix, read_json, read_pose_table
+from spslam.datasets.text import camera_from_matrix, read_intrinsics_matrix, read_json
 from spslam.errors import DatasetError
 
 COLOR_FOLDERS = ("color", "rgb", "images")
@@ -57,7 +57,8 @@ def open_folder(folder: Path, depth_scale: float | None = None) -> FileDataset:
     if scale is not None and not 0 < scale < float("inf"):
         raise DatasetError(f"{folder}: depth_scale must be positive, got {scale}")
     _check_scale(frames, scale)
-    return FileDataset(f"folder/{folder.name}", camera, frames, _read_poses(folder / "poses.txt", len(frames)), scale)
+    frames, poses = attach_pose_table(dict(enumerate(frames)), folder / "poses.txt")
+    return FileDataset(f"folder/{folder.name}", camera, frames, poses, scale)
 
 
 def _color_folder(folder: Path) -> Path:
@@ -73,28 +74,24 @@ def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     ]
     if not paths:
         raise DatasetError(f"{folder}: must hold images ({', '.join(suffixes)}), got none")
-    return sorted(paths, key=_natural_order)
+    return sorted(paths, key=lambda path: _natural_order(path.name))
 
 
-def _natural_order(path: Path) -> list[tuple[int, str]]:
-    parts = re.split(r"(\d+)", path.name)
+def _natural_order(name: str) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
 def _pair(folder: Path, colors: list[Path], depths: list[Path]) -> list[FramePaths]:
-    by_stem = {path.stem: path for path in depths}
-    if any(color.stem in by_stem for color in colors):
-        return [_frame(i, color, by_stem.get(color.stem)) for i, color in enumerate(colors)]
+    color_of, depth_of = ({path.stem: path for path in paths} for paths in (colors, depths))
+    if color_of.keys() & depth_of.keys():
+        stems = sorted(color_of.keys() | depth_of.keys(), key=_natural_order)
+        return [paired(color_of.get(stem), depth_of.get(stem), i / FRAMES_PER_SECOND) for i, stem in enumerate(stems)]
     if len(colors) == len(depths):
-        return [_frame(i, *pair) for i, pair in enumerate(zip(colors, depths, strict=True))]
+        return [paired(*pair, i / FRAMES_PER_SECOND) for i, pair in enumerate(zip(colors, depths, strict=True))]
     raise DatasetError(
         f"{folder}: colour and depth images must have the same names or be as many, got {len(colors)} and {len(depths)}"
     )
-
-
-def _frame(index: int, color: Path, depth: Path | None) -> FramePaths:
-    fault = f"{color}: the depth image of this frame is missing" if depth is None else None
-    return FramePaths(color, depth or color, index / FRAMES_PER_SECOND, fault)
 
 
 def _read_intrinsics(folder: Path, width: int, height: int) -> tuple[Camera, float | None]:
@@ -150,12 +147,3 @@ def _check_median(path: Path, median: float, stored_median: float) -> None:
         f"{path}: median depth must be within {low:g} and {high:g} m, "
         f"got {median:.4g} m with depth_scale {stored_median / median:.4g}{suggestion}"
     )
-
-
-def _read_poses(path: Path, count: int) -> np.ndarray | None:
-    if not path.is_file():
-        return None
-    table = read_pose_table(path)
-    poses = np.full((count, 4, 4), np.nan)
-    poses[: len(table)] = table[:count]
-    return poses

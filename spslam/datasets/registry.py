@@ -12,10 +12,11 @@ from spslam.datasets.folder import open_folder
 from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.replica import open_replica
 from spslam.datasets.scannet import open_scannet
-from spslam.datasets.seven_scenes import open_seven_scenes
+from spslam.datasets.seven_scenes import SPLITS, list_sequences, open_seven_scenes
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
 from spslam.datasets.tum import open_tum
 from spslam.errors import DatasetError
+from spslam.options import DatasetOptions
 
 
 def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> RgbdDataset:
@@ -66,6 +67,24 @@ def open_sequence(config: Any, data_dir: str | os.PathLike | None = None, frames
         except DatasetError as error:
             fault = fault or error
     raise DatasetError(f"{dataset.name}: no frame can be read; the first: {fault}")
+
+
+def sequence_options(options: DatasetOptions) -> list[DatasetOptions]:
+    """One section of options for each sequence of the data, where ``options`` leaves open which one is meant.
+
+    A 7-Scenes scene of several sequences gives one for each; ``sequence: train`` or ``test`` one for each in
+    TrainSplit.txt or TestSplit.txt. Everything else gives the options as they are.
+
+    Raises
+    ------
+    DatasetError
+        For a missing folder, or a missing or malformed split file.
+    """
+    split = options.sequence if options.sequence in SPLITS else None
+    if options.type != "7scenes" or options.path is None or (options.sequence is not None and split is None):
+        return [options]
+    names = list_sequences(Path(options.path), str(split) if split else None)
+    return [options.model_copy(update={"sequence": name}) for name in names] or [options]
 
 
 def dataset_types() -> list[str]:

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, attach_pose_table, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import first_size
-from spslam.datasets.text import camera_from_matrix, read_json, read_pose_table
+from spslam.datasets.text import camera_from_matrix, read_json
 from spslam.errors import DatasetError
 
 CAMERA_FILE = "cam_params.json"
@@ -34,10 +34,9 @@ def open_replica(folder: Path) -> FileDataset:
     depths = find_numbered(results, r"depth(\d+)\.png")
     if not colors:
         raise DatasetError(f"{folder}: must hold results/frame000000.jpg and so on, got none")
-    frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
     camera, units_per_metre = _read_camera(_find_camera_file(folder), *first_size(colors.values()))
-    poses = _read_poses(folder / "traj.txt", np.array(list(frames)))
-    return FileDataset(f"replica/{folder.name}", camera, list(frames.values()), poses, units_per_metre)
+    frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "traj.txt")
+    return FileDataset(f"replica/{folder.name}", camera, frames, poses, units_per_metre)
 
 
 def _find_camera_file(folder: Path) -> Path:
@@ -58,13 +57,3 @@ def _read_camera(path: Path, width: int, height: int) -> tuple[Camera, float]:
         raise DatasetError(f"{path}: camera.scale must be positive, got {values['scale']}")
     matrix = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path)), float(values["scale"])
-
-
-def _read_poses(path: Path, numbers: np.ndarray) -> np.ndarray | None:
-    if not path.is_file():
-        return None
-    table = read_pose_table(path)
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    known = numbers < len(table)
-    poses[known] = table[numbers[known]]
-    return poses

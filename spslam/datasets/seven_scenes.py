@@ -17,6 +17,7 @@ from spslam.datasets.images import first_size
 from spslam.datasets.text import read_intrinsics_matrix, read_rows
 from spslam.errors import DatasetError
 
+SPLITS = ("train", "test")
 INTRINSICS_FILE = "camera-intrinsics.txt"
 FRAMES_PER_SECOND = 30.0
 # "The default intrinsics for this sensor", as the data set's page gives them for 640x480.
@@ -31,7 +32,8 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
     Parameters
     ----------
     folder : the scene (with ``seq-XX`` in it) or a sequence itself.
-    sequence : ``seq-03`` or its number. None is the first that is there.
+    sequence : ``seq-03`` or its number; ``train`` or ``test`` is the first of TrainSplit.txt or TestSplit.txt. None is
+        the first that is there.
 
     The camera is that of ``camera-intrinsics.txt`` in the sequence or the scene, else the data set's default
     (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite pose, has no
@@ -48,7 +50,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
     if not colors and not depths:
         raise DatasetError(
             f"{sequence_folder}: must hold 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
-            "a scene holds them in seq-01, seq-02, ..."
+            + _hint(sequence_folder)
         )
     camera = _find_camera(sequence_folder, list(colors.values()))
     frames, poses = attach_poses(
@@ -69,10 +71,15 @@ def list_sequences(scene: Path, split: str | None = None) -> list[str]:
     """
     if split is None:
         return sorted(path.name for path in require_folder(scene).glob("seq-*") if path.is_dir())
-    if split not in ("train", "test"):
+    if split not in SPLITS:
         raise ValueError(f"list_sequences: split must be 'train' or 'test', got {split!r}")
     rows = read_rows(scene / f"{split.capitalize()}Split.txt", columns=1)
     return sorted(_sequence_name("".join(row)) for row in rows)
+
+
+def _hint(folder: Path) -> str:
+    packed = sorted(path.name for path in folder.glob("seq-*.zip"))
+    return f"unpack {packed[0]} and its like first" if packed else "a scene holds them in seq-01, seq-02, ..."
 
 
 def _choose_sequence(folder: Path, sequence: str | int | None) -> Path:
@@ -83,6 +90,8 @@ def _choose_sequence(folder: Path, sequence: str | int | None) -> Path:
         return folder
     if sequence is None:
         return folder / names[0]
+    if sequence in SPLITS:
+        sequence = next(iter(list_sequences(folder, str(sequence))), str(sequence))
     name = _sequence_name(sequence)
     if name not in names:
         raise DatasetError(f"{folder}: sequence must be one of {', '.join(names)}, got {sequence}")

@@ -1,8 +1,9 @@
 """The layout of Neural RGB-D (Azinovic et al. 2022), which "Synthetic RGB-D" is distributed in.
 
-``images/imgN.png`` (or jpg), ``depth_filtered/depthN.png`` (noisy and filtered) and ``depth/depthN.png`` (exact),
-16-bit millimetres, ``poses.txt`` with four lines a frame (4x4 camera to world, OpenGL camera axes: x right, y up,
-z backward) and ``focal.txt`` with one number. The principal point is the image's middle.
+``images/imgN.png`` (or jpg), ``depth_filtered/depthN.png`` (noisy and filtered), ``depth_with_noise/depthN.png``
+(before the filter) and ``depth/depthN.png`` (exact), each in 16-bit millimetres, ``poses.txt`` with four lines a frame
+(4x4 camera to world, OpenGL camera axes: x right, y up, z backward) and ``focal.txt`` with one number. The principal
+point is the image's middle.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, attach_pose_table, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import first_size
-from spslam.datasets.text import camera_from_matrix, read_numbers, read_pose_table
+from spslam.datasets.text import camera_from_matrix, read_numbers
 from spslam.errors import DatasetError
 
 FRAMES_PER_SECOND = 30.0
-DEPTH_FOLDERS = {"filtered": "depth_filtered", "exact": "depth"}
+DEPTH_FOLDERS = {"filtered": "depth_filtered", "noisy": "depth_with_noise", "exact": "depth"}
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -28,7 +29,7 @@ def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileD
     Parameters
     ----------
     folder : the scene.
-    depth_variant : ``filtered`` (noisy) or ``exact``. None is filtered if it is there, else exact.
+    depth_variant : ``filtered``, ``noisy`` or ``exact``. None is the first of these that is there.
 
     A pose with NaN, or none for a frame, leaves that frame without one; ``poses.txt`` may be missing altogether.
 
@@ -41,10 +42,11 @@ def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileD
     depths = find_numbered(_depth_folder(folder, depth_variant), r"depth(\d+)\.png")
     if not colors:
         raise DatasetError(f"{folder}: must hold images/img0.png (or jpg) and so on, got none")
-    frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
     camera = _read_camera(folder / "focal.txt", *first_size(colors.values()))
-    poses = _read_poses(folder / "poses.txt", np.array(list(frames)))
-    return FileDataset(f"synthetic_rgbd/{folder.name}", camera, list(frames.values()), poses, units_per_metre=1000.0)
+    frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "poses.txt")
+    if poses is not None:
+        poses = poses @ _OPENCV_FROM_OPENGL
+    return FileDataset(f"synthetic_rgbd/{folder.name}", camera, frames, poses, units_per_metre=1000.0)
 
 
 def _depth_folder(folder: Path, variant: str | None) -> Path:
@@ -68,13 +70,3 @@ def _read_camera(path: Path, width: int, height: int) -> Camera:
     focal = numbers[0]
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path))
-
-
-def _read_poses(path: Path, numbers: np.ndarray) -> np.ndarray | None:
-    if not path.is_file():
-        return None
-    table = read_pose_table(path) @ _OPENCV_FROM_OPENGL
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    known = numbers < len(table)
-    poses[known] = table[numbers[known]]
-    return poses

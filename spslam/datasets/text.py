@@ -59,13 +59,22 @@ def read_pose(path: Path) -> np.ndarray:
     return checked_pose(numbers, str(path))
 
 
-def read_pose_table(path: Path) -> np.ndarray:
-    """Poses [F,4,4] of a file with 16 numbers each, row by row; NaN where the file has a non-finite number."""
+def read_pose_table(path: Path) -> tuple[np.ndarray, dict[int, str]]:
+    """Poses [F,4,4] of a file with 16 numbers each, row by row, and what is wrong with those that are no rigid motion.
+
+    NaN where the file has a non-finite number, and where the pose is wrong. Raises DatasetError for a file that isn't
+    made of sixteens of numbers.
+    """
     numbers = read_numbers(path)
     if numbers.size % 16:
         raise DatasetError(f"{path}: must have 16 numbers a pose, got {numbers.size} numbers")
-    poses = [checked_pose(row, f"{path}, pose {i}") for i, row in enumerate(numbers.reshape(-1, 16))]
-    return np.array(poses).reshape(-1, 4, 4)
+    poses, faults = np.full((numbers.size // 16, 4, 4), np.nan), {}
+    for i, row in enumerate(numbers.reshape(-1, 16)):
+        try:
+            poses[i] = checked_pose(row, f"{path}, pose {i}")
+        except DatasetError as error:
+            faults[i] = str(error)
+    return poses, faults
 
 
 def checked_pose(numbers: np.ndarray, name: str) -> np.ndarray:

@@ -59,8 +59,8 @@ def open_tum(folder: Path) -> FileDataset:
     The camera is that of ``calibration.txt`` in the folder (fx fy cx cy, then up to five distortion coefficients), else
     the one named in the folder's name (``freiburg1`` or ``fr1``, ...), else ROS's default. Lists may be unsorted; of
     lines with the same timestamp the first counts. Colour images without a depth image within 0.02 s are left out.
-    Frames outside the time of ``groundtruth.txt``, or in a gap of over 0.1 s in it, have no pose; the file may be
-    missing.
+    Frames outside the time of ``groundtruth.txt``, or in a gap of over 0.1 s in it, have no pose; its rows with a
+    number that isn't finite are left out, and the file may be missing.
 
     Raises
     ------
@@ -166,6 +166,6 @@ def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tu
 def _interpolated_truth(path: Path, times: np.ndarray) -> np.ndarray | None:
     if not path.is_file():
         return None
-    truth = Trajectory.load_tum(path)
+    truth = Trajectory.load_tum(path, skip_unknown=True)
     timestamps, first = np.unique(truth.timestamps, return_index=True)
     return interpolate_trajectory(Trajectory(timestamps, truth.poses[first]), times, MAX_TRUTH_GAP_S)

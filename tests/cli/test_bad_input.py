@@ -142,5 +142,17 @@ def test_commands_on_a_finished_run_refuse_other_folders(tmp_path, command):
     assert_refused(spslam(command, "empty", cwd=tmp_path), "must be the output folder of a finished run, but has no ")
 
 
+def test_check_data_looks_at_every_sequence_of_a_scene(tmp_path, scene):
+    shutil.copytree(scene / "seq-01", scene / "seq-02")
+    (scene / "seq-02" / "frame-000001.depth.png").write_bytes(b"")
+    result = spslam("check-data", "7scenes", "--data", scene, cwd=tmp_path)
+    assert result.returncode == 0
+    first, second = result.stdout.split("\n\n")
+    assert "seq-01" in first
+    assert "seq-02" in second
+    assert "! unreadable: " in second
+    assert "frame-000001.depth.png: the file is empty" in second
+
+
 def test_check_data_refuses_what_run_refuses(tmp_path):
     assert_refused(spslam("check-data", "7scenes", "--data", "absent", cwd=tmp_path), "absent: no such folder")

@@ -3,7 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from spslam.datasets import dataset_types, open_dataset, open_sequence
+from spslam.config import load_config
+from spslam.datasets import dataset_types, open_dataset, open_sequence, sequence_options
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
 from tests.datasets.layouts import (
@@ -63,6 +64,24 @@ def test_common_options(tmp_path):
 def test_the_argument_overrides_the_path(tmp_path):
     folder = write_folder(tmp_path / "data")
     assert len(open_dataset(SimpleNamespace(type="folder", path="elsewhere"), str(folder))) == 3
+
+
+def test_one_section_of_options_a_sequence(tmp_path):
+    scene = write_seven_scenes(tmp_path / "scene", count=1, sequences=("seq-01", "seq-02"))
+    (scene / "TestSplit.txt").write_text("sequence2\n")
+
+    def sequences(*overrides):
+        options = load_config("7scenes", overrides=[("dataset.path", str(scene)), *overrides]).dataset
+        return [found.sequence for found in sequence_options(options)]
+
+    assert sequences() == ["seq-01", "seq-02"]
+    assert sequences("dataset.sequence=test") == ["seq-02"]
+    assert sequences("dataset.sequence=1") == [1]
+    assert sequences(("dataset.path", str(scene / "seq-01"))) == [None]
+    assert sequences("dataset.type=tum") == [None]
+    assert sequences(("dataset.path", None)) == [None]
+    with pytest.raises(DatasetError, match="TrainSplit.txt: no such file"):
+        sequences("dataset.sequence=train")
 
 
 def test_errors():

@@ -55,6 +55,24 @@ def test_sequences(tmp_path):
         open_seven_scenes(scene, 5)
 
 
+def test_the_first_sequence_of_a_split(tmp_path):
+    scene = write_seven_scenes(tmp_path, count=1, sequences=("seq-01", "seq-02", "seq-03"))
+    (scene / "TestSplit.txt").write_text("sequence3\n")
+    (scene / "TrainSplit.txt").write_text("sequence2\nsequence1\n")
+    assert open_seven_scenes(scene, "test").name.endswith("seq-03")
+    assert open_seven_scenes(scene, "train").name.endswith("seq-01")
+    (scene / "TestSplit.txt").unlink()
+    with pytest.raises(DatasetError, match="TestSplit.txt: no such file"):
+        open_seven_scenes(scene, "test")
+
+
+def test_packed_sequences_are_pointed_out(tmp_path):
+    (tmp_path / "seq-02.zip").touch()
+    (tmp_path / "seq-01.zip").touch()
+    with pytest.raises(DatasetError, match="got none; unpack seq-01.zip and its like first"):
+        open_seven_scenes(tmp_path)
+
+
 def test_rotations_are_projected_to_so3(tmp_path):
     scene = write_seven_scenes(tmp_path, count=1)
     pose = np.eye(4)

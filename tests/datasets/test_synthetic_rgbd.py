@@ -6,7 +6,7 @@ import pytest
 from spslam.camera import Camera
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
 from spslam.errors import DatasetError
-from tests.datasets.layouts import color_image, depth_metres, poses, shared_data, write_synthetic_rgbd
+from tests.datasets.layouts import color_image, depth_metres, poses, shared_data, write_depth, write_synthetic_rgbd
 
 
 def test_a_scene(tmp_path):
@@ -28,7 +28,7 @@ def test_depth_variants(tmp_path):
     np.testing.assert_allclose(open_synthetic_rgbd(scene)[1].depth, depth_metres(1), atol=1e-6)
     with pytest.raises(DatasetError, match=r"depth_filtered: no such folder; there is depth \(depth_variant: exact\)"):
         open_synthetic_rgbd(scene, "filtered")
-    with pytest.raises(DatasetError, match="depth_variant must be one of filtered, exact, got best"):
+    with pytest.raises(DatasetError, match="depth_variant must be one of filtered, noisy, exact, got best"):
         open_synthetic_rgbd(scene, "best")
 
 
@@ -49,7 +49,6 @@ def test_poses_with_nan_missing_and_absent(tmp_path):
         ("focal.txt", "", "focal.txt: must hold one number, the focal length in pixels, got 0"),
         ("focal.txt", "-3", "focal.txt: Camera: fx must be positive, got -3"),
         ("poses.txt", "1 0 0 0\n", "poses.txt: must have 16 numbers a pose, got 4 numbers"),
-        ("poses.txt", "2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "poses.txt, pose 0: must be a rotation and a translation"),
         ("poses.txt", "oops", "poses.txt: must hold numbers only"),
     ],
 )
@@ -58,6 +57,23 @@ def test_broken_text_files(tmp_path, name, text, message):
     (scene / name).write_text(text)
     with pytest.raises(DatasetError, match=message):
         open_synthetic_rgbd(scene)
+
+
+def test_a_pose_that_is_no_motion_is_its_frame_s_fault(tmp_path):
+    scene = write_synthetic_rgbd(tmp_path, count=2)
+    (scene / "poses.txt").write_text("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1\n" + "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n")
+    dataset = open_synthetic_rgbd(scene)
+    with pytest.raises(DatasetError, match="poses.txt, pose 0: must be a rotation and a translation"):
+        dataset[0]
+    assert dataset[1].pose is not None
+
+
+def test_noisy_depth_is_a_variant(tmp_path):
+    scene = write_synthetic_rgbd(tmp_path, count=1)
+    with pytest.raises(DatasetError, match="depth_with_noise: no such folder; there is depth_filtered"):
+        open_synthetic_rgbd(scene, "noisy")
+    write_depth(scene / "depth_with_noise" / "depth0.png", depth_metres(0) + 0.2)
+    np.testing.assert_allclose(open_synthetic_rgbd(scene, "noisy")[0].depth, depth_metres(0) + 0.2, atol=1e-6)
 
 
 def test_wrong_layouts(tmp_path):
