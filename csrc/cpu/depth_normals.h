@@ -45,11 +45,13 @@ inline void smoothed_depths(const PaddedDepth& depth, const std::int32_t (&place
                             float (&smoothed)[kPixelBatch]) {
   alignas(64) float center[kPixelBatch], weights[kPixelBatch] = {}, differences[kPixelBatch] = {};
   SPS_SIMD for (int i = 0; i < kPixelBatch; ++i) center[i] = depth.origin()[places[i]];
+  // Looked up before: a choice between constants within the loop keeps a compiler from unrolling it.
+  const float spatial[kSmoothingRadius + 1] = {smoothing_weight(0), smoothing_weight(1), smoothing_weight(2)};
   for (int dv = -kSmoothingRadius; dv <= kSmoothingRadius; ++dv) {
     for (int du = -kSmoothingRadius; du <= kSmoothingRadius; ++du) {
       const float* shifted = depth.origin() + dv * depth.stride() + du;
-      const float row_weight = smoothing_weight(dv);
-      const float column_weight = smoothing_weight(du);
+      const float row_weight = spatial[dv < 0 ? -dv : dv];
+      const float column_weight = spatial[du < 0 ? -du : du];
       SPS_SIMD for (int i = 0; i < kPixelBatch; ++i) {
         add_to_window(center[i], shifted[places[i]], row_weight, column_weight, weights[i], differences[i]);
       }
