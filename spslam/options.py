@@ -193,8 +193,10 @@ class RunOptions(Section):
     """How the frames are read and what is kept on the way."""
 
     checkpoint_every: int = _option("save the state to resume from after this many frames; 0 never", "frames", ge=0)
-    prefetch_workers: int = _option("threads that read and decode images", "threads", ge=1)
-    prefetch_ahead: int = _option("most frames read ahead", "frames", ge=1)
+    prefetch_workers: int | None = _option(
+        "threads that read and decode images; null is as many as suit the cores and the device", "threads", ge=1
+    )
+    prefetch_ahead: int | None = _option("most frames read ahead; null is two a thread", "frames", ge=1)
     previews: int = _option("input frames kept as pictures for the report", "frames", ge=0)
 
 

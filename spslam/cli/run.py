@@ -11,6 +11,7 @@ from spslam.cli.arguments import add_config, add_device, add_preset, add_quiet, 
 from spslam.cli.parser import UsageError
 from spslam.cli.progress import make_progress, print_summary
 from spslam.config import Config, load_config, resolve_config_path
+from spslam.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,12 +52,20 @@ def run(config: Config, output: Path, frames: slice | None, resume: bool, mesh: 
     try:
         return run_sequence(config, data, output, frames, resume, mesh, progress)
     except KeyboardInterrupt:
-        if (output / "checkpoint.safetensors").is_file():
+        if _can_go_on(output):
             raise KeyboardInterrupt(f"the same command with --output {output} --resume goes on") from None
+        raise
+    except DeviceError as error:
+        if _can_go_on(output):
+            raise DeviceError(f"{error}; what was done is in {output}, --resume goes on from there") from error
         raise
     finally:
         if progress is not None:
             progress.close()
+
+
+def _can_go_on(output: Path) -> bool:
+    return (output / "checkpoint.safetensors").is_file()
 
 
 def default_output(config: str) -> Path:

@@ -115,9 +115,9 @@ class Scene:
         parameters = (self.volume.embeddings, self.planes.texels, self.geometry_decoder, self.color_decoder)
         return sum(p.numel() * p.element_size() for p in parameters)
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Everything learnt, on the CPU and contiguous; views where it is there already, so clone what must stay."""
-        state = {
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Everything learnt, where it is; views, so clone what must stay as it is."""
+        return {
             "origin": self.origin,
             "volume.voxel_coords": self.volume.voxel_coords,
             "volume.embeddings": self.volume.embeddings,
@@ -127,7 +127,10 @@ class Scene:
             "geometry_decoder": self.geometry_decoder,
             "color_decoder": self.color_decoder,
         }
-        return {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """`tensors()` on the CPU and contiguous; views where they are so already."""
+        return {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors().items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replaces the content by that of `state_dict()`.

@@ -5,6 +5,7 @@ One safetensors file, written to a temporary file, synced and renamed: a kill at
 
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,28 +31,44 @@ def fingerprint(config: Config) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def save_checkpoint(path: Path, state: SlamState, config: Config, source: dict[str, Any]) -> None:
-    """Writes the state.
+# Rows of these are never changed once they are there, so a snapshot may share them.
+_APPENDED_ONLY = ("scene.volume.voxel_coords", "frames.lattices", "pixels.records")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The state after a frame, on the device it was on.
+
+    Attributes:
+        tensors: by name.
+        header: JSON object.
+    """
+
+    tensors: dict[str, torch.Tensor]
+    header: dict[str, Any]
+
+
+def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy: bool) -> Snapshot:
+    """The state as it will be when the device has done what it was given so far; the host waits for nothing.
 
     Args:
-        path: the file.
         state: after a whole frame.
         config: of the run.
         source: JSON object that names the data and where to go on, returned by `load_checkpoint`.
-
-    Raises:
-        OutputError: the file can't be written; the checkpoint before is left as it was.
+        copy: whether the snapshot must outlast further frames; else it shares the state's memory.
     """
     tensors = {
-        **_prefixed("scene.", state.scene.state_dict()),
-        **_prefixed("frames.", state.frames.state_dict()),
-        **_prefixed("pixels.", state.pixels.state_dict()),
+        **_prefixed("scene.", state.scene.tensors()),
+        **_prefixed("frames.", state.frames.tensors()),
+        **_prefixed("pixels.", {"records": state.pixels.records, "has_pixels": state.pixels.has_pixels}),
     }
     # Moments that the next mapping call resets anyway need no place.
     if not config.mapping.reset_moments:
         for name, moments in state.moments.items():
-            tensors[f"moments.{name}.first"] = moments.first.cpu()
-            tensors[f"moments.{name}.second"] = moments.second.cpu()
+            tensors[f"moments.{name}.first"] = moments.first
+            tensors[f"moments.{name}.second"] = moments.second
+    if copy:
+        tensors = {name: tensor if name in _APPENDED_ONLY else tensor.clone() for name, tensor in tensors.items()}
     header = {
         "format": FORMAT,
         "config": fingerprint(config),
@@ -60,14 +77,24 @@ def save_checkpoint(path: Path, state: SlamState, config: Config, source: dict[s
         "unmapped": state.unmapped,
         "source": source,
     }
-    save_tensors(path, tensors, header)
+    return Snapshot(tensors, header)
+
+
+def write_snapshot(path: Path, snapshot: Snapshot) -> None:
+    """Writes a checkpoint; on CUDA it waits for the current stream.
+
+    Raises:
+        OutputError: the file can't be written; the checkpoint before is left as it was.
+    """
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in snapshot.tensors.items()}
+    save_tensors(path, tensors, snapshot.header)
 
 
 def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, Any]:
     """Restores the state in place.
 
     Args:
-        path: a file written by `save_checkpoint`.
+        path: a file written by `write_snapshot`.
         state: a fresh state of the same configuration.
         config: of this run.
 

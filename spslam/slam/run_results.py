@@ -51,7 +51,7 @@ def write_results(
         **provenance(config, system.device),
         "frames": len(frames),
         **_speed(clock),
-        **_timings(files.read_log()),
+        **_timings(files.read_log(), clock),
         "lost_frames": int(frames.lost.sum()),
         "skipped_frames": len(skipped),
         **_sizes(system),
@@ -108,12 +108,12 @@ def _sizes(system: SlamSystem) -> dict[str, float]:
     return sizes
 
 
-def _timings(log: list[dict[str, Any]]) -> dict[str, float]:
-    """The timing figures of metrics.json, from the log."""
+def _timings(log: list[dict[str, Any]], clock: dict[str, Any]) -> dict[str, float]:
+    """The timing figures of metrics.json, from the log: where a frame's time goes, and iterations by themselves."""
     tracked = [line for line in log if line["tracking_iterations"]]
     mapped = [line for line in log if line["mapping_iterations"]]
     later = mapped[1:]
-    figures: dict[str, float] = {}
+    figures = _shares(log, clock)
     if tracked:
         seconds = sum(line["tracking_ms"] for line in tracked) / 1e3
         iterations = sum(line["tracking_iterations"] for line in tracked)
@@ -122,9 +122,19 @@ def _timings(log: list[dict[str, Any]]) -> dict[str, float]:
         figures["tracking_fps"] = len(tracked) / seconds
     if mapped:
         figures["first_mapping_s"] = mapped[0]["mapping_ms"] / 1e3
-        figures["encode_ms"] = sum(line["encode_ms"] for line in mapped) / len(mapped)
     if later:
         total = sum(line["mapping_iterations"] for line in later)
         figures["mapping_ms_per_iteration"] = sum(line["mapping_ms"] for line in later) / total
         figures["mapping_iterations"] = later[-1]["mapping_iterations"]
     return figures
+
+
+def _shares(log: list[dict[str, Any]], clock: dict[str, Any]) -> dict[str, float]:
+    """Milliseconds a frame, on average; waiting, the stages and the rest add up to the loop's time."""
+    frames = max(clock["frames"], 1)
+    figures = {
+        name: sum(line[name] for line in log) / frames
+        for name in ("upload_ms", "wait_ms", "tracking_ms", "encode_ms", "mapping_ms")
+    }
+    spent_ms = sum(figures.values()) - figures["upload_ms"]
+    return {**figures, "other_ms": max(1e3 * clock["wall_s"] / frames - spent_ms, 0.0)}

@@ -78,12 +78,12 @@ class FrameTable:
         """float64 [F, 4, 4] T_world_camera of the rows from `first` on; negative ones count from the end."""
         return pose7_to_matrix(self.poses[first:].cpu().numpy().astype(np.float64))
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """All columns on the CPU, as views where they are there already."""
-        return {name: column[: self._count].cpu() for name, column in self._columns.items()}
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All columns, where they are; views, so clone what must stay as it is."""
+        return {name: column[: self._count] for name, column in self._columns.items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Replaces the content by that of `state_dict()`."""
+        """Replaces the content by copies of what `tensors()` gave."""
         self._count = len(state["poses"])
         self._columns = {name: state[name].to(column.device, copy=True) for name, column in self._columns.items()}
 

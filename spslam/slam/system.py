@@ -1,8 +1,6 @@
 """The frame loop: what happens to one frame, in order."""
 
 import math
-import time
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,48 +10,16 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
 from spslam.prior import load_prior
+from spslam.slam.frame_feed import PreparedFrame, Upload
+from spslam.slam.frame_report import FrameMarks, FrameReport, PendingReport
 from spslam.slam.mapper import Mapper
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.state import SlamState, pose_tensor
+from spslam.slam.timeline import Mark, mark
 from spslam.slam.tracker import Tracker, TrackingResult
 from spslam.trajectory import Trajectory
 
 MAX_DISTANCE_M = 10_000.0  # a float32 still tells a millimetre there
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """What happened to one frame; a line of log.jsonl.
-
-    Attributes:
-        frame: number of the frame in the run, from 0.
-        index: its index in the data set.
-        timestamp: s.
-        lost: whether its pose is not to be trusted.
-        valid_depth: share of pixels with usable depth.
-        tracking_iterations, tracking_ms: of this frame; 0 for the first.
-        residual_cm: weighted RMS distance of its pixels to the map; None where it was not tracked.
-        inliers: share of its pixels on mapped surface; None where it was not tracked.
-        encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
-        mapping_iterations, mapping_ms: of the joint optimisation after this frame.
-        loss: total loss of the last mapping iteration; None where there was none.
-        voxels: allocated vertices.
-    """
-
-    frame: int
-    index: int
-    timestamp: float
-    lost: bool
-    valid_depth: float
-    tracking_iterations: int
-    tracking_ms: float
-    residual_cm: float | None
-    inliers: float | None
-    encode_ms: float
-    mapping_iterations: int
-    mapping_ms: float
-    loss: float | None
-    voxels: int
 
 
 class SlamSystem:
@@ -94,44 +60,48 @@ class SlamSystem:
         self.tracker = Tracker(config, camera)
         self.mapper = Mapper(config, camera, prior)
 
-    def process(self, frame: RgbdFrame, pixels: FramePixels | None = None) -> FrameReport:
-        """Takes the next frame in.
+    def process(self, frame: RgbdFrame) -> FrameReport:
+        """Takes the next frame in, and waits until the device is done with it.
 
         Args:
             frame: colour, depth, timestamp.
-            pixels: `sample_frame(frame, camera, config)`, if that was done ahead on another thread.
 
         Raises:
             SpslamError: the map or the pixels would pass a limit of the configuration. The frame has then been taken
                 in half, and the system must not be given another.
         """
-        if pixels is None:
-            pixels = sample_frame(frame, self.camera, self.config)
-        pixels = pixels.to(self.device)
+        pixels = sample_frame(frame, self.camera, self.config)
+        return self.submit(PreparedFrame(frame.index, frame.timestamp, pixels)).result()
+
+    def submit(self, frame: PreparedFrame) -> PendingReport:
+        """Takes the next frame in as `process` does, but waits only for its pose: mapping goes on behind."""
+        began = self._mark()
+        marks = FrameMarks(asked=frame.asked or began, began=began, done=began)
+        pixels = self._receive(frame, marks)
         number = len(self.state.frames)
-        tracked, tracking_ms = _timed(lambda: self._track(pixels, number))
+        tracked = self._track(pixels, number, marks)
         self.state.frames.append(tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice)
         self.state.pixels.add(pixels.records)
         # A lost frame must not touch the map.
         mapped = not tracked.lost and self._is_mapping_frame(number)
         self.state.unmapped = not mapped
-        encode_ms, mapping_ms, iterations, losses = self._map(pixels, number) if mapped else (0.0, 0.0, 0, None)
-        return FrameReport(
-            frame=number,
-            index=frame.index,
-            timestamp=frame.timestamp,
-            lost=bool(self.state.frames.lost[-1]),
-            valid_depth=pixels.valid_share,
-            tracking_iterations=tracked.iterations,
-            tracking_ms=tracking_ms,
-            residual_cm=_known(tracked.residual_cm),
-            inliers=_known(tracked.inlier_share),
-            encode_ms=encode_ms,
-            mapping_iterations=iterations,
-            mapping_ms=mapping_ms,
-            loss=None if losses is None else float(losses[0]),
-            voxels=self.state.scene.volume.num_voxels,
-        )
+        iterations, losses = self._map(pixels, marks) if mapped else (0, None)
+        loss = None if losses is None else _fetch(losses[0])
+        marks.done = self._mark()
+        known = {
+            "frame": number,
+            "index": frame.index,
+            "timestamp": frame.timestamp,
+            "lost": bool(self.state.frames.lost[-1]),
+            "valid_depth": pixels.valid_share,
+            "tracking_iterations": tracked.iterations,
+            "residual_cm": _known(tracked.residual_cm),
+            "inliers": _known(tracked.inlier_share),
+            "mapping_iterations": iterations,
+            "voxels": self.state.scene.volume.num_voxels,
+            "decode_ms": frame.decode_ms,
+        }
+        return PendingReport(known, marks, frame.wait_ms, loss)
 
     def finish(self) -> None:
         """Optimises once more if frames came after the last mapping call. Call it after the last frame."""
@@ -144,26 +114,41 @@ class SlamSystem:
         frames = self.state.frames
         return Trajectory(frames.timestamps.numpy().copy(), frames.matrices(), frames.lost.numpy().copy())
 
-    def _track(self, pixels: FramePixels, number: int) -> TrackingResult:
+    def _mark(self) -> Mark:
+        return mark(self.device)
+
+    def _receive(self, frame: PreparedFrame, marks: FrameMarks) -> FramePixels:
+        if not isinstance(frame.pixels, Upload):
+            return frame.pixels.to(self.device)
+        marks.upload = (frame.pixels.begin, frame.pixels.end)
+        return frame.pixels.received()
+
+    def _track(self, pixels: FramePixels, number: int, marks: FrameMarks) -> TrackingResult:
         if self.state.scene.volume.num_voxels == 0:
             pose = pose_tensor(self.first_pose, self.device)
             return TrackingResult(pose, 0, math.nan, math.nan, lost=self.tracker.is_blind(pixels))
+        begin = self._mark()
         start = self.tracker.predict(self.state.frames)
-        return self.tracker.track(self.state.scene, pixels, start, number)
+        tracked = self.tracker.track(self.state.scene, pixels, start, number)
+        marks.tracking = (begin, self._mark())
+        return tracked
 
     def _is_mapping_frame(self, number: int) -> bool:
         return number % self.config.mapping.every == 0 or self.state.scene.volume.num_voxels == 0
 
-    def _map(self, pixels: FramePixels, number: int) -> tuple[float, float, int, torch.Tensor | None]:
-        first = self.state.scene.volume.num_voxels == 0
-        _, encode_ms = _timed(lambda: self.mapper.integrate(self.state, pixels))
+    def _map(self, pixels: FramePixels, marks: FrameMarks) -> tuple[int, torch.Tensor | None]:
+        """Encodes and optimises; returns the number of iterations and the last one's losses."""
+        first, begin = self.state.scene.volume.num_voxels == 0, self._mark()
+        self.mapper.integrate(self.state, pixels)
+        marks.encode = (begin, self._mark())
         if self.state.scene.volume.num_voxels == 0:
             # Depth without a surface in it: the map must begin with a later frame, and so must the path.
             self.state.frames.lost[-1] = True
-            return encode_ms, 0.0, 0, None
+            return 0, None
         iterations = self.config.mapping.first_iterations if first else self.config.mapping.iterations
-        losses, mapping_ms = _timed(lambda: self.mapper.optimize(self.state, iterations))
-        return encode_ms, mapping_ms, iterations, losses
+        losses = self.mapper.optimize(self.state, iterations)
+        marks.mapping = (marks.encode[1], self._mark())
+        return iterations, losses
 
 
 def _check_first_pose(pose: np.ndarray) -> None:
@@ -180,7 +165,8 @@ def _known(number: float) -> float | None:
     return None if math.isnan(number) else number
 
 
-def _timed(call):
-    started = time.perf_counter()
-    result = call()
-    return result, 1e3 * (time.perf_counter() - started)
+def _fetch(number: torch.Tensor) -> torch.Tensor:
+    """A copy of a tensor [] that is on its way to the CPU; to be read once the device is done."""
+    if number.device.type == "cpu":
+        return number.clone()
+    return torch.empty_like(number, device="cpu", pin_memory=True).copy_(number, non_blocking=True)

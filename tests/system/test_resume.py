@@ -12,7 +12,7 @@ import pytest
 
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
-from spslam.slam import run as run_module
+from spslam.slam import run_loop
 from spslam.slam.run import run_sequence
 from tests.cli.command import ROOT
 from tests.system.sequences import FAST_SETTINGS, Recorded, results, run_on, settings, write_room
@@ -237,4 +237,4 @@ def test_a_damaged_checkpoint_is_one_line(monkeypatch, interrupted, size):
     [(0, 0, 500, False), (100, 0, 99, False), (100, 0, 100, True), (100, 5000, 5100, False), (100, 5000, 5556, True)],
 )
 def test_checkpoints_come_after_so_many_frames_or_a_tenth_of_all(every, last_saved, done, due):
-    assert run_module._is_checkpoint_due(every, last_saved, done) == due
+    assert run_loop._is_checkpoint_due(every, last_saved, done) == due

@@ -1,0 +1,98 @@
+"""Writing checkpoints beside the frame loop."""
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from spslam.config import Config
+from spslam.slam.checkpoint import Snapshot, take_snapshot, write_snapshot
+from spslam.slam.state import SlamState
+
+
+class CheckpointWriter:
+    """Writes one checkpoint at a time: on CUDA on a thread, from a snapshot on the device; on the CPU in place.
+
+    There a thread would have to copy the whole state first, and share the kernels' cores.
+
+    Args:
+        path: the checkpoint's file.
+        threaded: whether to write on a thread.
+    """
+
+    def __init__(self, path: Path, threaded: bool):
+        self.path, self.threaded = path, threaded
+        self._thread: threading.Thread | None = None
+        self._error: BaseException | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the last checkpoint is still being written."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def write(self, state: SlamState, config: Config, source: dict[str, Any], log_descriptor: int) -> None:
+        """Writes the state as it is now, after the log, which so holds the frames of every checkpoint.
+
+        Args:
+            state: after a whole frame.
+            config: of the run.
+            source: what `load_checkpoint` is to return.
+            log_descriptor: of the log, to which the frames' lines were written.
+
+        Raises:
+            OutputError: this or the last checkpoint can't be written; the one before is left as it was.
+        """
+        self.wait()
+        snapshot = take_snapshot(state, config, source, copy=self.threaded)
+        if not self.threaded:
+            _write(self.path, snapshot, log_descriptor)
+            return
+        device = state.scene.device
+        taken = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
+        write = _on_own_stream(device, taken, lambda: _write(self.path, snapshot, log_descriptor))
+        self._thread = threading.Thread(target=self._keep_error, args=(write,), name="spslam-checkpoint")
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Returns when nothing is being written any more; raises what went wrong since the last call."""
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def close(self) -> None:
+        """Returns when nothing is being written any more; an error of the last checkpoint is raised."""
+        self.wait()
+
+    def _keep_error(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except BaseException as error:  # raised again by `wait`
+            self._error = error
+
+
+def _write(path: Path, snapshot: Snapshot, log_descriptor: int) -> None:
+    # The log must hold the frames of every checkpoint, also after a power cut.
+    os.fsync(log_descriptor)
+    write_snapshot(path, snapshot)
+
+
+def _on_own_stream(
+    device: torch.device, taken: torch.cuda.Event | None, write: Callable[[], None]
+) -> Callable[[], None]:
+    """`write`, done on a stream that waits for the snapshot and for nothing that came after it."""
+    if taken is None:
+        return write
+
+    def write_on_stream() -> None:
+        stream = torch.cuda.Stream(device)
+        stream.wait_event(taken)
+        with torch.cuda.stream(stream):
+            write()
+
+    return write_on_stream

@@ -1,0 +1,86 @@
+"""The device of a run: choosing it, and what to say when it fails."""
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+
+from spslam import ops
+from spslam.errors import DeviceError
+
+_CPU_OUT_OF_MEMORY = "not enough memory"
+_CUDA_FAILED = ("CUDA error", "CUDA driver", "cudaError", "CUDA out of memory")
+
+
+def resolve_device(name: str) -> torch.device:
+    """The torch device of `auto`, `cpu`, `cuda` or `cuda:N`.
+
+    Raises:
+        DeviceError: the device is not there.
+    """
+    if name == "auto":
+        name = "cpu" if ops.CUDA_OFF_REASON else "cuda"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise DeviceError(f"device must be auto, cpu, cuda or cuda:N, got {name}") from None
+    if device.type == "cuda":
+        if ops.CUDA_OFF_REASON:
+            raise DeviceError(f"device {name} is not available: {ops.CUDA_OFF_REASON}; use --device cpu")
+        if device.index is not None and device.index >= torch.cuda.device_count():
+            raise DeviceError(f"device {name} is not available: there are {torch.cuda.device_count()} CUDA devices")
+    elif device.type != "cpu":
+        raise DeviceError(f"device must be auto, cpu, cuda or cuda:N, got {name}")
+    return device
+
+
+@contextlib.contextmanager
+def explained_failures(device: torch.device) -> Iterator[None]:
+    """Turns what torch raises when a device fails into one line that says what to change.
+
+    Raises:
+        DeviceError: memory is used up, or the GPU does not answer any more.
+    """
+    try:
+        yield
+    except (torch.OutOfMemoryError, MemoryError) as error:
+        raise _out_of_memory(device) from error
+    except RuntimeError as error:
+        if _CPU_OUT_OF_MEMORY in str(error):
+            raise _out_of_memory(torch.device("cpu")) from error
+        if any(mark in str(error) for mark in _CUDA_FAILED):
+            raise _failed(device, error) from error
+        raise
+
+
+def _out_of_memory(device: torch.device) -> DeviceError:
+    other = "another GPU or --device cpu" if device.type == "cuda" else "a machine with more memory"
+    return DeviceError(
+        f"{_name(device)} is out of memory{_in_use(device)}: lower pixels.budget_mb, choose a larger "
+        f"scene.voxel_size_m and scene.plane_cell_m, or use {other}"
+    )
+
+
+def _failed(device: torch.device, error: RuntimeError) -> DeviceError:
+    reason = str(error).splitlines()[0]
+    if "out of memory" in reason:
+        return _out_of_memory(device)
+    return DeviceError(
+        f"{_name(device)} has failed: {reason}; nvidia-smi shows its state, --device cpu does without it"
+    )
+
+
+def _name(device: torch.device) -> str:
+    return "the machine" if device.type == "cpu" else f"device {device}"
+
+
+def _in_use(device: torch.device) -> str:
+    """How much memory this process and all others hold; nothing where that can't be told."""
+    if device.type != "cuda":
+        return ""
+    try:
+        own = torch.cuda.memory_allocated(device)
+        free, total = torch.cuda.mem_get_info(device)
+    except (RuntimeError, AssertionError):
+        return ""
+    return f" ({own / 2**20:.0f} MB in use by this run, {free / 2**20:.0f} of {total / 2**20:.0f} MB free)"

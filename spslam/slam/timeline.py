@@ -1,0 +1,61 @@
+"""Marks on a device's own time line: what runs asynchronously is timed without waiting for it."""
+
+import time
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+
+
+class Mark(ABC):
+    """A place on a device's time line; marks of one kind can be compared."""
+
+    @abstractmethod
+    def has_passed(self) -> bool:
+        """Whether all work before the mark is done."""
+
+    @abstractmethod
+    def wait(self) -> None:
+        """Returns once all work before the mark is done; what other streams do is not waited for."""
+
+    @abstractmethod
+    def ms_since(self, earlier: Any) -> float:
+        """Milliseconds from an earlier mark to this one; both must have passed."""
+
+
+class HostMark(Mark):
+    """Now, for work that is done when its call returns."""
+
+    def __init__(self):
+        self._time_s = time.perf_counter()
+
+    def has_passed(self) -> bool:
+        return True
+
+    def wait(self) -> None:
+        pass
+
+    def ms_since(self, earlier: "HostMark") -> float:
+        return 1e3 * (self._time_s - earlier._time_s)
+
+
+class StreamMark(Mark):
+    """When a CUDA stream gets to this place in its queue."""
+
+    def __init__(self, stream: torch.cuda.Stream):
+        self.event = torch.cuda.Event(enable_timing=True)
+        self.event.record(stream)
+
+    def has_passed(self) -> bool:
+        return self.event.query()
+
+    def wait(self) -> None:
+        self.event.synchronize()
+
+    def ms_since(self, earlier: "StreamMark") -> float:
+        return earlier.event.elapsed_time(self.event)
+
+
+def mark(device: torch.device) -> Mark:
+    """When the device has done all it was given so far: on CUDA by this thread's current stream."""
+    return StreamMark(torch.cuda.current_stream(device)) if device.type == "cuda" else HostMark()

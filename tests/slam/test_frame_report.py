@@ -1,0 +1,77 @@
+"""Times of a frame's stages: they add up, and nobody is blamed for what ran beside."""
+
+import pytest
+import torch
+
+from spslam.slam.frame_report import FrameMarks, PendingReport
+from spslam.slam.timeline import mark
+
+
+class At:
+    """A mark at a given millisecond."""
+
+    def __init__(self, ms: float, passed: bool = True):
+        self.ms, self.passed, self.waited = ms, passed, False
+
+    def has_passed(self):
+        return self.passed
+
+    def wait(self):
+        self.waited = True
+
+    def ms_since(self, earlier):
+        return self.ms - earlier.ms
+
+
+def mapped_frame(**changes) -> FrameMarks:
+    marks = {
+        "asked": At(10),
+        "began": At(13),
+        "tracking": (At(13), At(15)),
+        "encode": (At(16), At(17)),
+        "mapping": (At(17), At(21)),
+        "upload": (At(4), At(4.5)),
+        "done": At(22),
+    }
+    return FrameMarks(**{**marks, **changes})
+
+
+def test_stages_and_the_rest_add_up():
+    times = mapped_frame().times_ms(host_wait_ms=2.5)
+    assert times == pytest.approx(
+        {"upload_ms": 0.5, "wait_ms": 2.5, "tracking_ms": 2, "encode_ms": 1, "mapping_ms": 4, "other_ms": 2.5}
+    )
+
+
+def test_waiting_counts_only_where_the_device_was_idle():
+    assert mapped_frame().times_ms(host_wait_ms=50)["wait_ms"] == 3
+    assert mapped_frame(began=At(10)).times_ms(host_wait_ms=50)["wait_ms"] == 0
+
+
+def test_stages_that_did_not_take_place_have_no_length():
+    times = mapped_frame(tracking=None, encode=None, mapping=None, upload=None).times_ms(0)
+    assert [times[f"{name}_ms"] for name in ("upload", "tracking", "encode", "mapping")] == [0, 0, 0, 0]
+    assert times["other_ms"] == 12
+
+
+def test_a_report_is_done_with_the_frames_last_mark():
+    known = {
+        "frame": 3, "index": 4, "timestamp": 0.1, "lost": False, "valid_depth": 0.9, "tracking_iterations": 8,
+        "residual_cm": 0.2, "inliers": 0.8, "mapping_iterations": 5, "voxels": 100, "decode_ms": 6.0,
+    }  # fmt: skip
+    marks = mapped_frame(done=At(22, passed=False))
+    pending = PendingReport(known, marks, 0.0, torch.tensor(0.25))
+    assert not pending.is_done()
+    report = pending.result()
+    assert marks.done.waited
+    assert (report.frame, report.loss, report.mapping_ms) == (3, 0.25, 4)
+
+
+def test_marks_of_a_device_are_in_order(device):
+    first = mark(device)
+    torch.ones(1000, device=device).sum()
+    second = mark(device)
+    second.wait()
+    assert first.has_passed()
+    assert second.has_passed()
+    assert second.ms_since(first) >= 0
