@@ -15,7 +15,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
 
-.PHONY: help demo test test-gpu dev lint example-cpp test-numpy
+.PHONY: help demo test test-gpu dev lint example-cpp
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -26,8 +26,8 @@ demo: dev ## track and map a generated room with known truth, into runs/demo
 test: dev ## build, then run the tests on the CPU
 	$(PYTHON) -m pytest
 
-test-gpu: ## run the tests that need a CUDA device, with the kernels that are there
-	$(PYTHON) -m pytest -m cuda
+test-gpu: ## run the tests that need a CUDA device, with the kernels that are there: built in place, or a wheel's
+	$(PYTHON) tests/run_on_gpu.py
 
 dev: $(ENVIRONMENT) ## build the kernels in place for this machine; SPSLAM_CUDA=ON for CUDA too
 	$(RUN) cmake -S . -B build/dev-$(SPSLAM_CUDA) -G Ninja \
@@ -44,11 +44,6 @@ example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, wi
 	$(RUN) cmake -S examples/cpp -B build/example-cpp -G Ninja -DCMAKE_PREFIX_PATH=$(CURDIR)/build/prefix
 	$(RUN) cmake --build build/example-cpp
 	$(RUN) ctest --test-dir build/example-cpp --output-on-failure
-
-test-numpy: dev ## install bindings/numpy and test it against the torch ops
-	SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps \
-	  --force-reinstall ./bindings/numpy
-	$(PYTHON) -m pytest bindings/numpy/tests
 
 lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .
