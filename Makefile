@@ -15,7 +15,7 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
 
-.PHONY: help demo test test-gpu dev lint example-cpp
+.PHONY: help demo test test-gpu dev lint example-cpp test-numpy
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -44,6 +44,11 @@ example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, wi
 	$(RUN) cmake -S examples/cpp -B build/example-cpp -G Ninja -DCMAKE_PREFIX_PATH=$(CURDIR)/build/prefix
 	$(RUN) cmake --build build/example-cpp
 	$(RUN) ctest --test-dir build/example-cpp --output-on-failure
+
+test-numpy: dev ## install bindings/numpy and test it against the torch ops
+	SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps \
+	  --force-reinstall ./bindings/numpy
+	$(PYTHON) -m pytest bindings/numpy/tests
 
 lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .

@@ -11,12 +11,23 @@ Intrinsics load_intrinsics(const std::vector<double>& intrinsics) {
           static_cast<float>(intrinsics[3])};
 }
 
+Tensor predict_pose(Tensor before, Tensor last) {
+  STD_TORCH_CHECK(before.numel() == kPoseSize && last.numel() == kPoseSize,
+                  "predict_pose: before and last must have 7 elements");
+  DeviceScope scope(last);
+  before = torch::stable::contiguous(before);
+  last = torch::stable::contiguous(last);
+  Tensor next = empty(last, {kPoseSize}, ScalarType::Float);
+  spslam::predict_pose(scope.context, data<float>(before), data<float>(last), mutable_data<float>(next));
+  return next;
+}
+
 std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> tensors, std::vector<double> scalars,
                                                       std::vector<std::int64_t> layout, Tensor pixels, Tensor pose,
                                                       std::vector<double> intrinsics, std::int64_t num_pixels,
                                                       std::int64_t iterations, double truncation, double kernel_start,
                                                       double kernel_end, double damping, std::int64_t seed,
-                                                      std::int64_t stream, std::int64_t frame) {
+                                                      std::int64_t stream, std::int64_t frame, bool tf32) {
   STD_TORCH_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
                   "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
   STD_TORCH_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
@@ -35,7 +46,8 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> tensor
                                 static_cast<float>(kernel_start),
                                 static_cast<float>(kernel_end),
                                 damping,
-                                philox_key(seed, stream, frame, 0)};
+                                philox_key(seed, stream, frame, 0),
+                                tf32};
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
                              workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
                              mutable_data<float>(hessian));
@@ -70,9 +82,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
   m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor pose, float[] intrinsics, int num_pixels, int iterations, float truncation, "
-        "float kernel_start, float kernel_end, float damping, int seed, int stream, int frame) "
+        "float kernel_start, float kernel_end, float damping, int seed, int stream, int frame, bool tf32=True) "
         "-> (Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
@@ -81,6 +94,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
 #endif
 
 SPS_LIBRARY_IMPL(m) {
+  m.impl("predict_pose", TORCH_BOX(&predict_pose));
   m.impl("track_gauss_newton", TORCH_BOX(&track_gauss_newton));
   m.impl("gauss_newton_poses", TORCH_BOX(&gauss_newton_poses));
 }

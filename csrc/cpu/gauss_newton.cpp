@@ -1,6 +1,6 @@
 #include "spslam/gauss_newton.h"
 
-#include "core/parallel.h"
+#include "core/for_each.h"
 #include "cpu/scene_tile.h"
 #include "kernels/gauss_newton.h"
 
@@ -59,6 +59,11 @@ void sum_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intri
 }  // namespace
 
 template <>
+void predict_pose<Cpu>(Cpu device, const float* before, const float* last, float* next) {
+  for_each(device, 1, [=](std::int64_t) { constant_speed_pose(before, last, next); });
+}
+
+template <>
 std::int64_t gauss_newton_workspace_size<Cpu>(Cpu, std::int64_t frames, std::int64_t pixels) {
   const std::int64_t chunks = chunk_count(pixels, kPixelGrain);
   return (frames > 0 ? frames : 1) * (chunks > 0 ? chunks : 1) * kTrackingTerms *
@@ -81,7 +86,9 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
     const float kernel = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
     sum_pixels(scene, net, options.intrinsics, load_pose(pose), options.truncation, kernel, options.num_pixels, record,
                static_cast<double*>(workspace), terms);
-    tracking_step(terms, options.damping, options.num_pixels, pose, stats + kTrackingStatSize * iteration, hessian);
+    float* own_stats = stats + kTrackingStatSize * iteration;
+    tracking_fit(terms, options.num_pixels, own_stats);
+    tracking_step(terms, options.damping, pose, own_stats + 2, hessian);
   }
 }
 

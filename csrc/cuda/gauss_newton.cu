@@ -1,17 +1,32 @@
-// Two launches an iteration: blocks of pixels to partial sums, and one warp that adds them in order and moves the pose.
-#include <cuda_runtime.h>
+// Tracking is one kernel for all iterations: each block sums its pixels' shares of the normal equations, waits for the
+// others at a barrier of the whole grid, and then takes the step by itself, so that one barrier an iteration is enough.
+#include <cooperative_groups.h>
 
+#include <algorithm>
+
+#include "core/cuda_check.cuh"
+#include "core/for_each.h"
+#include "cuda/geometry_fragments.cuh"
 #include "kernels/gauss_newton.h"
-#include "kernels/scene_element.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
 namespace {
 
-constexpr int kPixelThreads = 64;
+constexpr int kWarps = 4;
+constexpr int kThreads = kWarps * kWarpSize;
+constexpr int kBlockPixels = kWarps * kTileSamples;
+// A barrier of the whole grid needs all blocks resident at once: few enough for the smallest device.
+constexpr std::int64_t kMaxTrackingBlocks = 16;
+constexpr int kPaddedTerms = kWarpSize;  // kTrackingTerms, one a lane
+static_assert(kTrackingTerms <= kPaddedTerms, "one lane a term");
 
-__host__ __device__ std::int64_t block_count(std::int64_t pixels) {
-  return (pixels + kPixelThreads - 1) / kPixelThreads;
+std::int64_t block_count(std::int64_t pixels) {
+  return (pixels + kBlockPixels - 1) / kBlockPixels;
+}
+
+std::int64_t tracking_block_count(std::int64_t pixels) {
+  return std::min(block_count(pixels), kMaxTrackingBlocks);
 }
 
 // Which record pixel i of frame f is: drawn by Philox while tracking, the i-th of the frame otherwise.
@@ -21,67 +36,163 @@ struct PixelSource {
   bool drawn;
   PhiloxKey key;
 
-  __device__ const std::int32_t* record(std::int64_t frame, std::int64_t i) const {
+  // Of depth 0 past the frame's pixels.
+  __device__ Pixel load(std::int64_t frame, std::int64_t i) const {
+    if (i >= pixels_per_frame) return {};
     const std::int64_t at =
         drawn ? philox_index(key, static_cast<std::uint32_t>(i), num_records) : frame * pixels_per_frame + i;
-    return pixels + kPixelWords * at;
+    return unpack_pixel(pixels + kPixelWords * at);
   }
 };
 
-// partials[(frame * blocks + block) * kTrackingTerms]: sums over the block's pixels, lanes added in a fixed tree.
-__global__ void residual_kernel(SceneView scene, PixelSource source, const float* poses, Intrinsics camera,
-                                float truncation, float kernel, double* partials) {
-  __shared__ double sums[kPixelThreads];
-  const std::int64_t frame = blockIdx.y, i = blockIdx.x * std::int64_t{kPixelThreads} + threadIdx.x;
-  double terms[kTrackingTerms] = {};
-  if (i < source.pixels_per_frame) {
-    const Pixel pixel = unpack_pixel(source.record(frame, i));
-    const SurfacePoint point =
-        surface_point(pixel, load_pose(poses + kPoseSize * frame), camera.fx, camera.fy, camera.cx, camera.cy);
-    const Cell<float> cell = find_cell(scene.table, scene.corner_ids, (1.0f / scene.voxel_size) * point.world);
-    if (pixel.depth > 0.0f && cell.corner_ids) {
-      Vec3<float> gradient;
-      const float sdf = geometry_element(scene, point.world, cell, &gradient);
-      if (is_tracking_inlier(pixel.depth, true, sdf)) {
-        add_tracking_residual(point.offset, sdf, gradient, truncation, kernel, terms);
-      }
+struct Measurement {
+  Intrinsics camera;
+  float truncation, kernel;
+};
+
+// Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms.
+template <MlpPrecision kPrecision>
+__device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
+                                               const Measurement& measure, const Pose<float>& pose, const Pixel& pixel,
+                                               int lane, float* terms) {
+  const Intrinsics& k = measure.camera;
+  const SurfacePoint point = surface_point(pixel, pose, k.fx, k.fy, k.cx, k.cy);
+  std::int32_t voxel = kNoVoxel;
+  Cell<float> cell{nullptr, {0.0f, 0.0f, 0.0f}};
+  if (pixel.depth > 0.0f) {
+    cell = find_cell(scene.table, scene.corner_ids, (1.0f / scene.voxel_size) * point.world);
+    if (cell.corner_ids) voxel = static_cast<std::int32_t>((cell.corner_ids - scene.corner_ids) / kCellCorners);
+  }
+  Vec3<float> gradient;
+  const float sdf = geometry_tile(scene, network, point.world, cell.local, voxel, lane, gradient);
+  // Two lanes bring the same pixel; one adds it.
+  if (lane % 4 < 2 && is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf)) {
+    add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, terms);
+  }
+}
+
+// The pixels of one thread in the order in which it takes them: tile after tile of this block, then those of the next
+// iteration. Each is fetched one ahead, so that its way through memory overlaps the work on the one before.
+class PixelQueue {
+ public:
+  __device__ PixelQueue(const PixelSource& source, std::int64_t frame)
+      : source_(source),
+        frame_(frame),
+        own_(blockIdx.x * kBlockPixels + threadIdx.x / kWarpSize * kTileSamples + lane_sample(threadIdx.x % kWarpSize)),
+        at_(own_),
+        next_(source.load(frame, own_)) {}
+
+  // Whether the block still has pixels in this iteration; if not, the next iteration begins.
+  __device__ bool pop(Pixel& pixel) {
+    if (at_ - own_ + blockIdx.x * kBlockPixels >= source_.pixels_per_frame) {
+      at_ = own_;
+      return false;
+    }
+    pixel = next_;
+    at_ += static_cast<std::int64_t>(gridDim.x) * kBlockPixels;
+    if (at_ - own_ + blockIdx.x * kBlockPixels < source_.pixels_per_frame) {
+      next_ = source_.load(frame_, at_);
+    } else {
+      ++source_.key.iteration;
+      next_ = source_.drawn ? source_.load(frame_, own_) : Pixel{};
+    }
+    return true;
+  }
+
+ private:
+  PixelSource source_;
+  std::int64_t frame_, own_, at_;
+  Pixel next_;
+};
+
+// Sums over the pixels of a frame that this block takes; thread t < 32 returns term t.
+template <MlpPrecision kPrecision>
+__device__ __forceinline__ double sum_block(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
+                                            const Measurement& measure, const Pose<float>& pose, PixelQueue& queue,
+                                            float (&sums)[kWarps][kPaddedTerms]) {
+  const int lane = threadIdx.x % kWarpSize, warp = threadIdx.x / kWarpSize;
+  float terms[kPaddedTerms] = {};
+  for (Pixel pixel; queue.pop(pixel);) add_pixel_tile(scene, network, measure, pose, pixel, lane, terms);
+  sums[warp][lane] = transpose_sum(terms, lane);
+  __syncthreads();
+  double sum = 0.0;
+  if (warp == 0) {
+    for (int w = 0; w < kWarps; ++w) sum += static_cast<double>(sums[w][lane]);
+  }
+  return sum;
+}
+
+// terms[t] = sum over blocks of partials[block][t], each warp a strided share, the shares added in order.
+__device__ void add_partials(const double* partials, std::int64_t blocks, double (&shares)[kWarps][kPaddedTerms],
+                             double* terms) {
+  const int lane = threadIdx.x % kWarpSize, warp = threadIdx.x / kWarpSize;
+  double sum = 0.0;
+  for (std::int64_t b = warp; b < blocks; b += kWarps) sum += __ldcg(partials + b * kPaddedTerms + lane);
+  shares[warp][lane] = sum;
+  __syncthreads();
+  if (warp == 0) {
+    double total = 0.0;
+    for (int w = 0; w < kWarps; ++w) total += shares[w][lane];
+    terms[lane] = total;
+  }
+  __syncthreads();
+}
+
+template <MlpPrecision kPrecision>
+__global__ void __launch_bounds__(kThreads)
+    track_kernel(SceneView scene, const std::int32_t* pixels, std::int64_t num_records, TrackingOptions options,
+                 double* partials, float* pose, float* stats, float* hessian) {
+  __shared__ GeometryNetwork<kPrecision> network;
+  __shared__ float sums[kWarps][kPaddedTerms];
+  __shared__ double shares[kWarps][kPaddedTerms], terms[kPaddedTerms];
+  __shared__ float own_pose[kPoseSize], own_stats[kTrackingStatSize], own_hessian[36];
+  network.load(scene.geometry_params);
+  if (threadIdx.x < kPoseSize) own_pose[threadIdx.x] = pose[threadIdx.x];
+  const PhiloxKey key{options.key.seed, options.key.stream, options.key.frame, 0};
+  PixelQueue queue({pixels, num_records, options.num_pixels, true, key}, 0);
+  __syncthreads();
+  for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
+    const Measurement measure{options.intrinsics, options.truncation,
+                              annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations)};
+    const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
+    // Two sets in turn: a block may be an iteration ahead of one that still reads.
+    double* shared_sums = partials + (iteration % 2) * gridDim.x * kPaddedTerms;
+    if (threadIdx.x < kPaddedTerms) __stcg(shared_sums + blockIdx.x * kPaddedTerms + threadIdx.x, sum);
+    cooperative_groups::this_grid().sync();
+    add_partials(shared_sums, gridDim.x, shares, terms);
+    if (threadIdx.x == 0) tracking_step(terms, options.damping, own_pose, own_stats + 2, own_hessian);
+    if (threadIdx.x == kWarpSize) tracking_fit(terms, options.num_pixels, own_stats);
+    __syncthreads();
+    if (blockIdx.x == 0 && threadIdx.x < kTrackingStatSize) {
+      stats[iteration * kTrackingStatSize + threadIdx.x] = own_stats[threadIdx.x];
     }
   }
-  double* out = partials + (frame * gridDim.x + blockIdx.x) * kTrackingTerms;
-  for (int t = 0; t < kTrackingTerms; ++t) {
-    sums[threadIdx.x] = terms[t];
-    __syncthreads();
-    for (int width = kPixelThreads / 2; width > 0; width /= 2) {
-      if (threadIdx.x < width) sums[threadIdx.x] += sums[threadIdx.x + width];
-      __syncthreads();
-    }
-    if (threadIdx.x == 0) out[t] = sums[0];
-    __syncthreads();
+  if (blockIdx.x != 0) return;
+  if (threadIdx.x < kPoseSize) pose[threadIdx.x] = own_pose[threadIdx.x];
+  if (threadIdx.x < 36) hessian[threadIdx.x] = own_hessian[threadIdx.x];
+}
+
+// partials[frame][block][term] of given pixels.
+__global__ void __launch_bounds__(kThreads)
+    residual_kernel(SceneView scene, PixelSource source, const float* poses, Measurement measure, double* partials) {
+  __shared__ GeometryNetwork<MlpPrecision::kFloat32> network;
+  __shared__ float sums[kWarps][kPaddedTerms];
+  network.load(scene.geometry_params);
+  __syncthreads();
+  const std::int64_t frame = blockIdx.y;
+  PixelQueue queue(source, frame);
+  const double sum = sum_block(scene, network, measure, load_pose(poses + kPoseSize * frame), queue, sums);
+  if (threadIdx.x < kPaddedTerms) {
+    partials[(frame * gridDim.x + blockIdx.x) * kPaddedTerms + threadIdx.x] = sum;
   }
 }
 
-// Lane t adds term t of all blocks, in order.
-__device__ void add_partials(const double* partials, std::int64_t blocks, double* terms) {
-  if (threadIdx.x < kTrackingTerms) {
-    double sum = 0.0;
-    for (std::int64_t b = 0; b < blocks; ++b) sum += partials[b * kTrackingTerms + threadIdx.x];
-    terms[threadIdx.x] = sum;
-  }
-  __syncwarp();
-}
-
-__global__ void tracking_step_kernel(const double* partials, std::int64_t blocks, double damping,
-                                     std::int64_t num_pixels, float* pose, float* stats, float* hessian) {
-  __shared__ double terms[kTrackingTerms];
-  add_partials(partials, blocks, terms);
-  if (threadIdx.x == 0) tracking_step(terms, damping, num_pixels, pose, stats, hessian);
-}
-
-__global__ void store_kernel(const double* partials, std::int64_t blocks, std::int64_t num_pixels, float* hessian,
-                             float* gradient, float* cost, float* inliers) {
-  __shared__ double terms[kTrackingTerms];
+__global__ void __launch_bounds__(kThreads)
+    store_kernel(const double* partials, std::int64_t blocks, std::int64_t num_pixels, float* hessian, float* gradient,
+                 float* cost, float* inliers) {
+  __shared__ double shares[kWarps][kPaddedTerms], terms[kPaddedTerms];
   const std::int64_t frame = blockIdx.x;
-  add_partials(partials + frame * blocks * kTrackingTerms, blocks, terms);
+  add_partials(partials + frame * blocks * kPaddedTerms, blocks, shares, terms);
   if (threadIdx.x != 0) return;
   double h[36], g[6], total;
   store_normal_terms<double>(terms, h, g, &total);
@@ -94,28 +205,33 @@ __global__ void store_kernel(const double* partials, std::int64_t blocks, std::i
 }  // namespace
 
 template <>
+void predict_pose<Cuda>(Cuda device, const float* before, const float* last, float* next) {
+  for_each(device, 1, [=] __device__(std::int64_t) { constant_speed_pose(before, last, next); });
+}
+
+template <>
 std::int64_t gauss_newton_workspace_size<Cuda>(Cuda, std::int64_t frames, std::int64_t pixels) {
-  const std::int64_t blocks = block_count(pixels);
-  return (frames > 0 ? frames : 1) * (blocks > 0 ? blocks : 1) * kTrackingTerms *
-         static_cast<std::int64_t>(sizeof(double));
+  const std::int64_t sets = std::max<std::int64_t>(frames * block_count(pixels), 2 * tracking_block_count(pixels));
+  return std::max<std::int64_t>(sets, 1) * kPaddedTerms * static_cast<std::int64_t>(sizeof(double));
 }
 
 template <>
 void track_gauss_newton<Cuda>(Cuda device, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
                               const TrackingOptions& options, void* workspace, float* pose, float* stats,
                               float* hessian) {
-  const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
   double* partials = static_cast<double*>(workspace);
-  const std::int64_t blocks = block_count(options.num_pixels);
-  for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
-    PixelSource source{pixels, num_records, options.num_pixels, true, options.key};
-    source.key.iteration = static_cast<std::uint32_t>(iteration);
-    const float kernel = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
-    residual_kernel<<<static_cast<unsigned>(blocks), kPixelThreads, 0, stream>>>(
-        scene, source, pose, options.intrinsics, options.truncation, kernel, partials);
-    tracking_step_kernel<<<1, 32, 0, stream>>>(partials, blocks, options.damping, options.num_pixels, pose,
-                                               stats + kTrackingStatSize * iteration, hessian);
-  }
+  void* arguments[] = {const_cast<SceneView*>(&scene),
+                       &pixels,
+                       &num_records,
+                       const_cast<TrackingOptions*>(&options),
+                       &partials,
+                       &pose,
+                       &stats,
+                       &hessian};
+  const auto kernel = options.tf32 ? track_kernel<MlpPrecision::kTf32> : track_kernel<MlpPrecision::kFloat32>;
+  SPS_CUDA_CHECK(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel),
+                                             dim3(static_cast<unsigned>(tracking_block_count(options.num_pixels))),
+                                             dim3(kThreads), arguments, 0, static_cast<cudaStream_t>(device.stream)));
 }
 
 template <>
@@ -130,10 +246,10 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
     const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
-    residual_kernel<<<grid, kPixelThreads, 0, stream>>>(scene, source, poses, intrinsics, truncation, kernel, partials);
+    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, {intrinsics, truncation, kernel}, partials);
   }
-  store_kernel<<<static_cast<unsigned>(frames), 32, 0, stream>>>(partials, blocks, pixels_per_frame, hessian, gradient,
-                                                                 cost, inliers);
+  store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, hessian,
+                                                                       gradient, cost, inliers);
 }
 
 }  // namespace spslam

@@ -31,19 +31,20 @@ SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pos
   return {offset + pose.translation, offset};
 }
 
-// Adds an inlier's residual. sdf is normalised, gradient its derivative by the world point (1/m).
+// Adds an inlier's residual to sums of type T. sdf is normalised, gradient its derivative by the world point (1/m).
+template <class T>
 SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
-                                      float truncation, float kernel, double* terms) {
+                                      float truncation, float kernel, T* terms) {
   const float residual = sdf * truncation;
   const Vec3<float> g = truncation * gradient;
   const Vec3<float> torque = cross(offset, g);
   const float ratio = residual / kernel;
   const float root = 1.0f / (1.0f + ratio * ratio);
-  const double jacobian[6] = {g.x, g.y, g.z, torque.x, torque.y, torque.z};
-  const double weight = static_cast<double>(root * root);
-  add_normal_terms<double>(jacobian, static_cast<double>(residual), weight, terms);
+  const T jacobian[6] = {g.x, g.y, g.z, torque.x, torque.y, torque.z};
+  const T weight = static_cast<T>(root * root);
+  add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
   terms[kNormalTerms] += weight;
-  terms[kNormalTerms + 1] += 1.0;
+  terms[kNormalTerms + 1] += T(1);
 }
 
 SPS_INLINE bool is_tracking_inlier(float depth, bool inside, float sdf) {
@@ -64,32 +65,47 @@ SPS_INLINE double tracking_cost(const double* terms) {
   return weights > 1e-6 ? terms[kNormalTerms - 1] / weights : 0.0;
 }
 
-// Solves the normal equations and moves the pose; writes the iteration's four statistics.
-SPS_INLINE void tracking_step(const double* terms, double damping, std::int64_t num_pixels, float* pose, float* stats,
-                              float* hessian) {
+// Solves the normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad).
+SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, float* steps, float* hessian) {
   double h[36], g[6], cost, delta[6];
   store_normal_terms<double>(terms, h, g, &cost);
   double trace = 0.0;
   for (int a = 0; a < 6; ++a) trace += h[a * 7];
   // The absolute part keeps directions that no pixel sees from moving.
   solve_damped_6x6<double>(h, g, damping, 1e-6 * trace + 1e-8, 1e-12, delta);
-  double norm = 0.0;
-  for (int a = 0; a < 6; ++a) norm += delta[a] * delta[a];
+  float step[6], norm = 0.0f;
+  for (int a = 0; a < 6; ++a) step[a] = static_cast<float>(delta[a]), norm += step[a] * step[a];
   norm = std::sqrt(norm);
-  const double scale = norm > kMaxTrackingStep ? kMaxTrackingStep / norm : 1.0;
-  const Vec3<float> dt{static_cast<float>(scale * delta[0]), static_cast<float>(scale * delta[1]),
-                       static_cast<float>(scale * delta[2])};
-  const Vec3<float> domega{static_cast<float>(scale * delta[3]), static_cast<float>(scale * delta[4]),
-                           static_cast<float>(scale * delta[5])};
+  const float scale = norm > kMaxTrackingStep ? kMaxTrackingStep / norm : 1.0f;
+  const Vec3<float> dt{scale * step[0], scale * step[1], scale * step[2]};
+  const Vec3<float> domega{scale * step[3], scale * step[4], scale * step[5]};
   const Quaternion<float> q =
       normalized(quaternion_exp(domega) * Quaternion<float>{pose[0], pose[1], pose[2], pose[3]});
   pose[0] = q.w, pose[1] = q.x, pose[2] = q.y, pose[3] = q.z;
   pose[4] += dt.x, pose[5] += dt.y, pose[6] += dt.z;
+  steps[0] = std::sqrt(dot(dt, dt));
+  steps[1] = std::sqrt(dot(domega, domega));
+  for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(h[i]);
+}
+
+// What an iteration's sums say of the pose before its step; columns 0, 1 and 4 of its statistics.
+SPS_INLINE void tracking_fit(const double* terms, std::int64_t num_pixels, float* stats) {
   stats[0] = static_cast<float>(tracking_cost(terms));
   stats[1] = static_cast<float>(terms[kNormalTerms + 1] / static_cast<double>(num_pixels));
-  stats[2] = std::sqrt(dot(dt, dt));
-  stats[3] = std::sqrt(dot(domega, domega));
-  for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(h[i]);
+  stats[4] = static_cast<float>(terms[kNormalTerms] / static_cast<double>(num_pixels));
+}
+
+// The pose after `before` and `last` if the camera goes on as it went, T1 T0^-1 T1, its w not negative.
+SPS_INLINE void constant_speed_pose(const float* before, const float* last, float* next) {
+  const Quaternion<double> q0 = normalized(Quaternion<double>{before[0], before[1], before[2], before[3]});
+  const Quaternion<double> q1 = normalized(Quaternion<double>{last[0], last[1], last[2], last[3]});
+  const Quaternion<double> turn = q1 * Quaternion<double>{q0.w, -q0.x, -q0.y, -q0.z};
+  const Quaternion<double> q = normalized(turn * q1);
+  const Vec3<double> t0{before[4], before[5], before[6]}, t1{last[4], last[5], last[6]};
+  const Vec3<double> t = rotation(turn) * (t1 - t0) + t1;
+  const double sign = q.w < 0.0 ? -1.0 : 1.0;
+  const double pose[7] = {sign * q.w, sign * q.x, sign * q.y, sign * q.z, t.x, t.y, t.z};
+  for (int i = 0; i < 7; ++i) next[i] = static_cast<float>(pose[i]);
 }
 
 }  // namespace spslam

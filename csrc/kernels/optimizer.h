@@ -28,11 +28,14 @@ SPS_INLINE void adam_update(const AdamCoefficients<T>& c, T& param, T& grad, T& 
 template <class V>
 SPS_INLINE void add_normal_terms(const V* jacobian, const V& residual, const V& weight, V* terms) {
   int term = 0;
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) {
     const V wj = weight * jacobian[a];
+    SPS_UNROLL
     for (int b = a; b < 6; ++b) terms[term++] += wj * jacobian[b];
   }
   const V wr = weight * residual;
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) terms[term++] += wr * jacobian[a];
   terms[term] += wr * residual;
 }
@@ -41,9 +44,12 @@ SPS_INLINE void add_normal_terms(const V* jacobian, const V& residual, const V& 
 template <class T>
 SPS_INLINE void store_normal_terms(const double* terms, T* hessian, T* gradient, T* cost) {
   int term = 0;
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) {
+    SPS_UNROLL
     for (int b = a; b < 6; ++b) hessian[a * 6 + b] = hessian[b * 6 + a] = static_cast<T>(terms[term++]);
   }
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) gradient[a] = static_cast<T>(terms[term++]);
   *cost = static_cast<T>(terms[term]);
 }
@@ -53,9 +59,12 @@ SPS_INLINE void store_normal_terms(const double* terms, T* hessian, T* gradient,
 template <class T>
 SPS_INLINE void solve_damped_6x6(const T* hessian, const T* gradient, double damping, double absolute_damping,
                                  double tolerance, T* delta) {
-  double l[6][6], d[6], x[6];
+  double l[6][6], d[6], inverse[6], x[6];
   bool solvable = true;
+  // Unrolled, as registers have no addresses; the only divisions are the six that nothing else waits beside.
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) {
+    SPS_UNROLL
     for (int b = 0; b <= a; ++b) {
       double sum = static_cast<double>(hessian[a * 6 + b]);
       double bound = 0.0;
@@ -63,24 +72,31 @@ SPS_INLINE void solve_damped_6x6(const T* hessian, const T* gradient, double dam
         sum += damping * sum + absolute_damping;
         bound = tolerance * sum;
       }
+      SPS_UNROLL
       for (int k = 0; k < b; ++k) sum -= l[a][k] * l[b][k] * d[k];
       if (a == b) {
         d[a] = sum;
+        inverse[a] = 1.0 / sum;
         solvable = solvable && sum > bound && std::isfinite(sum);
       } else {
-        l[a][b] = sum / d[b];
+        l[a][b] = sum * inverse[b];
       }
     }
   }
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) {
     x[a] = -static_cast<double>(gradient[a]);
+    SPS_UNROLL
     for (int k = 0; k < a; ++k) x[a] -= l[a][k] * x[k];
   }
+  SPS_UNROLL
   for (int a = 5; a >= 0; --a) {
-    x[a] /= d[a];
+    x[a] *= inverse[a];
+    SPS_UNROLL
     for (int k = a + 1; k < 6; ++k) x[a] -= l[k][a] * x[k];
     solvable = solvable && std::isfinite(x[a]);
   }
+  SPS_UNROLL
   for (int a = 0; a < 6; ++a) delta[a] = solvable ? static_cast<T>(x[a]) : T(0);
 }
 

@@ -2,7 +2,7 @@
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
-from spslam.ops.gauss_newton import gauss_newton_poses, track_gauss_newton
+from spslam.ops.gauss_newton import gauss_newton_poses, predict_pose, track_gauss_newton
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
@@ -47,6 +47,7 @@ __all__ = [
     "new_voxel_hash",
     "normal_equations",
     "philox_uniform",
+    "predict_pose",
     "query_color",
     "query_sdf",
     "query_sdf_gradient",

@@ -12,6 +12,30 @@ from spslam.ops._checks import check, check_tensor
 from spslam.ops.scene_view import Intrinsics, SceneView
 
 
+def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+    """The pose after two given ones if the camera goes on as it went, T1 T0^-1 T1; reads nothing back to the host.
+
+    Args:
+        before: float32 [7] T0 = T_world_camera, quaternion (w, x, y, z) and translation (m).
+        last: float32 [7] T1.
+
+    Returns:
+        float32 [7], its quaternion of norm 1 with w >= 0.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device.
+
+    Example:
+        >>> still = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
+        >>> moved = torch.tensor([1.0, 0, 0, 0, 0.25, 0, 0])
+        >>> predict_pose(still, moved)[4:]
+        tensor([0.5000, 0.0000, 0.0000])
+    """
+    check_tensor("predict_pose", "last", last, (7,), torch.float32)
+    check_tensor("predict_pose", "before", before, (7,), torch.float32, like=last)
+    return torch.ops.spslam.predict_pose(before, last)
+
+
 def track_gauss_newton(
     scene: SceneView,
     pixels: torch.Tensor,
@@ -27,8 +51,10 @@ def track_gauss_newton(
     seed: int,
     stream: int,
     frame: int,
+    tf32: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Tracks one frame against a frozen scene; all iterations in one call.
+    """Tracks one frame against a frozen scene; all iterations in one call, on CUDA in one kernel that never stops for
+    the host.
 
     Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the
     step to a norm of 0.15. The kernel width k goes geometrically from `kernel_start` to `kernel_end`, reached one
@@ -46,11 +72,14 @@ def track_gauss_newton(
         kernel_end: last width, m.
         damping: relative Levenberg damping.
         seed, stream, frame: keys of the draws, see `philox_uniform`.
+        tf32: on CUDA devices from sm_80 on, let tensor cores multiply in the decoder, with factors rounded to 10 bits
+            of mantissa: under 0.1 mm of SDF. Elsewhere, and without it, everything is float32.
 
     Returns:
-        float32 [7] pose; float32 [iterations, 4] with the weighted mean squared residual (m^2), the share of pixels on
-        mapped surface, and the norms of the step in translation (m) and rotation (rad); float32 [6, 6] H of the last
-        iteration. The same to the bit for any number of threads.
+        float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of pixels on
+        mapped surface, the norms of the step in translation (m) and rotation (rad), and the mean weight over all pixels
+        (0 for those off the map), each before the iteration's step; float32 [6, 6] H of the last iteration. The same to
+        the bit every time on one device, and for any number of CPU threads.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -85,6 +114,7 @@ def track_gauss_newton(
         seed,
         stream,
         frame,
+        tf32,
     )
 
 
@@ -123,9 +153,14 @@ def gauss_newton_poses(
     return torch.ops.spslam.gauss_newton_poses(*scene.arguments(), pixels, poses, list(intrinsics), truncation, kernel)
 
 
+@torch.library.register_fake("spslam::predict_pose")
+def _(before, last):
+    return last.new_empty(7)
+
+
 @torch.library.register_fake("spslam::track_gauss_newton")
 def _(scene, scene_scalars, plane_layout, pixels, pose, intrinsics, num_pixels, iterations, *_):
-    return pose.new_empty(7), pose.new_empty((iterations, 4)), pose.new_empty((6, 6))
+    return pose.new_empty(7), pose.new_empty((iterations, 5)), pose.new_empty((6, 6))
 
 
 @torch.library.register_fake("spslam::gauss_newton_poses")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from spslam import ops
-from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
+from spslam.geometry import constant_speed, matrix_to_pose7, pose7_to_matrix, rotation_angle
 from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
 
 
@@ -91,8 +91,61 @@ def test_recovers_the_pose(device, generator, shift_m, angle_deg):
     found = pose7_to_matrix(pose.cpu().double().numpy())
     assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 2e-3
     assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.1
-    assert stats.shape == (8, 4) and float(stats[-1, 1]) > 0.8
+    assert stats.shape == (8, 5) and float(stats[-1, 1]) > 0.8
     assert torch.linalg.eigvalsh(hessian.cpu().double()).min() > 0
+
+
+# Between devices: other orders of float32 sums; with tf32, factors of 10 bits in the decoder.
+FLOAT32_POSE = dict(rtol=0, atol=1e-5)
+TF32_POSE = dict(rtol=0, atol=2e-4)
+FLOAT32_SUMS, TF32_SUMS = 1e-4, 5e-3  # of the largest
+
+
+@pytest.mark.parametrize("tf32", [False, True])
+@pytest.mark.parametrize("num_pixels", [50, 1024, 1100, 5000])
+def test_devices_agree(device, generator, tf32, num_pixels):
+    """Whole and part tiles, one a warp and several."""
+    scene = make_scene(generator, random_decoder=False, device=device)
+    records, start = corner_pixels(POSE, generator), _pose7(_moved(POSE, 0.01, 0.02))
+    options = {**OPTIONS, "num_pixels": num_pixels}
+    on_cpu = make_scene(torch.Generator().manual_seed(0), random_decoder=False)
+    want = ops.track_gauss_newton(on_cpu, records, start, INTRINSICS, **options, frame=4)
+    got = ops.track_gauss_newton(scene, records.to(device), start.to(device), INTRINSICS, **options, frame=4, tf32=tf32)
+    pose, stats, hessian = (tensor.cpu() for tensor in got)
+    torch.testing.assert_close(pose, want[0], **(TF32_POSE if tf32 else FLOAT32_POSE))
+    bound = TF32_SUMS if tf32 else FLOAT32_SUMS
+    assert torch.allclose(hessian, want[2], rtol=0, atol=bound * float(want[2].abs().max()))
+    # A point that rounding moves over the border of the inliers counts as one of the pixels.
+    assert torch.allclose(stats[:, 1], want[1][:, 1], rtol=0, atol=2 / num_pixels)
+    assert torch.allclose(stats[:, 4], want[1][:, 4], rtol=0, atol=2 / num_pixels + bound)
+
+
+def test_same_bits_every_time(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    records = corner_pixels(POSE, generator).to(device)
+    start = _pose7(_moved(POSE, 0.01, 0.02), device)
+    options = {**OPTIONS, "num_pixels": 3000}
+    first = ops.track_gauss_newton(scene, records, start, INTRINSICS, **options, frame=0)
+    for _ in range(9):
+        again = ops.track_gauss_newton(scene, records, start, INTRINSICS, **options, frame=0)
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_support_is_the_mean_weight(device, generator):
+    """At the true pose every mapped pixel weighs one; off the map none does."""
+    scene = make_scene(generator, random_decoder=False, device=device)
+    records = corner_pixels(POSE, generator).to(device)
+    _, stats, _ = ops.track_gauss_newton(scene, records, _pose7(POSE, device), INTRINSICS, **OPTIONS, frame=0)
+    inliers, support = stats[-1, 1].item(), stats[-1, 4].item()
+    assert 0.95 * inliers < support <= inliers + 1e-6
+
+
+@pytest.mark.parametrize("shift_m, angle_deg", [(0.0, 0.0), (0.03, 2.0), (0.5, 80.0)])
+def test_prediction_is_constant_speed(device, shift_m, angle_deg):
+    before, last = POSE, _moved(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
+    predicted = ops.predict_pose(_pose7(before, device), _pose7(last, device)).cpu()
+    torch.testing.assert_close(predicted, _pose7(constant_speed(before, last)))
+    assert predicted[0] >= 0
 
 
 def test_same_bits_for_any_number_of_threads(generator):
@@ -134,6 +187,8 @@ def test_arguments_are_named(generator):
     records = corner_pixels(POSE, generator)
     with pytest.raises(ValueError, match="track_gauss_newton: iterations must be at least 1, got 0"):
         ops.track_gauss_newton(scene, records, _pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
+    with pytest.raises(ValueError, match=r"predict_pose: before must have shape \[7\], got \[8\]"):
+        ops.predict_pose(torch.zeros(8), torch.zeros(7))
     with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):
         ops.track_gauss_newton(scene, records[:0], _pose7(POSE), INTRINSICS, **OPTIONS, frame=0)
 
@@ -143,5 +198,6 @@ def test_opcheck(generator):
     records, pose = corner_pixels(POSE, generator, 50), _pose7(POSE)
     arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4, 0, 1, 0)
     torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, (*scene.arguments(), *arguments))
+    torch.library.opcheck(torch.ops.spslam.predict_pose.default, (pose, pose))
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)
     torch.library.opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments))

@@ -9,8 +9,9 @@
 
 namespace spslam {
 
-constexpr int kPoseSize = 7;          // unit quaternion (w, x, y, z), translation (m)
-constexpr int kTrackingStatSize = 4;  // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad)
+constexpr int kPoseSize = 7;  // unit quaternion (w, x, y, z), translation (m)
+// cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean robust weight over all pixels
+constexpr int kTrackingStatSize = 5;
 
 struct TrackingOptions {
   Intrinsics intrinsics;
@@ -19,7 +20,12 @@ struct TrackingOptions {
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
   double damping;
   PhiloxKey key;  // its iteration is replaced by the running one
+  bool tf32;      // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
 };
+
+// next [7]: the pose after `before` [7] and `last` [7] at constant speed.
+template <class Device>
+void predict_pose(Device device, const float* before, const float* last, float* next);
 
 // Bytes of scratch for the launches below.
 template <class Device>
