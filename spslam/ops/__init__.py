@@ -3,6 +3,7 @@
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.gauss_newton import gauss_newton_poses, predict_pose, track_gauss_newton
+from spslam.ops.hash_table import VoxelHash
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
@@ -35,6 +36,7 @@ __all__ = [
     "SceneGradients",
     "SceneView",
     "Stream",
+    "VoxelHash",
     "bilinear_interpolate",
     "depth_normals",
     "encode_points",

@@ -56,8 +56,16 @@ def set_num_threads(count: int) -> None:
 
     At import it is torch's number of threads. Not to be called while another thread runs a kernel.
 
+    Args:
+        count: at least 1.
+
     Raises:
         ValueError: `count` below 1.
+
+    Example:
+        >>> set_num_threads(2)
+        >>> get_num_threads()
+        2
     """
     if count < 1:
         raise ValueError(f"set_num_threads: count must be at least 1, got {count}")
@@ -65,7 +73,12 @@ def set_num_threads(count: int) -> None:
 
 
 def get_num_threads() -> int:
-    """Threads the CPU kernels may use."""
+    """Threads the CPU kernels may use.
+
+    Example:
+        >>> get_num_threads() >= 1
+        True
+    """
     return torch.ops.spslam.get_num_threads()
 
 

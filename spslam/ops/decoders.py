@@ -7,6 +7,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._autograd import forbid_second_derivatives
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
 
 class Activation(IntEnum):
@@ -18,7 +19,17 @@ class Activation(IntEnum):
 
 
 def mlp_num_params(inputs: int, hidden: int, outputs: int) -> int:
-    """Length of the flat parameter vector of `mlp`."""
+    """Length of the flat parameter vector of `mlp`: H (I + 1) + H (H + 1) + O (H + 1).
+
+    Args:
+        inputs: I.
+        hidden: H.
+        outputs: O.
+
+    Example:
+        >>> mlp_num_params(11, 32, 1)
+        1473
+    """
     return hidden * (inputs + 1) + hidden * (hidden + 1) + outputs * (hidden + 1)
 
 
@@ -87,3 +98,5 @@ def _mlp_backward(ctx, grad):
 
 torch.library.register_autograd("spslam::mlp", _mlp_backward, setup_context=_setup_context)
 forbid_second_derivatives("mlp")
+register_rows_vmap("mlp", (0,))
+register_each_vmap("mlp_backward")

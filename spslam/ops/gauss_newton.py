@@ -83,6 +83,15 @@ def track_gauss_newton(
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+
+    Example:
+        >>> pose = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
+        >>> still, stats, hessian = track_gauss_newton(
+        ...     SceneView.empty(), torch.zeros(4, 3, dtype=torch.int32), pose, Intrinsics(60.0, 60.0, 31.5, 23.5),
+        ...     num_pixels=4, iterations=2, truncation=0.08, kernel_start=0.08, kernel_end=0.02, damping=1e-4,
+        ...     seed=0, stream=1, frame=0)
+        >>> torch.equal(still, pose), stats[:, 1]  # nothing is mapped: no pixel takes part, the camera stays
+        (True, tensor([0., 0.]))
     """
     name = "track_gauss_newton"
     scene.check(name)
@@ -143,6 +152,14 @@ def gauss_newton_poses(
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+
+    Example:
+        >>> pixels, poses = torch.zeros(2, 5, 3, dtype=torch.int32), torch.tensor([[1.0, 0, 0, 0, 0, 0, 0]] * 2)
+        >>> camera = Intrinsics(60.0, 60.0, 31.5, 23.5)
+        >>> hessian, _, _, inliers = gauss_newton_poses(
+        ...     SceneView.empty(), pixels, poses, camera, truncation=0.08, kernel=0.05)
+        >>> hessian.shape, inliers
+        (torch.Size([2, 6, 6]), tensor([0., 0.]))
     """
     name = "gauss_newton_poses"
     scene.check(name)

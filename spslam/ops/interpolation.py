@@ -13,6 +13,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._autograd import forbid_second_derivatives
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
 
 def trilinear_interpolate(
@@ -191,10 +192,12 @@ def _tri_plane_backward(ctx, grad):
     return grad_texels if need_texels else None, grad_points if need_points else None, None, None
 
 
-for _op, _save, _backward in (
-    ("trilinear_interpolate", _save_trilinear, _trilinear_backward),
-    ("bilinear_interpolate", _save_bilinear, _bilinear_backward),
-    ("tri_plane_interpolate", _save_tri_plane, _tri_plane_backward),
+for _op, _save, _backward, _rows in (
+    ("trilinear_interpolate", _save_trilinear, _trilinear_backward, (1, 2)),
+    ("bilinear_interpolate", _save_bilinear, _bilinear_backward, (1,)),
+    ("tri_plane_interpolate", _save_tri_plane, _tri_plane_backward, (1,)),
 ):
     torch.library.register_autograd(f"spslam::{_op}", _backward, setup_context=_save)
     forbid_second_derivatives(_op)
+    register_rows_vmap(_op, _rows)
+    register_each_vmap(f"{_op}_backward")

@@ -36,6 +36,14 @@ def marching_cubes(
         TypeError: a tensor of another dtype.
         ValueError: shapes or devices that do not fit, fewer than two samples an axis, coordinates out of range or
             repeated.
+
+    Example:
+        >>> axis = torch.linspace(-1, 1, 9)
+        >>> x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
+        >>> ball = (x**2 + y**2 + z**2).sqrt() - 0.6
+        >>> vertices, faces = marching_cubes(torch.zeros(1, 3, dtype=torch.int32), ball[None])
+        >>> len(vertices) - 3 * len(faces) // 2 + len(faces)  # Euler's number of a closed surface without holes
+        2
     """
     name = "marching_cubes"
     check_tensor(name, "values", values, ("M", "n + 1", "n + 1", "n + 1"), torch.float32)

@@ -4,6 +4,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._vmap import register_rows_vmap
 
 
 def sparse_adam_(
@@ -43,6 +44,13 @@ def sparse_adam_(
         ValueError: shapes or devices that do not fit, a tensor that is not contiguous, a rate out of range.
 
     V = 0 changes nothing. The result does not depend on the number of threads.
+
+    Example:
+        >>> param, grad, exp_avg, exp_avg_sq = torch.zeros(2, 1), torch.ones(2, 1), torch.zeros(2, 1), torch.zeros(2, 1)
+        >>> stamps = torch.tensor([1, 0], dtype=torch.int32)
+        >>> sparse_adam_(param, grad, exp_avg, exp_avg_sq, stamps, stamp=1, lr=0.1, step=1)
+        >>> param.flatten(), grad.flatten()
+        (tensor([-0.1000,  0.0000]), tensor([0., 1.]))
     """
     name = "sparse_adam_"
     check_tensor(name, "param", param, param.shape if isinstance(param, torch.Tensor) else (), FLOATING)
@@ -82,6 +90,11 @@ def normal_equations(
     Raises:
         TypeError: a tensor of another dtype.
         ValueError: shapes or devices that do not fit.
+
+    Example:
+        >>> hessian, gradient, cost = normal_equations(torch.ones(1, 4), torch.ones(1, 4, 6), torch.ones(1, 4))
+        >>> hessian[0, 0, 0], gradient[0, 0], cost[0]
+        (tensor(4.), tensor(4.), tensor(4.))
     """
     name = "normal_equations"
     check_tensor(name, "residuals", residuals, ("F", "N"), FLOATING)
@@ -110,6 +123,10 @@ def solve_normal_equations(
     Raises:
         TypeError: a tensor of another dtype.
         ValueError: shapes or devices that do not fit, negative damping.
+
+    Example:
+        >>> solve_normal_equations(2 * torch.eye(6)[None], torch.ones(1, 6))
+        tensor([[-0.5000, -0.5000, -0.5000, -0.5000, -0.5000, -0.5000]])
     """
     name = "solve_normal_equations"
     check_tensor(name, "hessian", hessian, ("F", 6, 6), FLOATING)
@@ -134,3 +151,7 @@ def _(residuals, jacobians, weights):
 @torch.library.register_fake("spslam::solve_normal_equations")
 def _(hessian, gradient, damping, absolute_damping):
     return torch.empty_like(gradient, memory_format=torch.contiguous_format)
+
+
+register_rows_vmap("normal_equations", (0, 1, 2))
+register_rows_vmap("solve_normal_equations", (0, 1))

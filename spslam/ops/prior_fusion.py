@@ -4,6 +4,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._vmap import register_rows_vmap
 
 FEATURES = 8
 _HIDDEN = 64
@@ -41,6 +42,11 @@ def depth_normals(
     Raises:
         ValueError: wrong shapes or devices, `fx`, `fy` or `max_jump` not positive, `step_px` below 1.
         TypeError: wrong dtypes.
+
+    Example:
+        >>> wall, pixels = torch.ones(32, 48), torch.tensor([[24, 16], [0, 0]], dtype=torch.int32)
+        >>> depth_normals(wall, pixels, 50.0, 50.0, 24.0, 16.0, step_px=2, max_jump=0.1)[:, 2]
+        tensor([-1.,  0.])
     """
     name = "depth_normals"
     check_tensor(name, "depth", depth, ["H", "W"], torch.float32)
@@ -82,6 +88,12 @@ def encode_points(
     Raises:
         ValueError: wrong shapes or devices, `voxel_size` not positive, another neighbourhood, a negative minimum.
         TypeError: wrong dtypes.
+
+    Example:
+        >>> point, normal = torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([[0.0, 0.0, -1.0]])
+        >>> coords, features, weights = encode_points(point, normal, torch.zeros(ENCODER_PARAMETERS), 1.0, 8)
+        >>> coords[0], features.shape, weights[0]  # each of the eight corners weighs 0.5^9
+        (tensor([0, 0, 0], dtype=torch.int32), torch.Size([8, 8]), tensor(0.0020))
     """
     name = "encode_points"
     check_tensor(name, "points", points, ["N", 3], torch.float32)
@@ -117,6 +129,12 @@ def fuse_prior_(
     Raises:
         ValueError: wrong shapes or devices, or `max_weight` not positive.
         TypeError: wrong dtypes.
+
+    Example:
+        >>> embeddings, weights = torch.zeros(1, 8), torch.ones(1)
+        >>> fuse_prior_(embeddings, weights, torch.zeros(1, dtype=torch.int32), torch.ones(1, 8), torch.ones(1), 9.0)
+        >>> embeddings[0, 0], weights
+        (tensor(0.5000), tensor([2.]))
     """
     name = "fuse_prior_"
     check_tensor(name, "embeddings", embeddings, ["V", FEATURES], torch.float32)
@@ -143,6 +161,11 @@ def random_embeddings(voxel_coords: torch.Tensor, seed: int, scale: float = 0.01
     Raises:
         ValueError: wrong shape, or a negative scale.
         TypeError: wrong dtype.
+
+    Example:
+        >>> coords = torch.tensor([[1, 2, 3], [4, 5, 6]], dtype=torch.int32)
+        >>> torch.equal(random_embeddings(coords, seed=0)[1:], random_embeddings(coords[1:], seed=0))
+        True
     """
     check_tensor("random_embeddings", "voxel_coords", voxel_coords, ["M", 3], torch.int32)
     check(scale >= 0, "random_embeddings", "scale", "be at least 0", scale)
@@ -168,3 +191,7 @@ def _(depth, pixels, fx, fy, cx, cy, step_px, max_jump):
 def _(points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight):
     rows = torch.library.get_ctx().new_dynamic_size()
     return points.new_empty((rows, 3), dtype=torch.int32), points.new_empty((rows, FEATURES)), points.new_empty(rows)
+
+
+register_rows_vmap("depth_normals", (1,))
+register_rows_vmap("random_embeddings", (0,))

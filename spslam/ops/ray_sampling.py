@@ -6,6 +6,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._vmap import register_each_vmap
 
 _MAX_SAMPLES = 2**20
 _COUNTER_RANGE = 2**32
@@ -41,6 +42,13 @@ def philox_uniform(
 
     Returns:
         float32 [N] in [0, 1), multiples of 2^-24; bit-identical on every device. N = 0 gives an empty tensor.
+
+    Raises:
+        ValueError: `count` negative.
+
+    Example:
+        >>> torch.equal(philox_uniform(0, 0, 0, 0, 3), philox_uniform(0, 0, 0, 0, 5)[:3])
+        True
     """
     check(count >= 0, "philox_uniform", "count", "be at least 0", count)
     out = torch.empty(count, dtype=torch.float32, device=device)
@@ -53,11 +61,23 @@ def sample_indices(
 ) -> torch.Tensor:
     """Uniform random integers in [0, upper), drawn with replacement, keyed as in `philox_uniform`.
 
+    Args:
+        seed, stream, frame, iteration: key of the draw.
+        count: how many numbers, N.
+        upper: 1 to 2^32.
+        device: where the result lives.
+
     Returns:
-        int64 [N]; bit-identical on every device.
+        int64 [N], floor(word * upper / 2^32) of each element's first word; bit-identical on every device. N = 0 gives
+        an empty tensor.
 
     Raises:
         ValueError: `count` negative, or `upper` outside [1, 2^32].
+
+    Example:
+        >>> drawn = sample_indices(0, Stream.EVALUATION, 0, 0, count=1000, upper=6)
+        >>> drawn.min(), drawn.max()
+        (tensor(0), tensor(5))
     """
     check(count >= 0, "sample_indices", "count", "be at least 0", count)
     check(1 <= upper <= 2**32, "sample_indices", "upper", "be in [1, 2^32]", upper)
@@ -133,3 +153,7 @@ def _(seed, stream, frame, iteration, out):
 @torch.library.register_fake("spslam::sample_indices")
 def _(seed, stream, frame, iteration, upper, out):
     pass
+
+
+# Not folded: a ray's draws depend on its row.
+register_each_vmap("sample_along_rays")

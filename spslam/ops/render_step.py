@@ -164,6 +164,17 @@ def render_step(
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+
+    Example:
+        >>> rays = RayBatch(
+        ...     pixels=torch.zeros(8, 3, dtype=torch.int32), ray_frames=torch.zeros(8, dtype=torch.int32),
+        ...     poses=torch.tensor([[1.0, 0, 0, 0, 0, 0, 0]]), intrinsics=Intrinsics(60.0, 60.0, 31.5, 23.5))
+        >>> options = RenderOptions(
+        ...     32, 11, near=0.2, far=1.02, truncation=0.08, cosine_targets=True, weight_rgb=10.0, weight_depth=0.1,
+        ...     weight_free_space=20.0, weight_sdf=1000.0, seed=0, stream=2, frame=0, iteration=0)
+        >>> step = render_step(SceneView.empty(), rays, options)
+        >>> step.losses, step.grad_poses.shape
+        (tensor([0., 0., 0., 0., 0.]), torch.Size([1, 6]))
     """
     name = "render_step"
     scene.check(name)

@@ -19,6 +19,10 @@ def query_sdf(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, tor
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device.
+
+    Example:
+        >>> query_sdf(SceneView.empty(), torch.zeros(2, 3))  # nothing is mapped yet
+        (tensor([1., 1.]), tensor([False, False]))
     """
     sdf, valid, _ = _query(scene, points, "query_sdf", with_gradient=False)
     return sdf, valid
@@ -27,8 +31,19 @@ def query_sdf(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, tor
 def query_sdf_gradient(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """As `query_sdf`, and the derivative by the point.
 
+    Args:
+        scene: the map.
+        points: float32 [N, 3], m.
+
     Returns:
-        sdf, valid, and float32 [N, 3] d sdf / d point (1/m), 0 outside.
+        sdf, valid, and float32 [N, 3] d sdf / d point (1/m), 0 outside. N = 0 gives empty tensors.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device.
+
+    Example:
+        >>> query_sdf_gradient(SceneView.empty(), torch.zeros(1, 3))[2]
+        tensor([[0., 0., 0.]])
     """
     return _query(scene, points, "query_sdf_gradient", with_gradient=True)
 
@@ -41,7 +56,14 @@ def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
         points: float32 [N, 3], m.
 
     Returns:
-        float32 [N, 3] in [0, 1].
+        float32 [N, 3] in [0, 1]. The same bits for any number of threads. N = 0 gives an empty tensor.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device.
+
+    Example:
+        >>> query_color(SceneView.empty(), torch.zeros(1, 3))  # a decoder of zeros is grey
+        tensor([[0.5000, 0.5000, 0.5000]])
     """
     scene.check("query_color")
     check_tensor("query_color", "points", points, ("N", 3), torch.float32, like=scene.embeddings)

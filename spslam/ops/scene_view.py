@@ -53,6 +53,28 @@ class SceneView:
     plane_cell_size: float
     plane_layout: Sequence[int]
 
+    @classmethod
+    def empty(cls, voxel_size: float = 0.04, device: torch.device | str = "cpu") -> "SceneView":
+        """A scene without voxels and texels, whose decoders are all zeros; `dataclasses.replace` fills in the rest."""
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(shape, dtype=dtype, device=device)
+
+        return cls(
+            hash_keys=torch.full((2,), -1, dtype=torch.int64, device=device),
+            hash_values=zeros(2, dtype=torch.int32),
+            corner_ids=zeros(0, 8, dtype=torch.int32),
+            embeddings=zeros(0, 8),
+            geometry_params=zeros(GEOMETRY_PARAMS),
+            texels=zeros(0, 32),
+            color_params=zeros(COLOR_PARAMS),
+            voxel_size=voxel_size,
+            origin=(0.0, 0.0, 0.0),
+            position_scale=0.25,
+            plane_cell_size=0.04,
+            plane_layout=[0] * 15,
+        )
+
     def check(self, function: str) -> None:
         """Raises TypeError or ValueError, naming `function`, where a tensor does not fit."""
         keys = self.hash_keys

@@ -10,6 +10,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._autograd import forbid_second_derivatives
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
 
 def volume_render(
@@ -181,3 +182,7 @@ torch.library.register_autograd("spslam::volume_render", _render_backward, setup
 torch.library.register_autograd("spslam::rendering_losses", _losses_backward, setup_context=_save_losses)
 forbid_second_derivatives("volume_render")
 forbid_second_derivatives("rendering_losses")
+register_rows_vmap("volume_render", (0, 1, 2, 3))
+register_each_vmap("volume_render_backward")
+register_each_vmap("rendering_losses")
+register_each_vmap("rendering_losses_backward")

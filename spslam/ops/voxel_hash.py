@@ -8,6 +8,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._vmap import register_rows_vmap
 
 VOXEL_COORD_MIN = -(2**20)
 VOXEL_COORD_MAX = 2**20 - 1
@@ -22,6 +23,14 @@ def new_voxel_hash(capacity: int, device: torch.device | str = "cpu") -> tuple[t
 
     Returns:
         hash_keys int64 [capacity], all -1, and hash_values int32 [capacity].
+
+    Raises:
+        ValueError: `capacity` is not a power of two.
+
+    Example:
+        >>> hash_keys, hash_values = new_voxel_hash(4)
+        >>> hash_keys
+        tensor([-1, -1, -1, -1])
     """
     check(capacity >= 2 and capacity & (capacity - 1) == 0, "new_voxel_hash", "capacity", "be a power of two", capacity)
     hash_keys = torch.full((capacity,), -1, dtype=torch.int64, device=device)
@@ -61,6 +70,15 @@ def voxel_hash_insert(
         ValueError: wrong shapes or devices, `first_id` negative.
         TypeError: wrong dtypes.
         RuntimeError: a coordinate out of range, or the table would become more than half full.
+
+    Example:
+        >>> hash_keys, hash_values = new_voxel_hash(8)
+        >>> coords = torch.tensor([[5, 0, 0], [2, 0, 0], [5, 0, 0]], dtype=torch.int32)
+        >>> voxel_hash_insert(hash_keys, hash_values, coords, first_id=0)
+        tensor([[2, 0, 0],
+                [5, 0, 0]], dtype=torch.int32)
+        >>> voxel_hash_find(hash_keys, hash_values, coords)
+        tensor([1, 0, 1], dtype=torch.int32)
     """
     _check_table("voxel_hash_insert", hash_keys, hash_values)
     check_tensor("voxel_hash_insert", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=hash_keys)
@@ -79,6 +97,13 @@ def voxel_hash_build_(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_
         ValueError: wrong shapes or devices, or a coordinate out of range.
         TypeError: wrong dtypes.
         RuntimeError: more voxels than half the slots.
+
+    Example:
+        >>> hash_keys, hash_values = new_voxel_hash(8)
+        >>> coords = torch.tensor([[5, 0, 0], [2, 0, 0]], dtype=torch.int32)
+        >>> voxel_hash_build_(hash_keys, hash_values, coords)
+        >>> voxel_hash_find(hash_keys, hash_values, coords)
+        tensor([0, 1], dtype=torch.int32)
     """
     _check_table("voxel_hash_build_", hash_keys, hash_values)
     check_tensor("voxel_hash_build_", "voxel_coords", voxel_coords, ["V", 3], torch.int32, like=hash_keys)
@@ -97,11 +122,16 @@ def voxel_hash_find(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_co
         voxel_coords: int32 [N, 3].
 
     Returns:
-        voxel_ids int32 [N], -1 where a coordinate is absent or out of range. Exact on every device.
+        voxel_ids int32 [N], -1 where a coordinate is absent or out of range. Exact on every device. N = 0 gives an empty
+        tensor.
 
     Raises:
         ValueError: wrong shapes or devices.
         TypeError: wrong dtypes.
+
+    Example:
+        >>> voxel_hash_find(*new_voxel_hash(4), torch.zeros(1, 3, dtype=torch.int32))
+        tensor([-1], dtype=torch.int32)
     """
     _check_table("voxel_hash_find", hash_keys, hash_values)
     check_tensor("voxel_hash_find", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=hash_keys)
@@ -130,6 +160,15 @@ def voxel_hash_update_corner_ids(
     Raises:
         ValueError: wrong shapes or devices, or `first_new` outside [0, V].
         TypeError: wrong dtypes.
+
+    Example:
+        >>> hash_keys, hash_values = new_voxel_hash(16)
+        >>> cube = torch.cartesian_prod(*[torch.arange(2, dtype=torch.int32)] * 3)
+        >>> coords = voxel_hash_insert(hash_keys, hash_values, cube, first_id=0)
+        >>> corner_ids = torch.full((8, 8), -1, dtype=torch.int32)
+        >>> voxel_hash_update_corner_ids(hash_keys, hash_values, coords, corner_ids, first_new=0)
+        >>> corner_ids[0].tolist(), corner_ids[1].tolist()
+        ([0, 4, 2, 6, 1, 5, 3, 7], [-1, -1, -1, -1, -1, -1, -1, -1])
     """
     name = "voxel_hash_update_corner_ids"
     _check_table(name, hash_keys, hash_values)
@@ -163,6 +202,12 @@ def voxel_hash_lookup(
     Raises:
         ValueError: wrong shapes or devices, or `voxel_size` not positive.
         TypeError: wrong dtypes.
+
+    Example:
+        >>> hash_keys, hash_values = new_voxel_hash(4)
+        >>> no_cells = torch.zeros(0, 8, dtype=torch.int32)
+        >>> voxel_hash_lookup(hash_keys, hash_values, no_cells, torch.ones(1, 3), voxel_size=0.04)[1]
+        tensor([[0., 0., 0.]])
     """
     name = "voxel_hash_lookup"
     _check_table(name, hash_keys, hash_values)
@@ -213,3 +258,5 @@ def _lookup_backward(ctx, grad_local_coords, _grad_rows):
 
 
 torch.library.register_autograd("spslam::voxel_hash_lookup", _lookup_backward, setup_context=_save_lookup)
+register_rows_vmap("voxel_hash_find", (2,))
+register_rows_vmap("voxel_hash_lookup", (3,))

@@ -14,13 +14,11 @@ py::array_t<float> normals_of(const py::object& depth, const py::object& pixels,
   check(fy > 0, {name, "fy"}, "be positive", fy);
   check(step_px >= 1 && step_px <= INT32_MAX, {name, "step_px"}, "be at least 1", step_px);
   check(max_jump > 0, {name, "max_jump"}, "be positive", max_jump);
-  const DepthImage view{image.data(),
-                        static_cast<std::int32_t>(image.size(1)),
-                        static_cast<std::int32_t>(image.size(0)),
-                        static_cast<float>(fx),
-                        static_cast<float>(fy),
-                        static_cast<float>(cx),
-                        static_cast<float>(cy)};
+  const DepthImage view{
+      image.data(),
+      static_cast<std::int32_t>(image.size(1)),
+      static_cast<std::int32_t>(image.size(0)),
+      {static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx), static_cast<float>(cy)}};
   auto out = empty<float>({at.size(0), 3});
   float* normals = out.mutable_data();
   without_gil([&] {

@@ -1,0 +1,63 @@
+"""How ops behave under `torch.vmap`."""
+
+import torch
+
+
+def register_rows_vmap(op: str, rows: tuple[int, ...]) -> None:
+    """Lets `torch.vmap` fold its axis into the rows of an op, whose outputs have a row for each row of the inputs.
+
+    Where an argument that is not one of `rows`, such as a table, has the mapped axis too, the op runs once for each
+    entry.
+
+    Args:
+        op: its name.
+        rows: positions of the arguments whose first axis is the rows.
+    """
+
+    def rule(info, in_dims, *args):
+        in_dims = _tensor_dims(in_dims, args)
+        mapped = {i for i, dim in enumerate(in_dims) if dim is not None}
+        if not mapped <= set(rows):
+            return _each(_overload(op), info.batch_size, in_dims, args)
+        size = info.batch_size
+        folded, count = list(args), 0
+        for i in rows:
+            spread = args[i].movedim(in_dims[i], 0) if i in mapped else args[i].expand(size, *args[i].shape)
+            count = spread.shape[1]
+            folded[i] = spread.reshape(size * count, *spread.shape[2:])
+        outputs = _overload(op)(*folded)
+        if isinstance(outputs, torch.Tensor):
+            return outputs.unflatten(0, (size, count)), 0
+        return tuple(output.unflatten(0, (size, count)) for output in outputs), (0,) * len(outputs)
+
+    torch.library.register_vmap(f"spslam::{op}", rule)
+
+
+def register_each_vmap(op: str) -> None:
+    """Lets `torch.vmap` run an op once for each entry of its axis: for ops that reduce, or number their rows."""
+
+    def rule(info, in_dims, *args):
+        return _each(_overload(op), info.batch_size, _tensor_dims(in_dims, args), args)
+
+    torch.library.register_vmap(f"spslam::{op}", rule)
+
+
+def _overload(op: str):
+    return getattr(torch.ops.spslam, op).default
+
+
+def _tensor_dims(in_dims, args) -> tuple[int | None, ...]:
+    """The mapped axis of each argument that is a tensor; lists of numbers come with lists of None."""
+    return tuple(dim if isinstance(arg, torch.Tensor) else None for dim, arg in zip(in_dims, args, strict=True))
+
+
+def _each(function, size, in_dims, args):
+    if size == 0:
+        raise ValueError(f"{function.name()}: torch.vmap must map over at least one entry, got 0")
+    entries = [
+        function(*(arg if dim is None else arg.select(dim, i) for arg, dim in zip(args, in_dims, strict=True)))
+        for i in range(size)
+    ]
+    if isinstance(entries[0], torch.Tensor):
+        return torch.stack(entries), 0
+    return tuple(torch.stack(outputs) for outputs in zip(*entries, strict=True)), (0,) * len(entries[0])

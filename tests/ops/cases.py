@@ -1,0 +1,303 @@
+"""A valid call of every public op, by argument name, for the tests that say something of all of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from spslam import ops
+from tests.ops.scenes import INTRINSICS, TRUNCATION, make_scene
+
+VOXEL = 0.04
+LAYOUT = [0, -3, 2, 7, 5, 35, -3, -1, 7, 4, 63, 2, -1, 5, 4]
+KEY = dict(seed=7, stream=ops.Stream.MAPPING_RAYS, frame=3, iteration=1)
+CAMERA = dict(fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+SAMPLES = 21
+Build = Callable[[torch.Generator, torch.device, int], dict]
+
+
+@dataclass(frozen=True)
+class Case:
+    """How to call an op.
+
+    Attributes:
+        build: makes the arguments from a generator, a device and a number of rows, which may be 0.
+        differentiable: names of the arguments that the op is differentiable by.
+        rows: names of the arguments whose rows `torch.vmap` may map over, the others shared; empty if none.
+        compiles: whether torch.compile takes a call of it whole.
+    """
+
+    build: Build
+    differentiable: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()
+    compiles: bool = True
+
+
+def arguments(name: str, generator: torch.Generator, device: torch.device | str = "cpu", rows: int = 60) -> dict:
+    """A valid call's arguments, by name."""
+    return CASES[name].build(generator, torch.device(device), rows)
+
+
+def _coords(generator, n, span=4):
+    return torch.randint(-span, span, (n, 3), generator=generator, dtype=torch.int32)
+
+
+def _normal(generator, *shape):
+    return torch.randn(*shape, generator=generator)
+
+
+def _uniform(generator, *shape):
+    return torch.rand(*shape, generator=generator)
+
+
+def _on(device, values):
+    return {name: value.to(device) if isinstance(value, torch.Tensor) else value for name, value in values.items()}
+
+
+def _table(generator, device, n):
+    """A table of `n` coordinates, repetitions included: keys, values, coordinates, corner ids."""
+    keys, values = ops.new_voxel_hash(1024, device)
+    coords = ops.voxel_hash_insert(keys, values, _coords(generator, n).to(device), 0)
+    corners = torch.full((len(coords), 8), -1, dtype=torch.int32, device=device)
+    ops.voxel_hash_update_corner_ids(keys, values, coords, corners, 0)
+    return keys, values, coords, corners
+
+
+def _hash(generator, device, n, **more):
+    keys, values, coords, corners = _table(generator, device, max(n, 1) * 4)
+    known = dict(hash_keys=keys, hash_values=values, voxel_coords=_coords(generator, n), corner_ids=corners)
+    return _on(device, {name: known.get(name, value) for name, value in more.items()})
+
+
+def _find(generator, device, n):
+    return _hash(generator, device, n, hash_keys=None, hash_values=None, voxel_coords=None)
+
+
+def _insert(generator, device, n):
+    return _find(generator, device, n) | dict(first_id=len(_table(generator, device, max(n, 1) * 4)[2]))
+
+
+def _build_table(generator, device, n):
+    keys, values, coords, _ = _table(generator, device, n)
+    return dict(hash_keys=keys, hash_values=values, voxel_coords=coords)
+
+
+def _update_corners(generator, device, n):
+    keys, values, coords, corners = _table(generator, device, n)
+    return dict(hash_keys=keys, hash_values=values, voxel_coords=coords, corner_ids=corners, first_new=0)
+
+
+def _lookup(generator, device, n):
+    points = 0.1 * _normal(generator, n, 3)
+    return _hash(
+        generator, device, n, hash_keys=None, hash_values=None, corner_ids=None, points=points, voxel_size=VOXEL
+    )
+
+
+def _trilinear(generator, device, n):
+    ids = torch.randint(-1, 40, (n, 8), generator=generator, dtype=torch.int32)
+    return _on(
+        device, dict(embeddings=_normal(generator, 40, 8), corner_ids=ids, local_coords=_uniform(generator, n, 3))
+    )
+
+
+def _bilinear(generator, device, n):
+    return _on(device, dict(texels=_normal(generator, 6, 9, 5), uv=10 * _uniform(generator, n, 2) - 1))
+
+
+def _tri_plane(generator, device, n):
+    points = 0.5 * _uniform(generator, n, 3) - 0.2
+    return _on(device, dict(texels=_normal(generator, 83, 32), points=points, cell_size=VOXEL, layout=LAYOUT))
+
+
+def _uniform_draw(generator, device, n):
+    return dict(KEY, count=n, device=device)
+
+
+def _index_draw(generator, device, n):
+    return dict(KEY, count=n, upper=17, device=device)
+
+
+def _along_rays(generator, device, n):
+    shape = dict(num_uniform=16, num_surface=5, near=0.2, far=1.02, truncation=TRUNCATION)
+    return _on(device, dict(depth=_uniform(generator, n) + 0.5, **shape, **KEY))
+
+
+def _frame_pixels(generator, device, n):
+    color = torch.randint(0, 256, (48, 64, 3), generator=generator).to(torch.uint8)
+    sampling = ops.PixelSampling(n, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, lattice_step=16)
+    key = dict(seed=7, stream=ops.Stream.PIXEL_DATABASE, frame=3)
+    return dict(depth=1 + 0.1 * _uniform(generator, 48, 64), color=color, **CAMERA, sampling=sampling, **key)
+
+
+def _samples(generator, n):
+    t = 1 + _uniform(generator, n, SAMPLES).sort(1).values
+    sdf = ((1.5 - t) / TRUNCATION).clamp(-1, 1)
+    return dict(sdf=sdf, color=_uniform(generator, n, SAMPLES, 3), t=t, valid=_uniform(generator, n, SAMPLES) < 0.9)
+
+
+def _render(generator, device, n):
+    return _on(device, dict(_samples(generator, n), truncation=TRUNCATION))
+
+
+def _losses(generator, device, n):
+    samples = _samples(generator, n) | dict(color=_uniform(generator, n, 3), depth=1 + _uniform(generator, n))
+    targets = dict(
+        rendered=_uniform(generator, n) < 0.9,
+        target_color=_uniform(generator, n, 3),
+        target_depth=1 + _uniform(generator, n),
+        cosine=_uniform(generator, n),
+    )
+    return _on(device, samples | targets | dict(truncation=TRUNCATION, cosine_targets=True))
+
+
+def _mlp(generator, device, n):
+    params = _normal(generator, ops.mlp_num_params(11, 32, 3)) / 6
+    return _on(device, dict(input=_normal(generator, n, 11), params=params, hidden=32, output=3, activation=1))
+
+
+def _adam(generator, device, n):
+    names = ("param", "grad", "exp_avg", "exp_avg_sq")
+    stamps = torch.randint(0, 2, (n,), generator=generator, dtype=torch.int32)
+    tables = {name: _uniform(generator, n, 8) for name in names}
+    return _on(device, tables | dict(stamps=stamps, stamp=1, lr=1e-2, step=3))
+
+
+def _equations(generator, device, n):
+    shapes = dict(residuals=(2, n), jacobians=(2, n, 6), weights=(2, n))
+    return _on(device, {name: _uniform(generator, *shape) for name, shape in shapes.items()})
+
+
+def _solve(generator, device, n):
+    root = _normal(generator, n, 6, 6)
+    hessian = root @ root.mT + 6 * torch.eye(6)
+    return _on(device, dict(hessian=hessian, gradient=_normal(generator, n, 6), damping=1e-4, absolute_damping=1e-9))
+
+
+def _depth_normals(generator, device, n):
+    pixels = torch.randint(0, 48, (n, 2), generator=generator, dtype=torch.int32)
+    image = 1 + 0.1 * _uniform(generator, 48, 64)
+    return _on(device, dict(depth=image, pixels=pixels, **CAMERA, step_px=2, max_jump=0.1))
+
+
+def _encode(generator, device, n):
+    normals = torch.nn.functional.normalize(_normal(generator, n, 3))
+    params = _normal(generator, ops.ENCODER_PARAMETERS) / 8
+    points = 0.2 * _normal(generator, n, 3)
+    return _on(device, dict(points=points, normals=normals, encoder_params=params, voxel_size=VOXEL))
+
+
+def _fuse(generator, device, n):
+    ids = torch.randperm(n + 5, generator=generator)[:n].int()
+    volume = dict(embeddings=_normal(generator, n + 5, 8), weights=_uniform(generator, n + 5))
+    added = dict(voxel_ids=ids, features=_normal(generator, n, 8), feature_weights=_uniform(generator, n))
+    return _on(device, volume | added | dict(max_weight=2.0))
+
+
+def _random_embeddings(generator, device, n):
+    return _on(device, dict(voxel_coords=_coords(generator, n), seed=5))
+
+
+def _marching_cubes(generator, device, n):
+    side = torch.arange(max(n, 1), dtype=torch.int32)
+    coords = torch.stack([side, side // 2, side // 3], 1)[:n]
+    return _on(device, dict(cell_coords=coords, values=_normal(generator, n, 4, 4, 4)))
+
+
+def _scene_points(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    return dict(scene=scene, points=(_uniform(generator, n, 3) * 1.2).to(device))
+
+
+def _records(generator, *shape):
+    """Packed pixels of a 64 x 48 camera, 0.5 to 1.5 m away."""
+    u = torch.randint(0, 64, shape, generator=generator, dtype=torch.int32)
+    v = torch.randint(0, 48, shape, generator=generator, dtype=torch.int32)
+    depth = (0.5 + _uniform(generator, *shape)).view(torch.int32)
+    return torch.stack([u | v << 16, depth, torch.full_like(u, 0x40402010)], -1)
+
+
+POSE = torch.tensor([1.0, 0, 0, 0, 0.02, -0.1, 0.05])
+
+
+def _render_step(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = ops.RayBatch(
+        pixels=_records(generator, n).to(device),
+        ray_frames=(torch.arange(n, dtype=torch.int32) * 2 // max(n, 1)).to(device),
+        poses=torch.stack([POSE, POSE]).to(device),
+        intrinsics=INTRINSICS,
+    )
+    weights = dict(weight_rgb=5.0, weight_depth=0.1, weight_free_space=10.0, weight_sdf=200.0)
+    options = ops.RenderOptions(16, 5, near=0.2, far=1.02, truncation=TRUNCATION, cosine_targets=True, **weights, **KEY)
+    gradients = ops.SceneGradients(
+        torch.zeros_like(scene.embeddings),
+        torch.zeros(len(scene.embeddings), dtype=torch.int32, device=device),
+        torch.zeros_like(scene.texels),
+        torch.zeros(len(scene.texels), dtype=torch.int32, device=device),
+        stamp=1,
+    )
+    return dict(scene=scene, rays=rays, options=options, gradients=gradients)
+
+
+def _track(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    steps = dict(num_pixels=32, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4)
+    return dict(
+        scene=scene,
+        pixels=_records(generator, max(n, 1)).to(device),
+        pose=POSE.to(device),
+        intrinsics=INTRINSICS,
+        truncation=TRUNCATION,
+        **steps,
+        **{name: value for name, value in KEY.items() if name != "iteration"},
+    )
+
+
+def _frame_equations(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    poses = torch.stack([POSE, POSE]).to(device)
+    frames = dict(pixels=_records(generator, 2, n).to(device), poses=poses, intrinsics=INTRINSICS)
+    return dict(scene=scene, **frames, truncation=TRUNCATION, kernel=0.05)
+
+
+def _predict(generator, device, n):
+    return dict(before=POSE.to(device), last=(POSE + torch.tensor([0, 0, 0, 0, 0.1, 0, 0])).to(device))
+
+
+CASES = {
+    "voxel_hash_find": Case(_find, rows=("voxel_coords",)),
+    "voxel_hash_insert": Case(_insert),
+    "voxel_hash_build_": Case(_build_table, compiles=False),
+    "voxel_hash_update_corner_ids": Case(_update_corners),
+    "voxel_hash_lookup": Case(_lookup, ("points",), rows=("points",)),
+    "trilinear_interpolate": Case(_trilinear, ("embeddings", "local_coords"), rows=("corner_ids", "local_coords")),
+    "bilinear_interpolate": Case(_bilinear, ("texels", "uv"), rows=("uv",)),
+    "tri_plane_interpolate": Case(_tri_plane, ("texels", "points"), rows=("points",)),
+    "philox_uniform": Case(_uniform_draw),
+    "sample_indices": Case(_index_draw),
+    "sample_along_rays": Case(_along_rays, rows=("depth",)),
+    "sample_frame_pixels": Case(_frame_pixels),
+    "volume_render": Case(_render, ("sdf", "color", "t"), rows=("sdf", "color", "t", "valid")),
+    "rendering_losses": Case(
+        _losses,
+        ("color", "depth", "sdf", "t"),
+        rows=("color", "depth", "sdf", "t", "valid", "rendered", "target_color", "target_depth", "cosine"),
+    ),
+    "mlp": Case(_mlp, ("input", "params"), rows=("input",)),
+    "sparse_adam_": Case(_adam),
+    "normal_equations": Case(_equations, rows=("residuals", "jacobians", "weights")),
+    "solve_normal_equations": Case(_solve, rows=("hessian", "gradient")),
+    "depth_normals": Case(_depth_normals, rows=("pixels",)),
+    "encode_points": Case(_encode),
+    "fuse_prior_": Case(_fuse),
+    "random_embeddings": Case(_random_embeddings, rows=("voxel_coords",)),
+    "marching_cubes": Case(_marching_cubes),
+    "query_sdf": Case(_scene_points),
+    "query_sdf_gradient": Case(_scene_points),
+    "query_color": Case(_scene_points),
+    "render_step": Case(_render_step),
+    "track_gauss_newton": Case(_track),
+    "gauss_newton_poses": Case(_frame_equations),
+    "predict_pose": Case(_predict),
+}

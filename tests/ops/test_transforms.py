@@ -1,0 +1,123 @@
+"""Ops inside of torch.compile and torch.vmap give what they give outside."""
+
+import copy
+
+import pytest
+import torch
+
+from spslam import ops
+from tests.ops.cases import CASES, arguments
+from tests.ops.test_limits import outputs
+
+BATCH = 3
+
+
+def named(condition):
+    return pytest.mark.parametrize("name", [name for name, case in CASES.items() if condition(case)])
+
+
+def tensors_of(values):
+    return [value for value in values.values() if isinstance(value, torch.Tensor)]
+
+
+def assert_same(got, want):
+    assert len(got) == len(want)
+    for g, w in zip(got, want, strict=True):
+        assert g.dtype == w.dtype
+        torch.testing.assert_close(g, w, rtol=0, atol=0, equal_nan=True)
+
+
+@named(lambda case: case.compiles)
+def test_compiles_whole(name, device, generator):
+    """One graph, no break: results, gradients and what is changed in place are the same to the bit."""
+    call = arguments(name, generator, device)
+    function = getattr(ops, name)
+    torch._dynamo.reset()
+
+    # Ops whose result has as many rows as there turn out to be: see docs/ops/index.md.
+    @torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True, capture_scalar_outputs=True)
+    def compiled(values):
+        return torch.compile(lambda given: function(**given), fullgraph=True, backend="aot_eager")(values)
+
+    results = []
+    for run in (lambda given: function(**given), compiled):
+        own = copy.deepcopy(call)
+        for argument in CASES[name].differentiable:
+            own[argument].requires_grad_()
+        found = outputs(run(own))
+        if CASES[name].differentiable:
+            sum(f.sum() for f in found if f.requires_grad).backward()
+        gradients = [own[argument].grad for argument in CASES[name].differentiable]
+        results.append([*found, *gradients, *tensors_of(own)])
+    assert_same(results[1], results[0])
+
+
+def test_compiled_code_runs(generator):
+    """With torch's own compiler behind it, not only the tracer."""
+    call = arguments("trilinear_interpolate", generator)
+
+    def scaled(embeddings, corner_ids, local_coords):
+        return ops.trilinear_interpolate(2 * embeddings, corner_ids, local_coords).relu()
+
+    torch._dynamo.reset()
+    torch.testing.assert_close(torch.compile(scaled, fullgraph=True)(**call), scaled(**call))
+
+
+@named(lambda case: case.rows)
+def test_vmap_over_rows(name, device, generator):
+    """Tables are shared, rows are mapped over."""
+    calls = [arguments(name, generator, device, rows=20) for _ in range(BATCH)]
+    rows = CASES[name].rows
+    shared = {key: value for key, value in calls[0].items() if key not in rows}
+    stacked = [torch.stack([call[row] for call in calls]) for row in rows]
+    function = getattr(ops, name)
+
+    got = outputs(torch.vmap(lambda *given: function(**shared, **dict(zip(rows, given, strict=True))))(*stacked))
+    each = [outputs(function(**shared, **{row: call[row] for row in rows})) for call in calls]
+    assert_same(got, [torch.stack(parts) for parts in zip(*each, strict=True)])
+
+
+@named(lambda case: case.rows and case.differentiable)
+def test_vmap_over_everything(name, device, generator):
+    """Tables too, another axis than the first, and gradients through it."""
+    calls = [arguments(name, generator, device, rows=20) for _ in range(BATCH)]
+    mapped = sorted({*CASES[name].rows, *CASES[name].differentiable})
+    shared = {key: value for key, value in calls[0].items() if key not in mapped}
+    stacked = {key: torch.stack([call[key] for call in calls], 1) for key in mapped}
+    function = getattr(ops, name)
+
+    def gradients(run):
+        leaves = {key: value.clone() for key, value in stacked.items()}
+        for key in CASES[name].differentiable:
+            leaves[key].requires_grad_()
+        found = run([leaves[key] for key in mapped])
+        sum(f.sum() for f in found if f.requires_grad).backward()
+        return [*found, *(leaves[key].grad for key in CASES[name].differentiable)]
+
+    def call(*given):
+        return tuple(outputs(function(**shared, **dict(zip(mapped, given, strict=True)))))
+
+    def one_by_one(given):
+        each = [call(*(value.select(1, i) for value in given)) for i in range(BATCH)]
+        return [torch.stack(parts) for parts in zip(*each, strict=True)]
+
+    assert_same(gradients(lambda given: torch.vmap(call, in_dims=1)(*given)), gradients(one_by_one))
+
+
+@named(lambda case: case.differentiable)
+def test_many_gradients_at_once(name, generator):
+    """torch.autograd.grad with is_grads_batched maps over the backward op."""
+    call = arguments(name, generator, rows=20)
+    leaves = [call[key].requires_grad_() for key in CASES[name].differentiable]
+    result = next(part for part in outputs(getattr(ops, name)(**call)) if part.requires_grad)
+    grads = torch.randn(BATCH, *result.shape, generator=generator)
+    options = dict(retain_graph=True, allow_unused=True, materialize_grads=True)
+    got = torch.autograd.grad(result, leaves, grads, is_grads_batched=True, **options)
+    each = [torch.autograd.grad(result, leaves, grad, **options) for grad in grads]
+    assert_same(got, [torch.stack(parts) for parts in zip(*each, strict=True)])
+
+
+def test_vmap_over_nothing_is_refused(generator):
+    call = arguments("mlp", generator)
+    with pytest.raises(ValueError, match="spslam::mlp: torch.vmap must map over at least one entry, got 0"):
+        torch.vmap(lambda params: ops.mlp(call["input"], params, 32, 3))(call["params"].expand(0, -1))
