@@ -58,6 +58,7 @@ setup(
     package_dir=CONFIG_PACKAGES,
     package_data={
         "spslam": ["py.typed"],
+        "spslam.benchmark": ["data/*.yaml", "data/suites/*.yaml"],
         "spslam.prior": ["data/*.safetensors"],
         **{name: ["*.yaml"] for name in CONFIG_PACKAGES},
     },

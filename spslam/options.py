@@ -165,15 +165,23 @@ class PixelOptions(Section):
     """The pixel database that mapping draws from."""
 
     per_frame: int = _option("M_k, pixels kept of each frame", "px", ge=16)
+    keyframe_every: int = _option(
+        "keep only every n-th frame, and the newest while it is that; 1 keeps all, as the paper does", "frames", ge=1
+    )
     budget_mb: float = _option("memory for them; past it old frames are thinned evenly", "MB", gt=0)
 
 
 class PriorOptions(Section):
     """The depth encoder and its fusion into the volume (section III.A)."""
 
-    enabled: bool = _text("encode each mapped frame and fuse it; false starts from random embeddings")
-    weights: str | None = _text("file of encoder and decoder weights (safetensors); null is the one shipped")
-    decoder: Literal["pretrained", "random"] = _text("start of the geometry decoder: the one trained with the encoder")
+    enabled: bool = _text("encode each mapped frame and fuse it; false starts new voxels from random embeddings")
+    fusion: bool = _text("fuse into voxels that are there already (1); false only fills new ones")
+    weights: str | None = _text(
+        "file of encoder and decoder weights (safetensors); null is the one shipped for the neighborhood"
+    )
+    decoder: Literal["pretrained", "random"] = _text(
+        "start of the geometry decoder: the one trained with the encoder, or random numbers"
+    )
     neighborhood: Literal[8, 64] = _option("voxel corners around a point that it is encoded at", "corners")
     points_per_frame: int = _option("most points of a frame that are encoded", "points", ge=1)
     min_weight: float = _option("least weight of a point at a corner", ge=0)

@@ -33,7 +33,8 @@ IMPORTS = {
     "meshing": GROUND | {"ops", "scene", "datasets"},
     "evaluation": GROUND | {"ops", "scene", "datasets", "meshing"},
     "slam": GROUND | {"ops", "scene", "prior", "datasets"},
-    "cli": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
+    "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
+    "cli": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "benchmark"},
 }
 # The last step of a run writes mesh, metrics and report.
 RUN_IMPORTS = {"meshing", "evaluation"}

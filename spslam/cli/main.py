@@ -23,6 +23,7 @@ COMMANDS = {
     "eval": "compare a run's trajectory and mesh with the truth",
     "mesh": "extract a mesh from a run's map",
     "check-data": "look through a data set before running on it",
+    "bench": "run a suite of sequences and compare with the paper's figures",
     "pretrain": "train the scene prior on procedural solids",
     "doctor": "say which kernels, device and versions are in use",
 }

@@ -25,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--steps", metavar="N", type=at_least_one, help="optimisation steps; the default is as shipped")
     parser.add_argument("--seed", metavar="N", type=int, help="seed of all random draws, 0 if not given")
+    parser.add_argument(
+        "--neighborhood",
+        type=int,
+        choices=(8, 64),
+        help="voxel corners around a point that it is encoded at, 64 if not given",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted training")
     parser.add_argument("--plot", action="store_true", help="draw the course of the training, beside FILE")
     add_quiet(parser)
@@ -56,7 +62,7 @@ def _settings(args: argparse.Namespace) -> Any:
     from spslam.cli.parser import UsageError
     from spslam.prior.training import PretrainSettings
 
-    given = {name: getattr(args, name) for name in ("steps", "seed") if getattr(args, name) is not None}
+    given = {name: getattr(args, name) for name in ("steps", "seed", "neighborhood") if getattr(args, name) is not None}
     try:
         return PretrainSettings(**given)
     except ValueError as error:

@@ -46,7 +46,8 @@ def encode_frame(
     """Encodes a frame's surface points and fuses them into the volume; section III.B and equation (1) of SP-SLAM.
 
     Vertices whose points weigh more than `options.min_weight` in sum are allocated; the weight of a fusion is that sum
-    over `options.kappa`, at most 1. Without a prior the same vertices are allocated and new ones start at random.
+    over `options.kappa`, at most 1; without `options.fusion` only new vertices take a feature (Table VIII). Without a
+    prior the same vertices are allocated and new ones start at random.
 
     Args:
         volume: the sparse volume; changed.
@@ -81,8 +82,15 @@ def encode_frame(
         options.min_weight * _LIGHT_PAIR,
     )
     keep = weights > options.min_weight
+    voxel_coords, features = voxel_coords[keep], features[keep]
     shares = (weights[keep] / options.kappa).clamp(max=1)
-    return volume.fuse(voxel_coords[keep], features[keep], shares, options.max_weight)
+    if options.fusion:
+        return volume.fuse(voxel_coords, features, shares, options.max_weight)
+    first_new = volume.num_voxels
+    voxel_ids = volume.insert(voxel_coords)
+    new = voxel_ids >= first_new
+    volume.fuse(voxel_coords[new], features[new], shares[new], options.max_weight)
+    return voxel_ids
 
 
 def _allocate(

@@ -12,7 +12,8 @@ from safetensors import SafetensorError, safe_open
 
 from spslam.errors import WeightsError
 
-SHIPPED = Path(__file__).parent / "data" / "prior.safetensors"
+_DATA = Path(__file__).parent / "data"
+SHIPPED = _DATA / "prior.safetensors"
 
 # Layer widths; the parameters of each are flat, as `spslam.ops.mlp` takes them.
 ENCODER_WIDTHS = (6, 64, 64, 8)  # position relative to the vertex (3), normal (3) -> feature
@@ -46,16 +47,22 @@ class Prior:
     metadata: dict
 
 
-def load_prior(path: str | os.PathLike | None = None) -> Prior:
+def shipped_weights(neighborhood: int = 64) -> Path:
+    """The shipped file of weights that were trained for a neighbourhood of 64 or 8 vertices."""
+    return SHIPPED if neighborhood == 64 else _DATA / f"prior-{neighborhood}.safetensors"
+
+
+def load_prior(path: str | os.PathLike | None = None, neighborhood: int = 64) -> Prior:
     """Reads a file of weights, as `spslam pretrain` writes it: safetensors with `encoder` and `geometry_decoder`.
 
     Args:
-        path: the file; the one shipped with spslam where None.
+        path: the file; where None, the one that is shipped for the neighbourhood.
+        neighborhood: 64 or 8, only used without a path: a file says by itself what it was trained for.
 
     Raises:
         WeightsError: the file is missing, damaged, or not weights of these networks. One line that names it.
     """
-    path = SHIPPED if path is None else Path(path)
+    path = shipped_weights(neighborhood) if path is None else Path(path)
     if not path.is_file():
         raise WeightsError(f"{path}: no such file of weights")
     try:

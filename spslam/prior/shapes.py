@@ -6,9 +6,9 @@ with a piece of its surface near the origin. Every draw comes from the generator
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import torch
 from torch import Generator, Tensor
@@ -21,30 +21,19 @@ FINE_STEP = 1e-2
 _ITERATED = (sd.superquadric, sd.wavy_sheet)
 
 
-class Solid(Protocol):
+class Solid(ABC):
     """A batch of B solids. Negative distance inside; a composition's is a lower bound of the distance's size."""
 
+    @abstractmethod
     def signed_distance(self, points: Tensor) -> Tensor:
         """Distances at points [B,N,3], as [B,N]."""
-        ...
-
-    def normals(self, points: Tensor, step: float | Tensor = FINE_STEP) -> Tensor:
-        """Unit gradients of the signed distance at points [B,N,3], by central differences over ``step`` or [B,1,1]."""
-        ...
 
     def march_distance(self, points: Tensor) -> Tensor:
         """A cheaper distance to step along rays by, equal to the first order near the surface."""
-        ...
-
-
-class _Normals:
-    def signed_distance(self, points: Tensor) -> Tensor:
-        raise NotImplementedError
-
-    def march_distance(self, points: Tensor) -> Tensor:
         return self.signed_distance(points)
 
     def normals(self, points: Tensor, step: float | Tensor = FINE_STEP) -> Tensor:
+        """Unit gradients of the signed distance at points [B,N,3], by central differences over ``step`` or [B,1,1]."""
         axes = torch.eye(3, dtype=points.dtype)
         shifted = torch.cat([points + step * axis for axis in (*axes, *-axes)], dim=1)
         ahead, behind = self.signed_distance(shifted).reshape(points.shape[0], 2, 3, points.shape[1]).unbind(1)
@@ -52,7 +41,7 @@ class _Normals:
 
 
 @dataclass(frozen=True)
-class Primitive(_Normals):
+class Primitive(Solid):
     """B solids of one kind, moved so that ``anchor`` (own frame) lies at ``place`` (patch frame).
 
     ``rotation`` [B,3,3] turns own axes to the patch's; ``orientation`` [B,1] is -1 where the inside is out.
@@ -78,7 +67,7 @@ class Primitive(_Normals):
 
 
 @dataclass(frozen=True)
-class Composition(_Normals):
+class Composition(Solid):
     """Union or intersection of two batches of solids."""
 
     first: Solid

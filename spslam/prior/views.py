@@ -108,7 +108,7 @@ def observe(kind: str, count: int, generator: Generator, settings: ViewSettings)
 
 
 @dataclass(frozen=True)
-class _Moved:
+class _Moved(Solid):
     """A solid seen from another origin [B,1,3]."""
 
     solid: Solid

@@ -19,9 +19,20 @@ class PixelDatabase:
         num_frames: F.
     """
 
-    def __init__(self, pixels_per_frame: int, budget_mb: float, device: torch.device | str = "cpu"):
-        """An empty database of at most `budget_mb` megabytes that starts with `pixels_per_frame` records a frame."""
+    def __init__(
+        self, pixels_per_frame: int, budget_mb: float, device: torch.device | str = "cpu", keyframe_every: int = 1
+    ):
+        """An empty database.
+
+        Args:
+            pixels_per_frame: records a frame, to start with.
+            budget_mb: most megabytes it may take.
+            device: where the records are.
+            keyframe_every: frames whose number isn't a multiple are forgotten when the next one comes, as systems with
+                keyframes do; 1 keeps all.
+        """
         self.pixels_per_frame = pixels_per_frame
+        self.keyframe_every = keyframe_every
         self.budget_bytes = int(budget_mb * 2**20)
         self.num_frames = 0
         if self.budget_bytes < pixels_per_frame * RECORD_BYTES:
@@ -39,7 +50,7 @@ class PixelDatabase:
 
     @property
     def has_pixels(self) -> torch.Tensor:
-        """bool [F] on the CPU: whether the frame had valid depth."""
+        """bool [F] on the CPU: whether the frame had valid depth, and is still kept."""
         return self._has_pixels[: self.num_frames]
 
     @property
@@ -55,6 +66,9 @@ class PixelDatabase:
                 repeated. On the database's device this waits for nothing.
         """
         self._reserve(self.num_frames + 1)
+        newest = self.num_frames - 1
+        if newest > 0 and newest % self.keyframe_every:
+            self._has_pixels[newest] = False
         count = self.pixels_per_frame
         if len(records):
             repeated = records.repeat(-(-count // len(records)), 1) if len(records) < count else records

@@ -186,7 +186,7 @@ class SlamState:
         )
         origin = torch.from_numpy(np.asarray(first_pose)[:3, 3].copy())
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
-        pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device)
+        pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device, config.pixels.keyframe_every)
         return cls(scene, FrameTable(camera, device), pixels)
 
 

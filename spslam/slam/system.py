@@ -52,13 +52,13 @@ class SlamSystem:
         self.config = config
         self.camera = camera
         self.device = torch.device(device)
-        prior = load_prior(config.prior.weights) if config.prior.enabled else None
-        decoder = prior.decoder_params if prior is not None and config.prior.decoder == "pretrained" else None
+        prior = load_prior(config.prior.weights, config.prior.neighborhood)
+        decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
         self.first_pose = np.eye(4) if first_pose is None else np.asarray(first_pose, np.float64)
         _check_first_pose(self.first_pose)
         self.state = SlamState.start(config, camera, self.first_pose, decoder, self.device)
         self.tracker = Tracker(config, camera)
-        self.mapper = Mapper(config, camera, prior)
+        self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
 
     def process(self, frame: RgbdFrame) -> FrameReport:
         """Takes the next frame in, and waits until the device is done with it.

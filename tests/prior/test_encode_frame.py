@@ -18,6 +18,7 @@ NOISE_M = 0.002
 FIELD_TOLERANCE_M = TRUNCATION_M / 10
 OPTIONS = PriorOptions(
     enabled=True,
+    fusion=True,
     weights=None,
     decoder="pretrained",
     neighborhood=64,
@@ -146,6 +147,25 @@ def test_weights_are_shares_of_kappa_capped_at_one_and_at_the_total(device, gene
     for _ in range(3):
         encode_frame(volume, points, normals, prior, changed(max_weight=2.5))
     assert volume.weights.max() == 2.5
+
+
+def test_without_fusion_only_new_voxels_are_filled(device, generator):
+    points, normals, _ = (x.to(device) for x in observe("plane", generator))
+    prior, half = load_prior(), len(points) // 2
+    left = points[:, 0].argsort()[:half]
+    volume, want = SparseVolume(VOXEL_M, device=device), SparseVolume(VOXEL_M, device=device)
+    first = encode_frame(volume, points[left], normals[left], prior, OPTIONS).long()
+    before, weights = volume.embeddings.clone(), volume.weights.clone()
+    moved = points + 0.01 * normals
+    ids = encode_frame(volume, moved, normals, prior, changed(fusion=False)).long()
+    assert torch.equal(volume.embeddings[first], before[first])
+    assert torch.equal(volume.weights[first], weights[first])
+    whole = encode_frame(want, moved, normals, prior, OPTIONS).long()
+    assert torch.equal(volume.voxel_coords[ids], want.voxel_coords[whole])
+    new = ids >= len(before)
+    assert new.any() and not new.all()
+    assert torch.equal(volume.embeddings[ids[new]], want.embeddings[whole[new]])
+    assert torch.equal(volume.weights[ids[new]], want.weights[whole[new]])
 
 
 def test_only_the_first_points_with_a_normal_are_taken(device, generator):

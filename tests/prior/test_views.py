@@ -1,5 +1,7 @@
 """What is observed of the solids."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -97,3 +99,18 @@ def test_batches_join_and_split(generator):
     both = Patches.cat([first, second])
     assert len(both) == 6
     assert torch.equal(both[3:].points, second.points)
+
+
+def test_blurred_normals_turn_gradually_at_an_edge():
+    """Differences over a voxel see both faces of a box near its edge; they change no point and no distance."""
+
+    def look(blur):
+        return observe("box", 64, torch.Generator().manual_seed(2), replace(CLEAN, max_normal_blur=blur))
+
+    sharp, blurred = look(0.0), look(1.0)
+    for name in ("points", "seen", "sdf", "valid", "surface_normals"):
+        assert torch.equal(getattr(sharp, name), getattr(blurred, name))
+    cosine = (sharp.normals * blurred.normals).sum(-1)[sharp.seen]
+    assert cosine.min() < 0.9
+    assert cosine.median() > 0.999
+    assert torch.allclose(blurred.normals[blurred.seen].norm(dim=-1), torch.ones(len(cosine)), atol=1e-5)

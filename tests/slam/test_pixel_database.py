@@ -33,6 +33,19 @@ def test_a_frame_without_pixels_is_marked():
     assert not database.records[0].any()
 
 
+def test_with_keyframes_the_others_are_kept_until_the_next_frame():
+    database = PixelDatabase(100, 1, keyframe_every=4)
+    for number in range(11):
+        database.add(frame(number, 100))
+        kept = database.has_pixels.nonzero()[:, 0].tolist()
+        assert kept == sorted({*range(0, number + 1, 4), number})
+    resumed = PixelDatabase(100, 1, keyframe_every=4)
+    resumed.load_state_dict(database.state_dict())
+    for one in (database, resumed):
+        one.add(frame(11, 100))
+    assert resumed.has_pixels.tolist() == database.has_pixels.tolist()
+
+
 def test_fewer_records_are_repeated_and_more_are_cut():
     database = PixelDatabase(100, 1)
     database.add(frame(0, 30))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from spslam.prior import load_prior
 from spslam.slam.pixels import sample_frame
 from spslam.slam.state import FrameTable, Moments, SlamState, pose_tensor
 from spslam.slam.system import SlamSystem
@@ -192,3 +193,22 @@ def test_moments_grow_with_zeros():
 def test_a_state_without_frames_is_usable_for_nothing(dataset):
     state = SlamState.start(settings(), dataset.camera, np.eye(4), None, CPU)
     assert state.usable.shape == (0,)
+
+
+def test_with_keyframes_mapping_moves_theirs_and_the_newest_pose_alone(dataset):
+    system = processed(dataset, 10, "pixels.keyframe_every=4", "mapping.every=5", "mapping.iterations=0")
+    before = system.state.frames.poses.clone()
+    system.mapper.optimize(system.state, 3)
+    moved = (system.state.frames.poses != before).any(1)
+    assert moved.nonzero()[:, 0].tolist() == [4, 8, 9]
+
+
+@pytest.mark.parametrize("enabled", ["true", "false"])
+def test_the_decoders_start_is_an_option_of_its_own(dataset, enabled):
+    decoders = [
+        SlamSystem(settings(f"prior.enabled={enabled}", f"prior.decoder={start}"), dataset.camera).state.scene
+        for start in ("pretrained", "random")
+    ]
+    trained = load_prior().decoder_params
+    assert torch.equal(decoders[0].geometry_decoder, trained)
+    assert not torch.equal(decoders[1].geometry_decoder, trained)

@@ -1,0 +1,130 @@
+"""One run, in this process: the system or the baseline over a sequence, and its figures against the truth."""
+
+from __future__ import annotations
+
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.benchmark.environment import describe_environment
+from spslam.benchmark.gicp import GicpOdometry
+from spslam.benchmark.jobs import Job
+from spslam.benchmark.suites import GICP
+from spslam.datasets import open_dataset, open_sequence
+from spslam.datasets.base import RgbdDataset
+from spslam.datasets.generated import GeneratedDataset
+from spslam.datasets.prefetch import prefetch
+from spslam.errors import DatasetError
+from spslam.evaluation.finished_run import surface_figures
+from spslam.evaluation.run_output import RunOutput
+from spslam.evaluation.surface import Surface, TriangleSurface
+from spslam.evaluation.trajectory import ate, rpe
+from spslam.slam.device import resolve_device
+from spslam.slam.run import run_sequence
+
+_READING_THREADS, _READ_AHEAD = 2, 8
+
+
+def measure(job: Job, folder: Path, threads: int | None) -> dict[str, Any]:
+    """Run a job; returns its record.
+
+    Parameters
+    ----------
+    job : what to run.
+    folder : for the run's own output; must not hold anything.
+    threads : of the kernels; as many as processors if None.
+
+    Returns
+    -------
+    ``job``, ``environment``, ``figures`` by the names of metrics.json, and ``seconds`` in all, evaluation included.
+
+    Raises
+    ------
+    SpslamError
+        What is wrong with data or settings.
+    """
+    if threads is not None:
+        ops.set_num_threads(threads)
+    started = time.perf_counter()
+    figures = _measure_gicp(job, threads or 1) if job.method == GICP else _measure_spslam(job, folder)
+    return {
+        "job": vars(job),
+        "environment": describe_environment(resolve_device(job.device)),
+        "figures": {name: value for name, value in figures.items() if isinstance(value, (int, float))},
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def parse_slice(frames: str | None) -> slice | None:
+    """``START:STOP[:STEP]`` as a slice; raises ValueError."""
+    if frames is None:
+        return None
+    parts = [int(part) if part else None for part in frames.split(":")]
+    if not 2 <= len(parts) <= 3:
+        raise ValueError(f"parse_slice: frames must be START:STOP[:STEP], got {frames}")
+    return slice(*parts)
+
+
+def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
+    config = job.load_config()
+    data = None if job.data is None else Path(job.data)
+    dataset = open_dataset(config.dataset, data)
+    truth = _true_surface(dataset, job.mesh)
+    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=truth is not None)
+    if truth is not None:
+        run = RunOutput.read(folder)
+        # A run that was lost throughout has an empty mesh, which is no reason to lose its other figures.
+        figures |= surface_figures(run, dataset, truth) if run.mesh() is not None else {}
+    if "peak_gpu_mb" in figures:
+        figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
+    return figures
+
+
+def _true_surface(dataset: RgbdDataset, mesh: str | None) -> Surface | None:
+    if isinstance(dataset, GeneratedDataset):
+        return dataset.room
+    return None if mesh is None else _load_surface(Path(mesh))
+
+
+def _load_surface(path: Path) -> TriangleSurface:
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+    except Exception as error:  # trimesh raises whatever the parser stumbles over
+        raise DatasetError(f"{path}: can't be read as a mesh: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise DatasetError(f"{path}: must be a mesh with faces, got none")
+    return TriangleSurface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def _measure_gicp(job: Job, threads: int) -> dict[str, Any]:
+    dataset = open_sequence(
+        job.load_config().dataset, None if job.data is None else Path(job.data), parse_slice(job.frames)
+    )
+    truth = dataset.poses()
+    first_pose = truth[0] if truth is not None and bool(np.isfinite(truth[0]).all()) else np.eye(4)
+    odometry = GicpOdometry(dataset.camera, first_pose, threads=threads, **dict(job.method_options))
+    torch.set_num_threads(1)
+    read, started = [], time.perf_counter()
+    with prefetch(dataset, _READING_THREADS, _READ_AHEAD) as frames:
+        for number, frame in enumerate(frames):
+            if not isinstance(frame, DatasetError):
+                odometry.process(frame.depth)
+                read.append(number)
+    wall_s = time.perf_counter() - started
+    poses = np.array(odometry.poses)
+    figures = {
+        "frames": len(poses),
+        "skipped_frames": len(dataset) - len(poses),
+        "lost_frames": sum(odometry.lost),
+        "wall_s": wall_s,
+        "fps": len(poses) / wall_s,
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+    return figures | ({} if truth is None else {**ate(poses, truth[read]), **rpe(poses, truth[read])})

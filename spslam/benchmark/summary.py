@@ -1,0 +1,93 @@
+"""What came out of a suite: statistics of every cell, what was skipped, what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from spslam.benchmark.figures import Statistic
+from spslam.benchmark.jobs import Plan
+from spslam.benchmark.pool import Outcome
+from spslam.benchmark.suites import Study, Suite
+
+Cell = tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A suite's results.
+
+    Attributes
+    ----------
+    suite : what was asked for.
+    cells : statistics by figure, of each (study, sequence, variant) that has a finished run.
+    skipped : sequences without data, and why.
+    failed : one line for each run that failed.
+    environments : what the runs were measured on, each once.
+    """
+
+    suite: Suite
+    cells: dict[Cell, dict[str, Statistic]]
+    skipped: dict[str, str]
+    failed: tuple[str, ...]
+    environments: tuple[dict[str, Any], ...]
+
+    def value(self, study: Study, sequence: str, variant: str, figure: str) -> Statistic | None:
+        """One statistic, None where it wasn't measured."""
+        return self.cells.get((study.name, sequence, variant), {}).get(figure)
+
+    def sequences(self, study: Study) -> list[str]:
+        """Names of the study's sequences that have a result."""
+        return [s.name for s in study.sequences if any(cell[:2] == (study.name, s.name) for cell in self.cells)]
+
+    def average(self, study: Study, variant: str, figure: str) -> float | None:
+        """Mean of a variant's figure over the sequences that have it."""
+        found = [self.value(study, name, variant, figure) for name in self.sequences(study)]
+        means = [statistic.mean for statistic in found if statistic is not None]
+        return sum(means) / len(means) if means else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON: ``rows`` with a statistic of every figure, and the rest."""
+        return {
+            "suite": self.suite.name,
+            "title": self.suite.title,
+            "seeds": self.suite.seeds,
+            "environments": list(self.environments),
+            "rows": [
+                {
+                    "study": study,
+                    "sequence": sequence,
+                    "variant": variant,
+                    "figures": {name: asdict(statistic) for name, statistic in figures.items()},
+                }
+                for (study, sequence, variant), figures in self.cells.items()
+            ],
+            "skipped": self.skipped,
+            "failed": list(self.failed),
+        }
+
+
+def summarize(suite: Suite, plan: Plan, outcomes: dict[str, Outcome]) -> Summary:
+    """Statistics over the seeds of every cell of a plan."""
+    cells = {}
+    for cell, keys in plan.cells.items():
+        records = [outcomes[key].record for key in keys if key in outcomes]
+        figures = [record["figures"] for record in records if record is not None]
+        if figures:
+            cells[cell] = _statistics(figures)
+    failed = tuple(f"{key}: {outcome.error}" for key, outcome in outcomes.items() if outcome.record is None)
+    return Summary(suite, cells, plan.skipped, failed, tuple(_environments(outcomes)))
+
+
+def _statistics(figures: list[dict[str, float]]) -> dict[str, Statistic]:
+    names = dict.fromkeys(name for run in figures for name in run)
+    return {name: Statistic.of([run[name] for run in figures if name in run]) for name in names}
+
+
+def _environments(outcomes: dict[str, Outcome]) -> Iterator[dict[str, Any]]:
+    seen: list[dict[str, Any]] = []
+    for outcome in outcomes.values():
+        if outcome.record is not None and outcome.record["environment"] not in seen:
+            seen.append(outcome.record["environment"])
+            yield outcome.record["environment"]

@@ -1,0 +1,146 @@
+"""``spslam bench``: suites of sequences, presets and seeds, in tables beside the paper's figures."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from spslam.cli.arguments import add_quiet, at_least_one, parse_frames
+from spslam.cli.parser import UsageError
+from spslam.errors import SpslamError
+from spslam.options import PRESETS
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a data set's; --list names all")
+    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the data sets")
+    parser.add_argument("--output", metavar="DIR", type=Path, help="folder of results; runs/bench-SUITE if not given")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto takes the GPUs, if any")
+    parser.add_argument("--presets", metavar="NAME", nargs="+", choices=PRESETS, help="presets to run")
+    parser.add_argument("--seeds", metavar="N", type=at_least_one, help="runs of each, seeds 0 to N-1 (the paper: 5)")
+    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="only these frames of every sequence; : is all")
+    parser.add_argument("--sequences", metavar="NAME", nargs="+", help="only these sequences")
+    parser.add_argument("--studies", metavar="NAME", nargs="+", help="only these studies of the ablation")
+    parser.add_argument("--workers", metavar="N", type=at_least_one, help="runs at a time; one a GPU if not given")
+    parser.add_argument("--threads", metavar="N", type=at_least_one, help="kernel threads of each run")
+    parser.add_argument("--no-baseline", action="store_true", help="leave out the classical baseline")
+    parser.add_argument("--keep", action="store_true", help="keep each run's trajectory, mesh and report")
+    parser.add_argument(
+        "--report", metavar="PAGE", type=Path, help="put the tables into a Markdown page's regions, too"
+    )
+    parser.add_argument("--list", action="store_true", help="say what would be run, and run nothing")
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    parser.add_argument("--key", help=argparse.SUPPRESS)
+    add_quiet(parser)
+
+
+def execute(args: argparse.Namespace) -> None:
+    if args.job is not None:
+        _run_job(args)
+        return
+
+    from spslam.benchmark.suites import load_suite, suite_names
+
+    if args.suite is None:
+        if not args.list:
+            raise UsageError(f"SUITE must be one of {', '.join(suite_names())}")
+        for name in suite_names():
+            print(f"{name:<16}{load_suite(name).title}")
+        return
+    if args.frames is not None:
+        _check_frames(args.frames)
+    suite = load_suite(
+        args.suite, args.presets, args.sequences, args.studies, args.frames, args.seeds, not args.no_baseline
+    )
+    _run_suite(suite, args)
+
+
+def _run_suite(suite: Any, args: argparse.Namespace) -> None:
+    from spslam.benchmark.gicp import require_small_gicp
+    from spslam.benchmark.jobs import make_plan
+    from spslam.benchmark.pool import PoolOptions, run_jobs
+    from spslam.benchmark.report import describe_gaps, update_page, write_results
+    from spslam.benchmark.suites import GICP
+    from spslam.benchmark.summary import summarize
+    from spslam.benchmark.tables import to_text
+    from spslam.slam.device import resolve_device
+
+    if args.data is not None and not args.data.is_dir():
+        raise UsageError(f"--data must be a folder that holds the data sets, got {args.data}")
+    plan = make_plan(suite, args.data, resolve_device(args.device).type)
+    if args.list:
+        _print_plan(plan)
+        return
+    if any(job.method == GICP for job in plan.jobs.values()):
+        require_small_gicp()
+    output = args.output or Path("runs") / f"bench-{suite.name}"
+    outcomes = run_jobs(
+        plan.jobs, output, PoolOptions(args.workers, args.threads, args.keep), None if args.quiet else _print_progress
+    )
+    summary = summarize(suite, plan, outcomes)
+    tables = write_results(summary, output)
+    if not args.quiet:
+        for table in tables:
+            print(f"{to_text(table)}\n")
+        print(f"tables  {output / 'results.md'}, {output / 'results.html'}, {output / 'summary.json'}")
+    if args.report is not None:
+        filled = update_page(args.report, summary)
+        if not args.quiet:
+            print(f"page    {args.report}: {', '.join(filled) or 'nothing to fill'}")
+    for line in describe_gaps(summary):
+        print(line, file=sys.stderr)
+    if summary.failed:
+        raise SpslamError(f"{len(summary.failed)} of {len(plan.jobs)} runs failed; the first: {summary.failed[0]}")
+    if not plan.jobs:
+        raise SpslamError(f"nothing of {suite.name} could be run: no data; --data names the folder that holds it")
+
+
+def _run_job(args: argparse.Namespace) -> None:
+    """One run, for `run_jobs` in another process; ends when that one does."""
+    from spslam.benchmark.jobs import Job
+    from spslam.benchmark.pool import run_here
+
+    threading.Thread(target=_exit_with_input, daemon=True).start()
+    run_here(Job.from_json(args.job), args.key, args.output, args.workers, args.threads, args.keep)
+
+
+def _exit_with_input() -> None:
+    # Not through sys.stdin, whose lock a thread that waits would still hold as Python ends.
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+def _check_frames(text: str) -> None:
+    try:
+        parse_frames(text)
+    except argparse.ArgumentTypeError as error:
+        raise UsageError(f"--frames {error}") from None
+
+
+def _print_plan(plan: Any) -> None:
+    for key, job in plan.jobs.items():
+        options = ", ".join(f"{name}={value}" for name, value in job.options)
+        print(f"{key}  {job.method} {job.preset or ''} {job.frames or 'all frames'} {options}".rstrip())
+    for name, reason in plan.skipped.items():
+        print(f"skipped {name}: {reason}")
+    print(f"{len(plan.jobs)} runs")
+
+
+def _print_progress(done: int, total: int, outcome: Any) -> None:
+    """A line on the error stream for each run as it ends; earlier ones pass in silence but for the last."""
+    if outcome.earlier and done < total:
+        return
+    record = outcome.record
+    if record is None:
+        text = f"FAILED: {outcome.error}"
+    else:
+        figures = record["figures"]
+        shown = [f"ATE {figures['ate_rmse_cm']:.2f} cm"] if "ate_rmse_cm" in figures else []
+        shown += [f"{figures['fps']:.1f} frames/s", f"{record['seconds']:.0f} s"]
+        text = ", ".join(shown)
+    print(f"[{done}/{total}] {outcome.key}: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,139 @@
+"""The shipped suites, and what the paper prints about them."""
+
+import pytest
+
+from spslam.benchmark.figures import FIGURES
+from spslam.benchmark.jobs import Job, make_plan
+from spslam.benchmark.published import AVERAGE, published
+from spslam.benchmark.suites import GICP, load_suite, suite_names
+from spslam.config import load_config
+from spslam.errors import ConfigError
+from tests.benchmark.examples import tiny_job
+
+DATASETS = {"replica": 8, "synthetic_rgbd": 6, "scannet": 6, "tum": 3, "7scenes": 7}
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_every_run_of_a_suite_has_a_valid_configuration(name, tmp_path):
+    suite = load_suite(name)
+    assert suite.studies
+    for study in suite.studies:
+        assert set(study.columns) | set(study.plots) <= set(FIGURES)
+        for sequence in study.sequences:
+            for variant in study.variants:
+                options = (*sequence.options, *(variant.options if variant.method != GICP else ()))
+                load_config(sequence.config, variant.preset, options)
+
+
+@pytest.mark.parametrize(("name", "scenes"), DATASETS.items())
+def test_datasets_have_the_papers_scenes_five_seeds_and_the_baseline(name, scenes):
+    suite = load_suite(name)
+    (study,) = suite.studies
+    assert suite.seeds == 5
+    assert [variant.preset for variant in study.variants[:2]] == ["paper", "balanced"]
+    assert study.variants[-1].method == GICP
+    names = [sequence.name for sequence in study.sequences]
+    assert len(names) == scenes
+    columns = published(suite.published)["ate"].columns
+    assert [column for column in columns if column != AVERAGE] == names
+
+
+@pytest.mark.parametrize("name", ["replica", "synthetic_rgbd", "scannet", "7scenes"])
+def test_the_papers_own_average_is_that_of_its_row(name):
+    """Several baselines' aren't, in the paper itself."""
+    *values, average = published(name)["ate"].rows["SP-SLAM (paper)"]
+    assert average == pytest.approx(sum(values) / len(values), abs=0.05)
+
+
+@pytest.mark.parametrize("name", [*DATASETS, "ablation"])
+def test_published_rows_are_complete(name):
+    for table in published(name).values():
+        assert all(len(row) == len(table.columns) for row in table.rows.values())
+        assert table.table.startswith("Table ")
+
+
+def test_nothing_is_published_about_other_suites():
+    assert published("quick") == published(None) == {}
+
+
+def test_a_suite_is_narrowed():
+    suite = load_suite("quick", ["fast"], ["room", "grey"], None, "0:5", 3, baseline=False)
+    (study,) = suite.studies
+    assert [sequence.name for sequence in study.sequences] == ["room", "grey"]
+    assert {sequence.frames for sequence in study.sequences} == {"0:5"}
+    assert [variant.preset for variant in study.variants] == ["fast"]
+    assert suite.seeds == 3
+    assert [study.name for study in load_suite("ablation", studies=["fusion"]).studies] == ["fusion"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": "replika"}, "suite must be one of .*replica.*, got replika"),
+        ({"name": "quick", "sequences": ["rom"]}, "sequence must be one of room, .*, got rom"),
+        ({"name": "ablation", "studies": ["x"]}, "study must be one of prior, .*, got x"),
+        ({"name": "quick", "studies": ["prior"]}, "study must be one of all, got prior"),
+    ],
+)
+def test_unknown_names_are_named(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        load_suite(**arguments)
+
+
+def test_a_plan_takes_the_data_that_is_there_and_says_what_is_not(tmp_path):
+    (tmp_path / "replica" / "room1").mkdir(parents=True)
+    (tmp_path / "replica" / "room1_mesh.ply").touch()
+    plan = make_plan(load_suite("replica", seeds=2), tmp_path, "cpu")
+    assert set(plan.skipped) == {f"room{i}" for i in (0, 2)} | {f"office{i}" for i in range(5)}
+    assert f"in {tmp_path}" in plan.skipped["room0"]
+    # Two presets with two seeds, and the baseline, which has none.
+    assert len(plan.jobs) == 5
+    assert {job.mesh for job in plan.jobs.values()} == {str(tmp_path / "replica" / "room1_mesh.ply")}
+    assert plan.cells["all", "room1", "spslam paper"] == tuple(
+        key for key, job in plan.jobs.items() if job.preset == "paper"
+    )
+
+
+def test_without_data_only_what_needs_none_is_planned():
+    plan = make_plan(load_suite("quick"), None, "cpu")
+    assert {job.sequence for job in plan.jobs.values()} == {"room"}
+    assert set(plan.skipped.values()) == {"no --data given"}
+
+
+def test_studies_share_their_runs():
+    plan = make_plan(load_suite("ablation", studies=["fusion", "targets"], sequences=["room"]), None, "cpu")
+    assert plan.cells["fusion", "room", "with fusion"] == plan.cells["targets", "room", "cosine targets"]
+    assert len(plan.jobs) == 5
+
+
+def test_a_key_names_what_decides_on_the_figures():
+    job = tiny_job()
+    others = [
+        tiny_job(seed=1),
+        tiny_job(method=GICP),
+        tiny_job(frames="0:5"),
+        tiny_job(preset="paper"),
+        tiny_job(mesh="truth.ply"),
+        tiny_job(options=()),
+    ]
+    assert len({job.key(), *(other.key() for other in others)}) == 7
+    assert tiny_job(data="/elsewhere").key() == job.key()
+    assert job.key().startswith("room-fast-seed0-")
+
+
+def test_other_weights_are_another_run(tmp_path):
+    from spslam.prior.encoder import SHIPPED
+
+    content = bytearray(SHIPPED.read_bytes())
+    content[-1] ^= 1
+    keys = set()
+    for name, weights in (("same", SHIPPED.read_bytes()), ("other", bytes(content))):
+        (tmp_path / "w.safetensors").write_bytes(weights)
+        keys.add(tiny_job(options=(("prior.weights", str(tmp_path / "w.safetensors")),)).key())
+        assert name
+    assert len(keys) == 2
+
+
+def test_a_job_comes_back_from_its_text():
+    for job in (tiny_job(), tiny_job(method=GICP)):
+        assert Job.from_json(job.to_json()) == job
