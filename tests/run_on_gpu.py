@@ -59,7 +59,7 @@ def _files_with_gpu_tests(folder: Path) -> list[str]:
 
 def _passes(file: str, folder: Path) -> bool:
     started = time.monotonic()
-    command = [sys.executable, "-m", "pytest", "-m", "cuda", "-q", "--no-header", file]
+    command = [sys.executable, "-m", "pytest", "-m", "cuda", "--no-header", "--disable-warnings", file]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     passes = done.returncode in (0, NONE_COLLECTED)
     last = done.stdout.strip().splitlines()[-1:] or ["no output"]

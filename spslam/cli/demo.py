@@ -50,7 +50,8 @@ def execute(args: argparse.Namespace) -> None:
     resolve_device(config.device)
     _remove_earlier_demo(args.output)
     frames = None if args.frames is None else slice(0, args.frames, 1)
-    run(config, args.output, frames, resume=False, mesh=True, quiet=args.quiet)
+    command = "spslam run demo" if frames is None else f"spslam run demo --frames 0:{args.frames}"
+    run(config, args.output, frames, resume=False, mesh=True, quiet=args.quiet, command=command)
     metrics = _evaluate(args.output)
     if not args.quiet:
         print_summary(metrics, args.output)

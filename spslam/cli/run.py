@@ -38,8 +38,16 @@ def execute(args: argparse.Namespace) -> None:
         print_summary(metrics, output)
 
 
-def run(config: Config, output: Path, frames: slice | None, resume: bool, mesh: bool, quiet: bool) -> dict[str, Any]:
-    """Run the sequence of a configuration; an interruption says how to go on."""
+def run(
+    config: Config,
+    output: Path,
+    frames: slice | None,
+    resume: bool,
+    mesh: bool,
+    quiet: bool,
+    command: str = "the same command with",
+) -> dict[str, Any]:
+    """Run the sequence of a configuration; an interruption says how to go on: by ``command`` and ``--resume``."""
     from spslam.datasets import open_sequence
 
     data = None if config.dataset.path is None else Path(config.dataset.path)
@@ -53,11 +61,11 @@ def run(config: Config, output: Path, frames: slice | None, resume: bool, mesh: 
         return run_sequence(config, data, output, frames, resume, mesh, progress)
     except KeyboardInterrupt:
         if _can_go_on(output):
-            raise KeyboardInterrupt(f"the same command with --output {output} --resume goes on") from None
+            raise KeyboardInterrupt(f"{command} --output {output} --resume goes on") from None
         raise
     except DeviceError as error:
         if _can_go_on(output):
-            raise DeviceError(f"{error}; what was done is in {output}, --resume goes on from there") from error
+            raise DeviceError(f"{error}; {command} --output {output} --resume goes on from its checkpoint") from error
         raise
     finally:
         if progress is not None:

@@ -59,9 +59,10 @@ class Uploader:
         source = pixels.holding(pixels.buffer.pin_memory())
         # One after another, so that the marks enclose one copy.
         with self._turn, torch.cuda.stream(self._stream):
+            buffer = torch.empty(len(source.buffer), dtype=torch.int32, device=self.device)
             begin = StreamMark(self._stream)
-            sent = source.to(self.device, non_blocking=True)
-            return Upload(sent, source, begin, StreamMark(self._stream))
+            buffer.copy_(source.buffer, non_blocking=True)
+            return Upload(pixels.holding(buffer), source, begin, StreamMark(self._stream))
 
 
 @dataclass

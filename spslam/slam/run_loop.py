@@ -5,7 +5,6 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import IO, Any
 
 from spslam.datasets.base import RgbdDataset
@@ -100,7 +99,7 @@ class RunLoop:
             done, pending = self._pending.popleft()
             report = pending.result() if pending else None
             if report:
-                log.write(json.dumps(asdict(report)) + "\n")
+                log.write(json.dumps(vars(report)) + "\n")
             if self.progress:
                 self.progress(done, len(self.dataset), report)
 
