@@ -1,5 +1,6 @@
 #include "spslam/render_step.h"
 
+#include "bindings/render_options.h"
 #include "bindings/scene.h"
 
 namespace spslam::bindings {
@@ -16,34 +17,15 @@ T* output(const OptionalTensor& tensor, std::int64_t size, const char* name) {
   return mutable_data<T>(*tensor);
 }
 
-RenderOptions load_options(std::int64_t num_uniform, std::int64_t num_surface, double near, double far,
-                           double truncation, bool cosine_targets, const std::vector<double>& weights,
-                           const PhiloxKey& key) {
-  constexpr std::int64_t kMaxSamples = 1 << 16;
-  STD_TORCH_CHECK(num_uniform >= 0 && num_surface >= 0 && num_uniform + num_surface >= 1 &&
-                      num_uniform + num_surface <= kMaxSamples,
-                  "render_step: the samples of a ray must be from 1 to ", kMaxSamples);
-  STD_TORCH_CHECK(weights.size() == 4, "render_step: weights must be rgb, depth, free_space, sdf");
-  const auto f = [](double x) { return static_cast<float>(x); };
-  return {
-      {static_cast<std::int32_t>(num_uniform), static_cast<std::int32_t>(num_surface), f(near), f(far), f(truncation)},
-      key,
-      {f(weights[0]), f(weights[1]), f(weights[2]), f(weights[3])},
-      cosine_targets};
-}
-
 void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars,
                  std::vector<std::int64_t> plane_layout, Tensor pixels, Tensor ray_frames, Tensor poses,
-                 std::vector<double> intrinsics, std::int64_t num_uniform, std::int64_t num_surface, double near,
-                 double far, double truncation, bool cosine_targets, std::vector<double> weights, std::int64_t seed,
-                 std::int64_t stream, std::int64_t frame, std::int64_t iteration, Tensor losses,
-                 OptionalTensor grad_poses, OptionalTensor grad_embeddings, OptionalTensor embedding_stamps,
-                 OptionalTensor grad_texels, OptionalTensor texel_stamps, OptionalTensor grad_geometry,
-                 OptionalTensor grad_color, std::int64_t stamp) {
+                 SPS_RENDER_OPTIONS_PARAMETERS, Tensor losses, OptionalTensor grad_poses,
+                 OptionalTensor grad_embeddings, OptionalTensor embedding_stamps, OptionalTensor grad_texels,
+                 OptionalTensor texel_stamps, OptionalTensor grad_geometry, OptionalTensor grad_color,
+                 std::int64_t stamp, std::int64_t precision) {
   const std::int64_t num_rays = ray_frames.numel();
   STD_TORCH_CHECK(pixels.numel() == 3 * num_rays, "render_step: pixels must have shape [R, 3]");
   STD_TORCH_CHECK(poses.dim() == 2 && poses.size(1) == 7, "render_step: poses must have shape [F, 7]");
-  STD_TORCH_CHECK(intrinsics.size() == 4, "render_step: intrinsics must be fx, fy, cx, cy");
   DeviceScope scope(losses);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   const SceneView& view = scene.view;
@@ -51,12 +33,15 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
   ray_frames = torch::stable::contiguous(ray_frames);
   poses = torch::stable::contiguous(poses);
   const std::int64_t num_texels = scene_tensors[5].numel() / kPlaneChannels;
-  const auto f = [&](int i) { return static_cast<float>(intrinsics[i]); };
-  const RayBatch rays{
-      data<std::int32_t>(pixels), data<std::int32_t>(ray_frames), num_rays, data<float>(poses), poses.size(0),
-      {f(0), f(1), f(2), f(3)}};
-  const RenderOptions options = load_options(num_uniform, num_surface, near, far, truncation, cosine_targets, weights,
-                                             philox_key(seed, stream, frame, iteration));
+  const RayBatch rays{data<std::int32_t>(pixels),
+                      data<std::int32_t>(ray_frames),
+                      num_rays,
+                      data<float>(poses),
+                      poses.size(0),
+                      load_intrinsics("render_step", intrinsics)};
+  const RenderOptions options =
+      load_options("render_step", num_uniform, num_surface, near, far, truncation, cosine_targets, weights,
+                   philox_key(seed, stream, frame, iteration), precision);
   const RenderGradients gradients{
       output<float>(losses, kLossTerms, "losses"),
       output<float>(grad_poses, rays.num_frames * kPoseGradientSize, "grad_poses"),
@@ -67,7 +52,7 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
       output<float>(grad_geometry, kGeometryDecoder.num_params(), "grad_geometry"),
       output<float>(grad_color, kColorDecoder.num_params(), "grad_color"),
       static_cast<std::int32_t>(stamp)};
-  const std::int64_t bytes = render_step_workspace_size(scope.context, view, rays, options);
+  const std::int64_t bytes = render_step_workspace_size(scope.context, view, rays, options, gradients);
   Tensor workspace = empty(losses, {bytes}, ScalarType::Byte);
   spslam::render_step(scope.context, view, rays, options, gradients, workspace.mutable_data_ptr());
 }
@@ -76,12 +61,10 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
-  m.def("render_step(" SPS_SCENE_SCHEMA
-        ", Tensor pixels, Tensor ray_frames, Tensor poses, float[] intrinsics, int num_uniform, int num_surface, "
-        "float near, float far, float truncation, bool cosine_targets, float[] weights, int seed, int stream, "
-        "int frame, int iteration, Tensor(a!) losses, Tensor(b!)? grad_poses, Tensor(c!)? grad_embeddings, "
-        "Tensor(d!)? embedding_stamps, Tensor(e!)? grad_texels, Tensor(f!)? texel_stamps, "
-        "Tensor(g!)? grad_geometry, Tensor(h!)? grad_color, int stamp) -> ()");
+  m.def("render_step(" SPS_SCENE_SCHEMA ", Tensor pixels, Tensor ray_frames, Tensor poses, " SPS_RENDER_OPTIONS_SCHEMA
+        ", Tensor(a!) losses, Tensor(b!)? grad_poses, Tensor(c!)? grad_embeddings, Tensor(d!)? embedding_stamps, "
+        "Tensor(e!)? grad_texels, Tensor(f!)? texel_stamps, Tensor(g!)? grad_geometry, Tensor(h!)? grad_color, "
+        "int stamp, int precision=0) -> ()");
 }
 #endif
 

@@ -203,7 +203,8 @@ class Step {
 }  // namespace render
 
 template <>
-std::int64_t render_step_workspace_size(Cpu, const SceneView&, const RayBatch&, const RenderOptions&) {
+std::int64_t render_step_workspace_size(Cpu, const SceneView&, const RayBatch&, const RenderOptions&,
+                                        const RenderGradients&) {
   return 0;
 }
 

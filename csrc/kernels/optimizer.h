@@ -7,6 +7,9 @@
 
 namespace spslam {
 
+// Adam's published decay rates and floor.
+constexpr double kAdamBeta1 = 0.9, kAdamBeta2 = 0.999, kAdamEpsilon = 1e-8;
+
 // Adam's constants for one step, as torch.optim.Adam forms them.
 template <class T>
 struct AdamCoefficients {

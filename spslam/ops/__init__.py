@@ -5,7 +5,9 @@ from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.gauss_newton import gauss_newton_poses, predict_pose, track_gauss_newton
 from spslam.ops.hash_table import VoxelHash
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
+from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.marching_cubes import marching_cubes
+from spslam.ops.optimize_map import AdamMoments, AdamTable, MapMoments, new_gradient_sums, optimize_map_
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.pixel_sampling import PixelSampling, sample_frame_pixels
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_points, fuse_prior_, random_embeddings
@@ -13,6 +15,7 @@ from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, s
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.track_adam import track_adam
 from spslam.ops.volume_rendering import rendering_losses, volume_render
 from spslam.ops.voxel_hash import (
     new_voxel_hash,
@@ -28,7 +31,11 @@ __all__ = [
     "CUDA_OFF_REASON",
     "ENCODER_PARAMETERS",
     "Activation",
+    "AdamMoments",
+    "AdamTable",
     "Intrinsics",
+    "LaunchGraph",
+    "MapMoments",
     "PixelSampling",
     "RayBatch",
     "RenderOptions",
@@ -46,8 +53,10 @@ __all__ = [
     "marching_cubes",
     "mlp",
     "mlp_num_params",
+    "new_gradient_sums",
     "new_voxel_hash",
     "normal_equations",
+    "optimize_map_",
     "philox_uniform",
     "predict_pose",
     "query_color",
@@ -62,6 +71,7 @@ __all__ = [
     "set_num_threads",
     "solve_normal_equations",
     "sparse_adam_",
+    "track_adam",
     "track_gauss_newton",
     "tri_plane_interpolate",
     "trilinear_interpolate",

@@ -8,7 +8,7 @@ from spslam.config import Config
 from spslam.geometry import quaternion_to_matrix
 from spslam.prior import Prior, encode_frame
 from spslam.slam.covisibility import POINTS, select_frames
-from spslam.slam.optimization import quaternion_gradient, render_options
+from spslam.slam.optimization import render_options
 from spslam.slam.pixels import FramePixels, unpack_points
 from spslam.slam.state import Moments, SlamState
 
@@ -21,6 +21,7 @@ class Mapper:
         self.camera = camera
         self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self.prior = prior
+        self._graph = ops.LaunchGraph()
 
     def integrate(self, state: SlamState, pixels: FramePixels) -> None:
         """Allocates voxels around the newest frame's surface, fills them from the prior, and covers it with planes."""
@@ -52,93 +53,41 @@ class Mapper:
         frames = self._select(state)
         if self.config.mapping.reset_moments:
             _reset(state)
-        losses = None
-        for iteration in range(iterations):
-            losses = self._iterate(state, frames, iteration)
-        return losses
-
-    def _iterate(self, state: SlamState, frames: torch.Tensor, iteration: int) -> torch.Tensor:
-        config, scene, newest = self.config, state.scene, len(state.frames) - 1
-        device = scene.device
-        count = config.mapping.pixels
-        slot = torch.arange(count) * len(frames) // count
-        draw = ops.sample_indices(
-            config.seed, ops.Stream.MAPPING_PIXELS, newest, iteration, count, state.pixels.pixels_per_frame, device
+        config, newest = self.config, len(state.frames) - 1
+        losses = ops.optimize_map_(
+            state.scene.view(),
+            state.pixels.records,
+            state.frames.poses,
+            frames,
+            self.intrinsics,
+            render_options(config, ops.Stream.MAPPING_RAYS, newest),
+            self._moments(state),
+            num_pixels=config.mapping.pixels,
+            iterations=iterations,
+            # The frame that founded the map holds the world in place.
+            fixed_frame=int(state.usable.nonzero()[0, 0]),
+            first_step=state.steps + 1,
+            first_stamp=state.stamp + 1,
+            graph=self._graph,
         )
-        records = state.pixels.records[frames[slot].to(device), draw]
-        selected = frames.to(device)
-        state.stamp += 1
-        state.steps += 1
-        gradients = self._gradients(state)
-        step = ops.render_step(
-            scene.view(),
-            ops.RayBatch(
-                records,
-                slot.to(device, torch.int32),
-                state.frames.poses[selected],
-                self.intrinsics,
-            ),
-            render_options(config, ops.Stream.MAPPING_RAYS, newest, iteration, config.mapping.optimize_poses),
-            gradients,
-        )
-        self._step_scene(state, step)
-        if step.grad_poses is not None:
-            self._step_poses(state, selected, step.grad_poses)
-        return step.losses
+        state.steps += iterations
+        state.stamp += iterations
+        return losses[-1]
 
-    def _gradients(self, state: SlamState) -> ops.SceneGradients:
-        """Buffers for the gradients of what is optimised, grown to the scene's size."""
-        scene, config = state.scene, self.config
-        frozen: tuple[torch.Tensor | None, torch.Tensor | None] = (None, None)
-        embeddings = texels = frozen
-        if config.mapping.optimize_geometry:
-            embeddings = _buffers(state, "embeddings", scene.volume.embeddings)
-        if config.loss.rgb > 0:
-            texels = _buffers(state, "texels", scene.planes.texels)
-        return ops.SceneGradients(*embeddings, *texels, stamp=state.stamp)
-
-    def _step_scene(self, state: SlamState, step: ops.RenderStep) -> None:
+    def _moments(self, state: SlamState) -> ops.MapMoments:
+        """Adam's state of all that is optimised, grown to the scene's size."""
         mapping, scene = self.config.mapping, state.scene
-        if step.grad_geometry is not None:
-            self._adam_rows(state, "embeddings", scene.volume.embeddings, mapping.embedding_rate)
-            self._adam_dense(
-                state, "geometry_decoder", scene.geometry_decoder, step.grad_geometry, mapping.decoder_rate
-            )
-        if step.grad_color is not None:
-            self._adam_rows(state, "texels", scene.planes.texels, mapping.plane_rate)
-            self._adam_dense(state, "color_decoder", scene.color_decoder, step.grad_color, mapping.color_decoder_rate)
-
-    def _adam_rows(self, state: SlamState, name: str, parameter: torch.Tensor, rate: float) -> None:
-        m, rows = state.moments[name], len(parameter)
-        ops.sparse_adam_(
-            parameter,
-            m.gradient[:rows],
-            m.first[:rows],
-            m.second[:rows],
-            m.stamps[:rows],
-            state.stamp,
-            lr=rate,
-            step=state.steps,
+        geometry, color = mapping.optimize_geometry, self.config.loss.rgb > 0
+        volume, planes = scene.volume.embeddings, scene.planes.texels
+        return ops.MapMoments(
+            embeddings=_moments(state, "embeddings", volume).of_table(mapping.embedding_rate) if geometry else None,
+            texels=_moments(state, "texels", planes).of_table(mapping.plane_rate) if color else None,
+            geometry_params=_decoder(state, "geometry_decoder", scene.geometry_decoder, mapping.decoder_rate, geometry),
+            color_params=_decoder(state, "color_decoder", scene.color_decoder, mapping.color_decoder_rate, color),
+            poses=_moments(state, "poses", state.frames.poses).of_tensor(mapping.pose_rate)
+            if mapping.optimize_poses
+            else None,
         )
-
-    def _adam_dense(
-        self, state: SlamState, name: str, parameter: torch.Tensor, gradient: torch.Tensor, rate: float
-    ) -> None:
-        if rate == 0:
-            return
-        m = _moments(state, name, parameter)
-        ops.sparse_adam_(parameter, gradient, m.first, m.second, lr=rate, step=state.steps)
-
-    def _step_poses(self, state: SlamState, selected: torch.Tensor, grad_poses: torch.Tensor) -> None:
-        poses = state.frames.poses
-        m = _moments(state, "poses", poses)
-        # The frame that founded the map holds the world in place.
-        free = selected != state.usable.nonzero()[0, 0].to(selected.device)
-        rows = selected[free]
-        m.gradient[rows] = quaternion_gradient(poses[rows], grad_poses[free])
-        m.stamps[rows] = state.stamp
-        self._adam_rows(state, "poses", poses, self.config.mapping.pose_rate)
-        poses[rows, :4] /= poses[rows, :4].norm(dim=1, keepdim=True)
 
     def _select(self, state: SlamState) -> torch.Tensor:
         config, frames, usable = self.config, state.frames, state.usable
@@ -172,10 +121,11 @@ def _moments(state: SlamState, name: str, parameter: torch.Tensor) -> Moments:
     return state.moments[name]
 
 
-def _buffers(state: SlamState, name: str, parameter: torch.Tensor) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """Where the gradient of a parameter's rows, and which rows have one, are kept."""
-    moments = _moments(state, name, parameter)
-    return moments.gradient, moments.stamps
+def _decoder(
+    state: SlamState, name: str, parameter: torch.Tensor, rate: float, optimised: bool
+) -> ops.AdamMoments | None:
+    """Adam's state of a decoder; None where it stays as it is."""
+    return _moments(state, name, parameter).of_tensor(rate) if optimised and rate > 0 else None
 
 
 def _reset(state: SlamState) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
@@ -97,7 +98,7 @@ class Moments:
 
     Attributes:
         first, second: running moments.
-        gradient: sums of the current iteration, zero between iterations.
+        gradient: sums of the current iteration, zero between iterations; see `ops.new_gradient_sums`.
         stamps: int32 [rows], the iteration that last touched a row.
     """
 
@@ -115,7 +116,7 @@ class Moments:
     def of(cls, first: torch.Tensor, second: torch.Tensor) -> "Moments":
         """The given moments, between two iterations."""
         stamps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
-        return cls(first, second, torch.zeros_like(first), stamps)
+        return cls(first, second, ops.new_gradient_sums(first), stamps)
 
     def fit(self, rows: int) -> None:
         """Appends zero rows up to `rows`, with spare capacity so that growth is amortised."""
@@ -132,6 +133,14 @@ class Moments:
             moved = old.new_zeros((count, *old.shape[1:]))
             moved[rows] = old[: len(rows)]
             setattr(self, name, moved)
+
+    def of_table(self, rate: float) -> ops.AdamTable:
+        """For a table of which iterations touch some rows."""
+        return ops.AdamTable(self.first, self.second, rate, self.gradient, self.stamps)
+
+    def of_tensor(self, rate: float) -> ops.AdamMoments:
+        """For parameters that every iteration steps."""
+        return ops.AdamMoments(self.first, self.second, rate)
 
     def reset(self) -> None:
         """Forgets the past steps."""

@@ -10,7 +10,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.geometry import constant_speed
 from spslam.scene import Scene
-from spslam.slam.optimization import PoseAdam, render_options
+from spslam.slam.optimization import render_options
 from spslam.slam.pixels import FramePixels
 from spslam.slam.state import FrameTable, pose_tensor
 
@@ -35,12 +35,13 @@ class TrackingResult:
 
 
 class Tracker:
-    """Tracks frames one after another; holds no state of its own."""
+    """Tracks frames one after another; holds no state of its own but scratch."""
 
     def __init__(self, config: Config, camera: Camera):
         self.config = config
         self.camera = camera
         self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+        self._graph = ops.LaunchGraph()
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
@@ -95,35 +96,30 @@ class Tracker:
         return self._judged(start, pose, len(stats), cost, inlier_share)
 
     def _track_adam(self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int) -> TrackingResult:
-        tracking, seed = self.config.tracking, self.config.seed
-        count, device = tracking.pixels, records.device
-        pose = start.clone()[None]
-        adam = PoseAdam(pose, tracking.rotation_rate, tracking.translation_rate)
-        ray_frames = torch.zeros(count, dtype=torch.int32, device=device)
-        best, best_pose = math.inf, start
-        iterations = self._iterations(frame)
-        for iteration in range(iterations):
-            draw = ops.sample_indices(seed, ops.Stream.TRACKING_PIXELS, frame, iteration, count, len(records), device)
-            step = ops.render_step(
-                scene.view(),
-                ops.RayBatch(records[draw], ray_frames, pose, self.intrinsics),
-                render_options(self.config, ops.Stream.TRACKING_RAYS, frame, iteration),
-            )
-            loss = float(step.losses[0])
-            if loss < best:
-                best, best_pose = loss, pose[0].clone()
-            if step.grad_poses is not None:
-                adam.step(step.grad_poses, iteration + 1)
+        tracking, iterations = self.config.tracking, self._iterations(frame)
+        best, _ = ops.track_adam(
+            scene.view(),
+            records,
+            start,
+            self.intrinsics,
+            render_options(self.config, ops.Stream.TRACKING_RAYS, frame),
+            num_pixels=tracking.pixels,
+            iterations=iterations,
+            rotation_rate=tracking.rotation_rate,
+            translation_rate=tracking.translation_rate,
+            graph=self._graph,
+        )
         # A pose that looks away from the map has no loss either, so its fit to the surface decides.
         _, _, cost, inlier_share = ops.gauss_newton_poses(
             scene.view(),
-            records[None, :count],
-            best_pose[None],
+            records[None, : tracking.pixels],
+            best[None],
             self.intrinsics,
             truncation=scene.settings.truncation_m,
-            kernel=self.config.tracking.kernel_end_m,
+            kernel=tracking.kernel_end_m,
         )
-        return self._judged(start, best_pose, iterations, float(cost), float(inlier_share))
+        fit = torch.cat([cost, inlier_share]).tolist()
+        return self._judged(start, best, iterations, *fit)
 
     def _judged(
         self, start: torch.Tensor, pose: torch.Tensor, iterations: int, cost: float, inlier_share: float

@@ -1,6 +1,9 @@
 """A small scene that the tests of the fused ops share: a room's corner with random features and decoders."""
 
+from typing import NamedTuple
+
 import numpy as np
+import pytest
 import torch
 
 from spslam import ops
@@ -10,6 +13,39 @@ VOXEL = 0.04
 TRUNCATION = 0.08
 INTRINSICS = ops.Intrinsics(60.0, 60.0, 31.5, 23.5)
 WIDTH, HEIGHT = 64, 48
+
+
+class Backend(NamedTuple):
+    """Where a fused op runs, and how its decoders multiply there."""
+
+    device: torch.device
+    precision: str
+
+
+BACKENDS = [
+    pytest.param(Backend(torch.device("cpu"), "fp32"), id="cpu"),
+    pytest.param(Backend(torch.device("cuda"), "fp32"), id="cuda-fp32", marks=pytest.mark.cuda),
+    pytest.param(Backend(torch.device("cuda"), "tf32"), id="cuda-tf32", marks=pytest.mark.cuda),
+]
+
+
+def look_at(center, target):
+    """float64 [4, 4] pose of a camera at `center` that looks at `target`, tilted a little."""
+    forward = np.subtract(target, center)
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.2, 1.0, -0.1], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = center
+    return pose
+
+
+POSES = [
+    look_at([0.02, -0.1, 0.05], [0.9, 0.5, 1.1]),
+    look_at([0.1, 0.0, 0.2], [0.9, 0.4, 0.8]),
+    look_at([-0.2, -0.15, 0.1], [0.8, 0.5, 1.1]),
+]
 
 
 def corner_sdf(points: torch.Tensor) -> torch.Tensor:

@@ -16,7 +16,9 @@ struct MlpShape {
   std::int64_t input, hidden, output;
   MlpActivation activation;
 
-  std::int64_t num_params() const { return hidden * (input + 1) + hidden * (hidden + 1) + output * (hidden + 1); }
+  constexpr std::int64_t num_params() const {
+    return hidden * (input + 1) + hidden * (hidden + 1) + output * (hidden + 1);
+  }
 };
 
 // Elements of T of scratch that the launches below need for n samples.

@@ -26,11 +26,16 @@ struct LossWeights {
   float rgb, depth, free_space, sdf;
 };
 
+// Arithmetic of the decoders in the fused kernels on CUDA: products of tf32 on matrix units, where the device has them,
+// or float throughout. The CPU knows float alone.
+enum class Precision : std::int32_t { kTf32 = 0, kFp32 = 1 };
+
 struct RenderOptions {
   RaySampling<float> sampling;
   PhiloxKey key;
   LossWeights weights;
   bool cosine_targets;  // distances to the surface's tangent plane, not along the ray
+  Precision precision;
 };
 
 // Where results go. Losses and dense gradients are overwritten. Rows of tables are added to and stamped; a null table,
@@ -50,7 +55,7 @@ struct RenderGradients {
 // Bytes of scratch that render_step needs.
 template <class Device>
 std::int64_t render_step_workspace_size(Device device, const SceneView& scene, const RayBatch& rays,
-                                        const RenderOptions& options);
+                                        const RenderOptions& options, const RenderGradients& gradients);
 
 template <class Device>
 void render_step(Device device, const SceneView& scene, const RayBatch& rays, const RenderOptions& options,

@@ -1,0 +1,56 @@
+// Sums of what the blocks and rays of a ray kernel left, in a fixed order.
+#pragma once
+
+#include "cuda/fused/arguments.cuh"
+#include "cuda/fused/fragment.cuh"
+
+namespace spslam::fused {
+
+constexpr int kSumThreads = 256, kSumWarps = kSumThreads / kWarp;
+
+// Units of work of a block of kSumThreads: columns of partials a warp wide, and frames a warp each.
+constexpr int kColumnUnits = kPartialSize / kWarp;
+
+// Column 32 * unit + lane over all blocks, in warp 0; warp w adds blocks w, w + 8, .. first. All threads take part.
+__device__ __forceinline__ float sum_column(const float* partials, int blocks, int unit, float (*shared)[kWarp]) {
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  float sum = 0.0f;
+#pragma unroll 8
+  for (int b = warp; b < blocks; b += kSumWarps) {
+    sum += __ldcg(partials + static_cast<std::int64_t>(b) * kPartialSize + unit * kWarp + lane);
+  }
+  __syncthreads();  // the unit before may still be read
+  shared[warp][lane] = sum;
+  __syncthreads();
+  float total = 0.0f;
+  for (int w = 0; w < kSumWarps; ++w) total += shared[w][lane];
+  return total;
+}
+
+// The five losses from the sum of term k in lane first + k.
+__device__ __forceinline__ void store_losses(float sum, int first, int lane, const LossWeights& weights,
+                                             std::int64_t num_rays, float* losses) {
+  const float mean = num_rays > 0 ? sum / static_cast<float>(num_rays) : 0.0f;
+  const float terms[4] = {__shfl_sync(kAllLanes, mean, first), __shfl_sync(kAllLanes, mean, first + 1),
+                          __shfl_sync(kAllLanes, mean, first + 2), __shfl_sync(kAllLanes, mean, first + 3)};
+  if (lane != 0) return;
+  losses[0] =
+      weights.rgb * terms[0] + weights.depth * terms[1] + weights.free_space * terms[2] + weights.sdf * terms[3];
+  for (int k = 0; k < 4; ++k) losses[1 + k] = terms[k];
+}
+
+// d L / d pose of a slot, over its rays in order, in all lanes of a warp.
+__device__ __forceinline__ void sum_pulls(const float* pulls, const RaySource& rays, std::int64_t slot, int lane,
+                                          float (&grad)[kPoseGradientSize]) {
+  constexpr int kRaysAtOnce = kWarp / kPullSize;
+  const std::int64_t begin = first_ray_of_slot(rays, slot), end = first_ray_of_slot(rays, slot + 1);
+  const int column = lane % kPullSize;
+  float sum = 0.0f;
+  for (std::int64_t r = begin + lane / kPullSize; r < end; r += kRaysAtOnce) {
+    if (column < kPoseGradientSize) sum += __ldcg(pulls + kPullSize * r + column);
+  }
+  for (int offset = kPullSize; offset < kWarp; offset *= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
+  for (int k = 0; k < kPoseGradientSize; ++k) grad[k] = __shfl_sync(kAllLanes, sum, k);
+}
+
+}  // namespace spslam::fused

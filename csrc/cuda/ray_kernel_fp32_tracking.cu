@@ -1,0 +1,7 @@
+#include "cuda/fused/ray_variants.cuh"
+
+namespace spslam::fused {
+
+template RayVariant ray_variant<Precision::kFp32, false>(int);
+
+}  // namespace spslam::fused

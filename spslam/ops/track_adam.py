@@ -1,0 +1,86 @@
+"""A whole tracking call with Adam on quaternion and translation, as in the paper (section III.D)."""
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._checks import check, check_tensor
+from spslam.ops.launch_graph import LaunchGraph
+from spslam.ops.ray_sampling import Stream
+from spslam.ops.render_step import RenderOptions
+from spslam.ops.scene_view import Intrinsics, SceneView
+
+
+def track_adam(
+    scene: SceneView,
+    records: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    options: RenderOptions,
+    *,
+    num_pixels: int,
+    iterations: int,
+    rotation_rate: float,
+    translation_rate: float,
+    pixel_stream: int = Stream.TRACKING_PIXELS,
+    graph: LaunchGraph | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Tracks one frame against a frozen scene; all iterations in one call.
+
+    Iteration i draws `num_pixels` of the records as `sample_indices` does with `pixel_stream` and iteration
+    `options.iteration + i`, makes a `render_step` with them, keeps the pose if its total loss is the least yet, and
+    takes an Adam step (beta 0.9 and 0.999, epsilon 1e-8) on quaternion and translation; the quaternion is then
+    normalised. On CUDA nothing waits for the device.
+
+    Args:
+        scene: the map; not changed.
+        records: int32 [P, 3] packed pixel records of the frame, see `RayBatch`; P >= 1.
+        pose: float32 [7] where to start: unit quaternion (w, x, y, z) and translation (m).
+        intrinsics: of the camera.
+        options: of the first iteration; `pose_gradient` is not read.
+        num_pixels: R, rays an iteration, at least 1.
+        iterations: I, at least 1.
+        rotation_rate: learning rate of the quaternion.
+        translation_rate: learning rate of the translation, m.
+        pixel_stream: random stream of the draw.
+        graph: where the call's CUDA graph is kept; without one the kernels are launched one after the other.
+
+    Returns:
+        float32 [7], the pose of the least loss; `pose` where no loss is a number. And float32 [I, 5], the losses before
+        each step, as `RenderStep.losses`.
+
+        Deterministic: the same bits for any number of CPU threads and, on CUDA, from run to run.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+    """
+    name = "track_adam"
+    scene.check(name)
+    options.check(name)
+    check_tensor(name, "records", records, ("P", 3), torch.int32, like=scene.embeddings)
+    check(len(records) >= 1, name, "records", "hold at least one pixel", len(records))
+    check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
+    check(len(intrinsics) == 4, name, "intrinsics", "be (fx, fy, cx, cy)", tuple(intrinsics))
+    check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
+    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
+    check(rotation_rate >= 0, name, "rotation_rate", "be at least 0", rotation_rate)
+    check(translation_rate >= 0, name, "translation_rate", "be at least 0", translation_rate)
+    with torch.no_grad():
+        return torch.ops.spslam.track_adam(
+            *scene.arguments(),
+            records,
+            pose,
+            *options.arguments(intrinsics),
+            int(pixel_stream),
+            num_pixels,
+            iterations,
+            rotation_rate,
+            translation_rate,
+            options.precision_code,
+            0 if graph is None else graph.number(pose.device),
+        )
+
+
+@torch.library.register_fake("spslam::track_adam")
+def _(scene, scene_scalars, plane_layout, records, pose, *args):
+    iterations = args[14]  # after twelve of the options, the pixel stream and the number of pixels
+    return pose.new_empty(7), pose.new_empty(iterations, 5)
