@@ -91,8 +91,24 @@ class MapMoments:
 
 
 def new_gradient_sums(param: torch.Tensor) -> torch.Tensor:
-    """Zeros of the shape and device of `param` that gradients are summed in: float32 on the CPU, where sums have a
-    fixed order, int64 fixed point on CUDA, where they have not."""
+    """Zeros for the sums of a parameter's gradients.
+
+    Args:
+        param: [V, C] or any shape.
+
+    Returns:
+        zeros of the shape and device of `param`: float32 on the CPU, where sums have a fixed order, int64 (fixed point)
+        on CUDA, where they have not. V = 0 gives an empty tensor.
+
+    Raises:
+        TypeError: `param` is no tensor.
+
+    Example:
+        >>> new_gradient_sums(torch.ones(2, 3)).shape
+        torch.Size([2, 3])
+    """
+    if not isinstance(param, torch.Tensor):
+        raise TypeError(f"new_gradient_sums: param must be a torch.Tensor, got {type(param).__name__}")
     return torch.zeros(param.shape, dtype=_gradient_dtype(param.device), device=param.device)
 
 
@@ -145,6 +161,19 @@ def optimize_map_(
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+
+    Example:
+        >>> options = RenderOptions(
+        ...     32, 11, near=0.2, far=1.02, truncation=0.08, cosine_targets=True, weight_rgb=10.0, weight_depth=0.1,
+        ...     weight_free_space=20.0, weight_sdf=1000.0, seed=0, stream=4, frame=0, iteration=0)
+        >>> scene, poses = SceneView.empty(), torch.tensor([[1.0, 0, 0, 0, 0, 0, 0]])
+        >>> decoder = AdamMoments(torch.zeros(1473), torch.zeros(1473), rate=1e-3)
+        >>> losses = optimize_map_(
+        ...     scene, torch.zeros(1, 50, 3, dtype=torch.int32), poses, torch.tensor([0]),
+        ...     Intrinsics(60.0, 60.0, 31.5, 23.5), options, MapMoments(geometry_params=decoder),
+        ...     num_pixels=64, iterations=5, fixed_frame=0, first_step=1, first_stamp=1)
+        >>> losses.shape
+        torch.Size([5, 5])
     """
     name = "optimize_map_"
     scene.check(name)

@@ -52,6 +52,17 @@ def track_adam(
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+
+    Example:
+        >>> options = RenderOptions(
+        ...     32, 11, near=0.2, far=1.02, truncation=0.08, cosine_targets=True, weight_rgb=10.0, weight_depth=0.1,
+        ...     weight_free_space=20.0, weight_sdf=1000.0, seed=0, stream=2, frame=0, iteration=0)
+        >>> pose, losses = track_adam(
+        ...     SceneView.empty(), torch.zeros(50, 3, dtype=torch.int32), torch.tensor([1.0, 0, 0, 0, 0, 0, 0]),
+        ...     Intrinsics(60.0, 60.0, 31.5, 23.5), options, num_pixels=64, iterations=6, rotation_rate=1e-3,
+        ...     translation_rate=2e-3)
+        >>> losses.shape, pose[0]
+        (torch.Size([6, 5]), tensor(1.))
     """
     name = "track_adam"
     scene.check(name)
