@@ -78,7 +78,7 @@ def _evaluate(output: Path) -> dict:
     """Adds the mesh's figures, by the room's exact surface, to metrics and report."""
     from spslam.datasets.generated import GeneratedDataset
     from spslam.datasets.registry import open_dataset
-    from spslam.evaluation.finished_run import add_metrics, surface_figures
+    from spslam.evaluation.finished_run import add_metrics, surface_figures, view_figures
     from spslam.evaluation.report import write_report
     from spslam.evaluation.run_output import RunOutput
 
@@ -86,6 +86,7 @@ def _evaluate(output: Path) -> dict:
     finished = RunOutput.read(output)
     if not isinstance(dataset, GeneratedDataset) or finished.mesh() is None:
         return finished.metrics
-    metrics = add_metrics(finished, surface_figures(finished, dataset, dataset.room))
+    figures = surface_figures(finished, dataset, dataset.room) | view_figures(finished, dataset)
+    metrics = add_metrics(finished, figures)
     write_report(output)
     return metrics

@@ -108,6 +108,8 @@ def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]
         ("completeness", "completeness_cm", "{:.2f} cm"),
         ("F1 at 5 cm", "f1_5cm", "{:.1f} %"),
         ("F1 at 1 cm", "f1_1cm", "{:.1f} %"),
+        ("depth L1", "depth_l1_cm", "{:.2f} cm"),
+        ("PSNR", "psnr_db", "{:.1f} dB"),
         ("memory", "peak_rss_mb", "{:.0f} MB"),
         ("GPU memory", "peak_gpu_mb", "{:.0f} MB"),
     ):

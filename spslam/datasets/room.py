@@ -101,6 +101,11 @@ class Room:
             first += len(points)
         return np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors)
 
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [V,3] and faces [F,3] of :meth:`mesh`."""
+        vertices, faces, _ = self.mesh()
+        return vertices, faces
+
     def _visible_triangles(self, solid: Primitive, longest_edge_m: float) -> tuple[np.ndarray, np.ndarray]:
         surface = solid.local_mesh()
         points, triangles = trimesh.remesh.subdivide_to_size(surface.vertices, surface.faces, longest_edge_m)

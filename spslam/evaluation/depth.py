@@ -1,4 +1,4 @@
-"""Rendered depth and colour images against true ones."""
+"""Rendered depth images against true ones."""
 
 from __future__ import annotations
 
@@ -36,21 +36,3 @@ def depth_l1(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]
     if not means:
         return {}
     return {"depth_l1_cm": 100 * float(np.mean(means)), "depth_l1_coverage": 100 * compared / known}
-
-
-def psnr_db(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of uint8 images [H,W,3], over the pixels of a mask [H,W] if given.
-
-    ``10 log10(255^2 / MSE)``; infinite for equal images, NaN for an empty mask.
-    """
-    if rendered.shape != reference.shape:
-        raise ValueError(
-            f"psnr_db: rendered and reference must have one shape, got {rendered.shape} and {reference.shape}"
-        )
-    squared = (rendered.astype(np.float64) - reference) ** 2
-    if mask is not None:
-        squared = squared[mask]
-    if not squared.size:
-        return float("nan")
-    error = float(squared.mean())
-    return float("inf") if error == 0 else 10 * float(np.log10(255**2 / error))

@@ -1,4 +1,4 @@
-"""A finished run against the truth: its trajectory, and its mesh where the camera saw the surface."""
+"""A finished run against the truth: its trajectory, its mesh where the camera saw the surface, its map's pictures."""
 
 from __future__ import annotations
 
@@ -9,27 +9,38 @@ from typing import Any
 import numpy as np
 
 from spslam.datasets.base import RgbdDataset
-from spslam.errors import OutputError
+from spslam.errors import DatasetError, OutputError
+from spslam.evaluation.depth import depth_l1
+from spslam.evaluation.images import psnr_db, ssim
 from spslam.evaluation.mesh import evaluate_surface, observed_mask
-from spslam.evaluation.run_output import RunOutput, match_times
+from spslam.evaluation.run_output import Mesh, RunOutput, match_times
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import Alignment, ate, rpe
+from spslam.evaluation.views import novel_depth, novel_poses, render_view
 from spslam.geometry import umeyama
 from spslam.io import atomic_write
+from spslam.scene import Scene
 
 # Frames that decide what was observed; more of a sequence's neighbours add nothing but time.
 _CULLING_FRAMES = 100
+# Views whose depth, and frames whose colour, is compared; and the width of the former.
+NOVEL_VIEWS, COLOR_VIEWS = 32, 16
+_NOVEL_WIDTH_PX = 160
 
 
-def trajectory_figures(run: RunOutput) -> dict[str, float]:
-    """ATE and RPE as metrics.json names them; empty where no true pose is known."""
+def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, float]:
+    """ATE and RPE as metrics.json names them; empty where no true pose is known.
+
+    With ``with_scale`` also ATE after alignment by a similarity, under names of its own.
+    """
     if run.truth is None:
         return {}
-    return {**ate(run.trajectory.poses, run.truth), **rpe(run.trajectory.poses, run.truth)}
+    figures = {**ate(run.trajectory.poses, run.truth), **rpe(run.trajectory.poses, run.truth)}
+    return {**figures, **ate(run.trajectory.poses, run.truth, with_scale=True)} if with_scale else figures
 
 
 def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dict[str, float]:
-    """Accuracy, completeness and F1 of the run's mesh, as metrics.json names them.
+    """Accuracy, completeness, F1 and depth from novel views of the run's mesh, as metrics.json names them.
 
     The mesh is carried into the truth's world by the rigid motion that best carries estimated onto true views (camera
     centres and points a metre away from them: the centres of a straight path alone leave a rotation open); surface that
@@ -46,20 +57,67 @@ def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dic
     OutputError
         When the run has no mesh, or none of its frames is in the dataset.
     """
-    mesh = run.mesh()
-    if mesh is None:
-        raise OutputError(f"{run.folder}: has no mesh to evaluate; spslam mesh {run.folder} makes one")
-    rows, indices = _frames_of(run, dataset)
+    mesh = _require_mesh(run)
+    rows, indices = _frames_of(run, dataset, _CULLING_FRAMES)
     poses = run.trajectory.poses if run.truth is None else run.truth
+    rows, depths = _read_depths(dataset, rows, indices)
     vertices = (
         mesh.vertices if run.truth is None else _align_views(run.trajectory.poses, run.truth).apply(mesh.vertices)
     )
-    depths = [dataset[int(index)].depth for index in indices]
 
     def observed(points: np.ndarray) -> np.ndarray:
         return observed_mask(points, depths, poses[rows], dataset.camera)
 
-    return evaluate_surface(TriangleSurface(vertices, mesh.faces), truth, observed)
+    known = np.flatnonzero(np.isfinite(poses[rows]).all(axis=(1, 2)))
+    views = novel_poses(poses[rows][known], [depths[row] for row in known], dataset.camera, NOVEL_VIEWS)
+    height_px = max(round(dataset.camera.height * _NOVEL_WIDTH_PX / dataset.camera.width), 1)
+    camera = dataset.camera.resized(_NOVEL_WIDTH_PX, height_px)
+    pairs = novel_depth((vertices, mesh.faces), truth.triangles(), views, camera, observed, NOVEL_VIEWS)
+    return {**evaluate_surface(TriangleSurface(vertices, mesh.faces), truth, observed), **depth_l1(pairs)}
+
+
+def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
+    """How like the input the map looks from where its frames were taken, as metrics.json names it.
+
+    The map is drawn from the estimated poses of frames spread evenly over the run.
+
+    Parameters
+    ----------
+    run : with a mesh and a map.
+    dataset : the one that the run was over, or that it took its frames from.
+
+    Returns
+    -------
+    ``psnr_db`` and ``ssim`` : means over the views, each over the pixels where the map has surface.
+    ``view_coverage`` : percent of all pixels where it has.
+    Empty when no frame can be read or none shows surface.
+
+    Raises
+    ------
+    OutputError
+        When the run has no mesh or no map, or none of its frames is in the dataset.
+    """
+    mesh, map_file = _require_mesh(run), run.folder / "map.safetensors"
+    if not map_file.is_file():
+        raise OutputError(f"{run.folder}: has no map.safetensors to draw")
+    scene = Scene.load(map_file)
+    likeness, coverage = [], []
+    for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS), strict=True):
+        try:
+            frame = dataset[int(index)]
+        except DatasetError:
+            continue
+        color, depth = render_view(scene, mesh, dataset.camera, run.trajectory.poses[row])
+        shown = depth > 0
+        coverage.append(100 * float(shown.mean()))
+        if shown.any():
+            likeness.append((psnr_db(color, frame.color, shown), ssim(color, frame.color, shown)))
+    if not likeness:
+        return {}
+    ratios, similarities = np.array(likeness).T
+    figures = {"psnr_db": float(ratios.mean()), "view_coverage": float(np.mean(coverage))}
+    # A view that shows specks of surface only has no whole window to compare.
+    return figures | ({} if np.isnan(similarities).all() else {"ssim": float(np.nanmean(similarities))})
 
 
 def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
@@ -67,6 +125,13 @@ def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
     metrics = {**run.metrics, **figures}
     atomic_write(Path(run.folder) / "metrics.json", json.dumps(metrics, indent=1) + "\n")
     return metrics
+
+
+def _require_mesh(run: RunOutput) -> Mesh:
+    mesh = run.mesh()
+    if mesh is None:
+        raise OutputError(f"{run.folder}: has no mesh to evaluate; spslam mesh {run.folder} makes one")
+    return mesh
 
 
 def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
@@ -77,11 +142,23 @@ def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
     return Alignment(*umeyama(*points))
 
 
-def _frames_of(run: RunOutput, dataset: RgbdDataset) -> tuple[np.ndarray, np.ndarray]:
+def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the run's trajectory, spread evenly, and the dataset's numbers of those frames."""
     indices = match_times(dataset.timestamps(), run.trajectory.timestamps)
     rows = np.flatnonzero(indices >= 0)
     if not len(rows):
         raise OutputError(f"{run.folder}: must be a run over {dataset.name}, but has none of its frames")
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _CULLING_FRAMES).round().astype(int))]
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
     return rows, indices[rows]
+
+
+def _read_depths(dataset: RgbdDataset, rows: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Depth images of frames, and the rows of those that can be read."""
+    readable, depths = [], []
+    for row, index in zip(rows, indices, strict=True):
+        try:
+            depths.append(dataset[int(index)].depth)
+        except DatasetError:
+            continue
+        readable.append(row)
+    return np.array(readable, dtype=np.int64), depths

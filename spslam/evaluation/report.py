@@ -49,7 +49,8 @@ def write_report(output_dir: str | os.PathLike) -> Path:
     """
     run = RunOutput.read(Path(output_dir))
     sections = [_header(run), _tiles(run.metrics), *_map_sections(run)]
-    sections += [_trajectory(run), _errors(run), _time(run), _tracking(run), _figures(run.metrics), _settings(run)]
+    sections += [_trajectory(run), _errors(run), _time(run), _tracking(run)]
+    sections += [_paper_table(run.metrics), _figures(run.metrics), _settings(run)]
     page = _PAGE.format(title=html.escape(_title(run)), style=STYLE, body="\n".join(sections))
     path = run.folder / "report.html"
     atomic_write(path, page)
@@ -223,6 +224,34 @@ def _tracking(run: RunOutput) -> str:
 def _column(run: RunOutput, key: str) -> np.ndarray:
     values = [entry.get(key) for entry in run.log]
     return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+
+# Columns of the paper's Table I: title, keys of metrics.json, form.
+_PAPER_COLUMNS = (
+    ("Comp. (%)", ("completeness_5cm",), "{:.2f}"),
+    ("Accu. (%)", ("accuracy_5cm",), "{:.2f}"),
+    ("F1 (%)", ("f1_5cm",), "{:.2f}"),
+    ("Track. (ms)", ("tracking_ms_per_iteration", "tracking_iterations"), "{:.2f} × {:.0f}"),
+    ("Map. (ms)", ("mapping_ms_per_iteration", "mapping_iterations"), "{:.2f} × {:.0f}"),
+    ("Track. FPS", ("tracking_fps",), "{:.2f}"),
+    ("Avg. FPS", ("fps",), "{:.2f}"),
+    ("#param (MB)", ("model_mb",), "{:.1f}"),
+    ("GPU (MB)", ("peak_gpu_mb",), "{:.0f}"),
+)
+
+
+def _paper_table(metrics: dict[str, Any]) -> str:
+    known = [
+        (title, form.format(*(metrics[key] for key in keys)))
+        for title, keys, form in _PAPER_COLUMNS
+        if all(metrics.get(key) is not None for key in keys)
+    ]
+    if not known:
+        return ""
+    heads = "".join(f"<th>{html.escape(title)}</th>" for title, _ in known)
+    cells = "".join(f"<td>{text}</td>" for _, text in known)
+    note = "the columns of SP-SLAM's Table I; surface at 5 cm, time an iteration times iterations, model as parameters"
+    return _section("As in the paper", f"<table><tr>{heads}</tr><tr>{cells}</tr></table>", note)
 
 
 def _figures(metrics: dict[str, Any]) -> str:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+from spslam.errors import DatasetError
 
 # Faces are looked up at sites spread over them, about this far apart; no point of a face is farther from its nearest
 # site than 1.1 times that.
@@ -26,6 +29,9 @@ class Surface(Protocol):
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance [N] of points [N,3] to the surface; infinite when it is empty."""
+
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [V,3] and faces [L,3] to draw it with."""
 
 
 class TriangleSurface:
@@ -52,6 +58,25 @@ class TriangleSurface:
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
         self._corners = corners[areas > 0]
         self._areas = areas[areas > 0]
+
+    @classmethod
+    def load(cls, path: Path) -> TriangleSurface:
+        """The mesh in a file (PLY, OBJ, GLB, ...); raises DatasetError if there is none, or none with faces."""
+        import trimesh
+
+        if not path.is_file():
+            raise DatasetError(f"{path}: no such mesh file")
+        try:
+            mesh = trimesh.load(path, process=False, force="mesh")
+        except Exception as error:  # trimesh raises whatever the parser stumbles over
+            raise DatasetError(f"{path}: can't be read as a mesh: {error}") from error
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            raise DatasetError(f"{path}: must be a mesh with faces, got none")
+        return cls(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [V,3] and faces [L,3], those of no area left out."""
+        return self._corners.reshape(-1, 3), np.arange(3 * len(self._corners)).reshape(-1, 3)
 
     @property
     def area_m2(self) -> float:

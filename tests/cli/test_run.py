@@ -79,6 +79,19 @@ def test_eval_adds_figures_of_the_mesh(finished):
     assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such mesh file")
 
 
+def test_eval_adds_figures_of_pictures_and_of_alignment_with_scale(finished):
+    folder, _ = finished
+    result = spslam("eval", "out", "--views", "--scale", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert "PSNR" in result.stdout
+    metrics = json.loads((folder / "out" / "metrics.json").read_text())
+    assert 10 < metrics["psnr_db"] < 60
+    assert 0 < metrics["ssim"] < 1
+    assert 0 < metrics["view_coverage"] <= 100
+    assert metrics["ate_scaled_rmse_cm"] <= metrics["ate_rmse_cm"]
+    assert "As in the paper" in (folder / "out" / "report.html").read_text()
+
+
 @pytest.mark.parametrize("suffix", ["ply", "glb"])
 def test_mesh_is_made_from_the_map(finished, suffix):
     folder, _ = finished

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from skimage.metrics import peak_signal_noise_ratio
 
-from spslam.evaluation.depth import depth_l1, psnr_db
+from spslam.evaluation.depth import depth_l1
 
 
 def test_depth_l1_is_the_mean_of_the_views_means():
@@ -19,15 +18,3 @@ def test_depth_l1_of_nothing():
     assert depth_l1([(np.zeros((2, 2)), np.ones((2, 2)))]) == {}
     with pytest.raises(ValueError, match="depth_l1: estimated and reference must have one shape"):
         depth_l1([(np.zeros((2, 2)), np.ones((2, 3)))])
-
-
-def test_psnr_agrees_with_scikit_image():
-    generator = np.random.default_rng(0)
-    a, b = generator.integers(0, 256, (2, 20, 30, 3), dtype=np.uint8)
-    assert psnr_db(a, b) == pytest.approx(peak_signal_noise_ratio(a, b))
-    mask = generator.uniform(size=(20, 30)) > 0.5
-    assert psnr_db(a, b, mask) == pytest.approx(peak_signal_noise_ratio(a[mask], b[mask]))
-    assert psnr_db(a, a) == float("inf")
-    assert np.isnan(psnr_db(a, b, np.zeros((20, 30), bool)))
-    with pytest.raises(ValueError, match="psnr_db: rendered and reference must have one shape"):
-        psnr_db(a, b[:10])

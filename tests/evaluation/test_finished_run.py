@@ -8,10 +8,11 @@ import trimesh
 
 from spslam.datasets.base import Subset
 from spslam.datasets.generated import GeneratedDataset
-from spslam.errors import OutputError
-from spslam.evaluation.finished_run import add_metrics, surface_figures, trajectory_figures
+from spslam.errors import DatasetError, OutputError
+from spslam.evaluation.finished_run import add_metrics, surface_figures, trajectory_figures, view_figures
 from spslam.evaluation.run_output import RunOutput, match_times
 from spslam.geometry import pose_from
+from spslam.scene import Scene, SceneSettings
 from spslam.trajectory import Trajectory
 
 TURN = pose_from(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([1.0, 2.0, 3.0]))
@@ -46,6 +47,43 @@ def test_perfect_run_has_perfect_figures(output, room):
     assert figures["f1_5cm"] > 99.9
     assert figures["accuracy_cm"] < 0.1
     assert figures["completeness_cm"] < 0.1
+    assert figures["depth_l1_cm"] < 0.1
+    assert figures["depth_l1_coverage"] > 99.9
+    assert surface_figures(run, room, room.room) == figures
+
+
+class WithoutSomeFrames(Subset):
+    """A data set of which two frames can't be read."""
+
+    def read(self, index):
+        if index in (2, 6):
+            raise DatasetError(f"frame {index} is broken")
+        return super().read(index)
+
+
+def test_frames_that_cannot_be_read_are_left_out_of_the_evaluation(output, room):
+    broken = WithoutSomeFrames(room)
+    assert surface_figures(RunOutput.read(output), broken, room.room)["f1_5cm"] > 99.9
+
+
+def test_pictures_need_a_map_and_a_mesh(output, room):
+    with pytest.raises(OutputError, match="has no map.safetensors to draw"):
+        view_figures(RunOutput.read(output), room)
+    Scene(SceneSettings(0.04, 0.08, 0.04, 0.25, 1000), seed=0).save(output / "map.safetensors")
+    figures = view_figures(RunOutput.read(output), room)
+    # The surface is the room's, the colours of an empty map are nothing like it.
+    assert figures["view_coverage"] > 99.9
+    assert 3 < figures["psnr_db"] < 20
+    assert figures["ssim"] < 0.9
+    (output / "mesh.ply").unlink()
+    with pytest.raises(OutputError, match="has no mesh to evaluate"):
+        view_figures(RunOutput.read(output), room)
+
+
+def test_alignment_with_scale_is_named(output):
+    figures = trajectory_figures(RunOutput.read(output), with_scale=True)
+    assert figures["ate_scale"] == pytest.approx(1, abs=1e-6)
+    assert {"ate_rmse_cm", "ate_scaled_rmse_cm"} <= figures.keys()
 
 
 def test_straight_path_leaves_no_rotation_open(output, room):
