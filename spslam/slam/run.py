@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from spslam.slam.run_files import RunFiles
 from spslam.slam.run_loop import Progress, RunLoop
 from spslam.slam.run_results import provenance, write_results
 from spslam.slam.system import SlamSystem
+from spslam.slam.warm_up import warm_up
 
 
 def run_sequence(
@@ -90,12 +92,15 @@ def _run(
     mesh: bool,
     progress: Progress | None,
 ) -> dict[str, Any]:
+    started = time.perf_counter()
     dataset = open_sequence(config.dataset, data_dir, frames)
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
     system = SlamSystem(config, dataset.camera, _first_pose(config, dataset), device)
     files = RunFiles(output_dir)
     position, clock = _begin(files, system, dataset, data_dir, resume)
+    if device.type == "cuda":
+        warm_up(config, dataset.camera, device)
+        torch.cuda.reset_peak_memory_stats(device)
+    clock["start_s"] = time.perf_counter() - started
     with _one_thread_a_frame(device):
         RunLoop(system, dataset, files, _identity(dataset, data_dir), clock, progress).run(position)
     return write_results(system, dataset, config, files, clock, mesh)

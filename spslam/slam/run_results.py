@@ -32,7 +32,7 @@ def write_results(
         dataset: what the run was over.
         config: of the run.
         files: of its output folder.
-        clock: `wall_s` of the loop, `decode_s` of reading, and the `frames` that they are for.
+        clock: `start_s` before the loop, `wall_s` of it, `decode_s` of reading, and the `frames` that they are for.
         mesh: whether to extract the mesh.
 
     Returns:
@@ -90,6 +90,7 @@ def _processor() -> str:
 def _speed(clock: dict[str, Any]) -> dict[str, float]:
     frames, wall_s = clock["frames"], clock["wall_s"]
     return {
+        "start_s": clock["start_s"],
         "wall_s": wall_s,
         "fps": frames / wall_s if wall_s else 0.0,
         "decode_ms": 1e3 * clock["decode_s"] / max(frames, 1),
