@@ -52,6 +52,7 @@ FIGURES = {
     "f1_1cm": Figure("F1", "% at 1 cm", 1),
     "depth_l1_cm": Figure("depth L1", "cm", 2),
     "psnr_db": Figure("PSNR", "dB", 1),
+    "ssim": Figure("SSIM", "", 3),
 }
 
 

@@ -30,6 +30,7 @@ class Job:
     frames : ``START:STOP[:STEP]`` or None for all.
     device : ``cpu`` or ``cuda``.
     data, mesh : folder of the data and file of the true surface, None where there is none.
+    views : whether pictures of the map are compared with the frames, which takes longer than a fast run.
     """
 
     sequence: str
@@ -43,6 +44,7 @@ class Job:
     device: str
     data: str | None
     mesh: str | None
+    views: bool
 
     def load_config(self) -> Config:
         """The resolved configuration; raises ConfigError."""
@@ -66,6 +68,7 @@ class Job:
             "frames": self.frames,
             "device": self.device,
             "mesh": self.mesh is not None,
+            "views": self.views,
         }
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
         words = (self.sequence, self.method if self.method != SPSLAM else self.preset or "balanced")
@@ -123,18 +126,16 @@ def make_plan(suite: Suite, data: Path | None, device: str) -> Plan:
                 skipped[sequence.name] = reason
                 continue
             for variant in study.variants:
-                wanted = {job.key(): job for job in _jobs(sequence, variant, folder, data, device, suite.seeds)}
+                job = replace(_job(sequence, variant, folder, data, device), views="psnr_db" in study.columns)
+                wanted = {seeded.key(): seeded for seeded in _seeded(job, suite.seeds)}
                 jobs |= wanted
                 cells[study.name, sequence.name, variant.name] = tuple(wanted)
     return Plan(jobs, cells, skipped)
 
 
-def _jobs(
-    sequence: Sequence, variant: Variant, folder: Path | None, data: Path | None, device: str, seeds: int
-) -> Iterator[Job]:
-    mesh = _find_mesh(sequence, folder, data)
-    ours = variant.method == SPSLAM
-    job = Job(
+def _job(sequence: Sequence, variant: Variant, folder: Path | None, data: Path | None, device: str) -> Job:
+    mesh, ours = _find_mesh(sequence, folder, data), variant.method == SPSLAM
+    return Job(
         sequence=sequence.name,
         config=sequence.config,
         preset=variant.preset,
@@ -146,8 +147,13 @@ def _jobs(
         device=device if ours else "cpu",
         data=None if folder is None else str(folder),
         mesh=None if mesh is None else str(mesh),
+        views=False,
     )
-    for seed in range(seeds if variant.seeded else 1):
+
+
+def _seeded(job: Job, seeds: int) -> Iterator[Job]:
+    """The job with each seed; a baseline draws nothing, and is run once."""
+    for seed in range(seeds if job.method == SPSLAM else 1):
         yield replace(job, seed=seed)
 
 

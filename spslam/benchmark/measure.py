@@ -20,7 +20,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
-from spslam.evaluation.finished_run import surface_figures
+from spslam.evaluation.finished_run import surface_figures, view_figures
 from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import ate, rpe
@@ -75,32 +75,21 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
     data = None if job.data is None else Path(job.data)
     dataset = open_dataset(config.dataset, data)
     truth = _true_surface(dataset, job.mesh)
-    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=truth is not None)
-    if truth is not None:
-        run = RunOutput.read(folder)
-        # A run that was lost throughout has an empty mesh, which is no reason to lose its other figures.
-        figures |= surface_figures(run, dataset, truth) if run.mesh() is not None else {}
+    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=truth is not None or job.views)
     if "peak_gpu_mb" in figures:
         figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
-    return figures
+    run = RunOutput.read(folder)
+    if run.mesh() is None:
+        # A run that was lost throughout has an empty mesh, which is no reason to lose its other figures.
+        return figures
+    figures |= {} if truth is None else surface_figures(run, dataset, truth)
+    return {**figures, **view_figures(run, dataset)} if job.views else figures
 
 
 def _true_surface(dataset: RgbdDataset, mesh: str | None) -> Surface | None:
     if isinstance(dataset, GeneratedDataset):
         return dataset.room
-    return None if mesh is None else _load_surface(Path(mesh))
-
-
-def _load_surface(path: Path) -> TriangleSurface:
-    import trimesh
-
-    try:
-        mesh = trimesh.load(path, process=False, force="mesh")
-    except Exception as error:  # trimesh raises whatever the parser stumbles over
-        raise DatasetError(f"{path}: can't be read as a mesh: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise DatasetError(f"{path}: must be a mesh with faces, got none")
-    return TriangleSurface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return None if mesh is None else TriangleSurface.load(Path(mesh))
 
 
 def _measure_gicp(job: Job, threads: int) -> dict[str, Any]:

@@ -22,7 +22,8 @@ PAPER_SEEDS = 5
 DATASET_COLUMNS = (
     "frames", "ate_rmse_cm", "rpe_cm", "rpe_deg", "lost_frames", "fps", "tracking_ms_per_iteration",
     "tracking_iterations", "mapping_ms_per_iteration", "mapping_iterations", "model_mb", "peak_gpu_mb", "peak_rss_mb",
-    "accuracy_cm", "completeness_cm", "accuracy_5cm", "completeness_5cm", "f1_5cm", "f1_1cm", "depth_l1_cm", "psnr_db",
+    "accuracy_cm", "completeness_cm", "accuracy_5cm", "completeness_5cm", "f1_5cm", "f1_1cm", "depth_l1_cm",
+    "psnr_db", "ssim",
 )  # fmt: skip
 
 
@@ -54,7 +55,6 @@ class Variant:
     """A way to run: a preset with changed options, or a baseline.
 
     ``series`` and ``x`` place it in a plot: the line it belongs to and its place on the axis, None outside of one.
-    ``seeded`` is False where another seed would change nothing.
     """
 
     name: str
@@ -63,10 +63,6 @@ class Variant:
     options: tuple[tuple[str, Any], ...] = ()
     series: str = ""
     x: float | None = None
-
-    @property
-    def seeded(self) -> bool:
-        return self.method == SPSLAM
 
 
 @dataclass(frozen=True)

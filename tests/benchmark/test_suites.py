@@ -114,9 +114,10 @@ def test_a_key_names_what_decides_on_the_figures():
         tiny_job(frames="0:5"),
         tiny_job(preset="paper"),
         tiny_job(mesh="truth.ply"),
+        tiny_job(views=True),
         tiny_job(options=()),
     ]
-    assert len({job.key(), *(other.key() for other in others)}) == 7
+    assert len({job.key(), *(other.key() for other in others)}) == 8
     assert tiny_job(data="/elsewhere").key() == job.key()
     assert job.key().startswith("room-fast-seed0-")
 
