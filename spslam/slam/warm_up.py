@@ -1,4 +1,4 @@
-"""A rehearsal before the first frame: a GPU loads each kernel when it is first used, which takes longer than its work."""
+"""A rehearsal before the first frame: a GPU loads a kernel at its first use, which takes longer than its work."""
 
 import numpy as np
 import torch
