@@ -28,13 +28,14 @@ IMPORTS = {
     **{name: GROUND for name in GROUND},
     "ops": set(),
     "datasets": GROUND,
+    "download": GROUND,
     "scene": GROUND | {"ops"},
     "prior": GROUND | {"ops"},
     "meshing": GROUND | {"ops", "scene", "datasets"},
     "evaluation": GROUND | {"ops", "scene", "datasets", "meshing"},
     "slam": GROUND | {"ops", "scene", "prior", "datasets"},
     "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
-    "cli": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "benchmark"},
+    "cli": GROUND | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "benchmark"},
 }
 # The last step of a run writes mesh, metrics and report.
 RUN_IMPORTS = {"meshing", "evaluation"}

@@ -22,6 +22,7 @@ COMMANDS = {
     "demo": "track and map a generated room with known truth; needs no data",
     "eval": "compare a run's trajectory and mesh with the truth",
     "mesh": "extract a mesh from a run's map",
+    "download": "fetch a public data set from its official address",
     "check-data": "look through a data set before running on it",
     "bench": "run a suite of sequences and compare with the paper's figures",
     "pretrain": "train the scene prior on procedural solids",

@@ -113,7 +113,11 @@ def test_what_is_missing_is_left_out(tmp_path, missing):
 
 def test_trajectory_and_metrics_alone_are_enough(tmp_path):
     run = write_run(tmp_path, mesh=False, truth=False, log=False, previews=False, config=False)
-    assert re.findall("<h2>(.*?)</h2>", write_report(run).read_text()) == ["Trajectory", "As in the paper", "All figures"]
+    assert re.findall("<h2>(.*?)</h2>", write_report(run).read_text()) == [
+        "Trajectory",
+        "As in the paper",
+        "All figures",
+    ]
 
 
 def test_one_frame_is_enough(tmp_path):

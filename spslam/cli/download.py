@@ -1,0 +1,71 @@
+"""``spslam download``: public data sets from their official addresses."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from spslam.cli.arguments import add_quiet
+from spslam.download import SOURCES, Source, download, find_source, is_complete
+from spslam.download.catalogue import SCANNET_TERMS
+
+SECONDS_BETWEEN_LINES = 2.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Fetch a public data set from its official address and unpack it. Without NAME the data sets are listed, with "
+        "their terms: downloading is agreeing to them. An interrupted download goes on with the same command."
+    )
+    parser.epilog = f"{SCANNET_TERMS}. Any sequence of TUM RGB-D can be named: tum/freiburg1_rpy."
+    parser.add_argument(
+        "name", metavar="NAME", nargs="?", help="a data set (replica) or a part (7scenes/chess); 7scenes is all parts"
+    )
+    parser.add_argument(
+        "--data", metavar="DIR", type=Path, default=Path("data"), help="folder to put it in; data if not given"
+    )
+    add_quiet(parser)
+
+
+def execute(args: argparse.Namespace) -> None:
+    if args.name is None:
+        _list(args.data)
+        return
+    parts = [source for source in SOURCES if source.name.startswith(f"{args.name}/")]
+    for source in parts or [find_source(args.name)]:
+        _bring(source, args.data, args.quiet)
+
+
+def _list(data: Path) -> None:
+    for source in SOURCES:
+        mark = "  (there)" if is_complete(source, data) else ""
+        print(f"{source.name:<20}{source.title}, about {source.gigabytes:g} GB{mark}")
+        print(f"{'':<20}{source.terms}")
+    print(f"\n{SCANNET_TERMS}")
+
+
+def _bring(source: Source, data: Path, quiet: bool) -> None:
+    if not quiet:
+        print(f"{source.name}: {source.title}\nterms: {source.terms}", flush=True)
+    brought = download(source, data, None if quiet else _Lines())
+    if not quiet:
+        command = source.run.replace("--data ", f"--data {data}/")
+        print(f"{'ready' if brought else 'was there already'} in {data}; {command}")
+
+
+class _Lines:
+    """A line every few seconds: how far a file is, and how fast it comes."""
+
+    def __init__(self) -> None:
+        self._last, self._bytes = time.monotonic(), 0
+
+    def __call__(self, name: str, done: int, total: int | None) -> None:
+        now = time.monotonic()
+        if done != total and now - self._last < SECONDS_BETWEEN_LINES:
+            return
+        speed = max(done - self._bytes, 0) / max(now - self._last, 1e-9)
+        self._last, self._bytes = now, done
+        share = f"{done / total:4.0%} of {total / 1e6:,.0f} MB" if total else f"{done / 1e6:,.0f} MB"
+        print(f"{name}: {share}, {speed / 1e6:.1f} MB/s", file=sys.stderr, flush=True)
