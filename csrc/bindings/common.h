@@ -123,6 +123,21 @@ void dispatch_floating(const char* function, const Tensor& tensor, F&& f) {
   }
 }
 
+// Scratch memory for a kernel, on the device of a tensor and freed with this.
+class Scratch {
+ public:
+  explicit Scratch(const Tensor& like) : like_(like) {}
+
+  void* operator()(std::int64_t bytes) {
+    regions_.push_back(empty(like_, {bytes}, ScalarType::Byte));
+    return mutable_data<std::uint8_t>(regions_.back());
+  }
+
+ private:
+  Tensor like_;
+  std::vector<Tensor> regions_;
+};
+
 inline PhiloxKey philox_key(std::int64_t seed, std::int64_t stream, std::int64_t frame, std::int64_t iteration) {
   return {static_cast<std::uint64_t>(seed), static_cast<std::uint32_t>(stream), static_cast<std::uint32_t>(frame),
           static_cast<std::uint32_t>(iteration)};

@@ -1,5 +1,3 @@
-// Frames arrive on the CPU, so the op is there alone.
-#ifndef SPS_CUDA
 #include "spslam/pixel_sampling.h"
 
 #include "bindings/common.h"
@@ -7,7 +5,28 @@
 namespace spslam::bindings {
 namespace {
 
-// One buffer for all: records [count, 3], normals [count, 3] as their bits, the lattice's halves in pairs.
+Tensor rows_of_three(const Tensor& like) {
+  return empty(like, {like.size(0), 3}, ScalarType::Float);
+}
+
+std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tensor pose, double fx, double fy,
+                                            double cx, double cy) {
+  STD_TORCH_CHECK(records.numel() == 3 * records.size(0) && normals.numel() == records.numel() && pose.numel() == 7,
+                  "unproject_pixels: records, normals and pose must have shapes [P, 3], [P, 3] and [7]");
+  records = contiguous(records);
+  normals = contiguous(normals);
+  pose = contiguous(pose);
+  DeviceScope scope(records);
+  const Tensor points = rows_of_three(records), world_normals = rows_of_three(records);
+  spslam::unproject_pixels(scope.context, data<std::int32_t>(records), data<float>(normals), records.size(0),
+                           data<float>(pose), static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx),
+                           static_cast<float>(cy), mutable_data<float>(points), mutable_data<float>(world_normals));
+  return {points, world_normals};
+}
+
+#ifndef SPS_CUDA
+// Frames arrive on the CPU, so this op is there alone. One buffer for all: records [count, 3], normals [count, 3] as
+// their bits, the lattice's halves in pairs.
 std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, double fx, double fy, double cx,
                                                      double cy, std::int64_t count, double min_depth, double max_depth,
                                                      std::int64_t step_px, double max_jump, std::int64_t lattice_step,
@@ -40,9 +59,15 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
   return {buffer, sample_pixels(image, philox_key(seed, stream, frame, 0), sampling, out)};
 }
 
+#endif
+
 }  // namespace
 
+#ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def(
+      "unproject_pixels(Tensor records, Tensor normals, Tensor pose, float fx, float fy, float cx, float cy) -> "
+      "(Tensor points, Tensor normals)");
   m.def(
       "sample_frame_pixels(Tensor depth, Tensor color, float fx, float fy, float cx, float cy, int count, float "
       "min_depth, float max_depth, int step_px, float max_jump, int lattice_step, int seed, int stream, int frame) -> "
@@ -52,6 +77,10 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
 STABLE_TORCH_LIBRARY_IMPL(spslam, CPU, m) {
   m.impl("sample_frame_pixels", TORCH_BOX(&sample_frame_pixels));
 }
+#endif
+
+SPS_LIBRARY_IMPL(m) {
+  m.impl("unproject_pixels", TORCH_BOX(&unproject_pixels));
+}
 
 }  // namespace spslam::bindings
-#endif

@@ -1,5 +1,7 @@
 #include "spslam/prior_fusion.h"
 
+#include <functional>
+
 #include "bindings/common.h"
 
 namespace spslam::bindings {
@@ -36,24 +38,29 @@ Tensor depth_normals(Tensor depth, Tensor pixels, double fx, double fy, double c
   return normals;
 }
 
-std::tuple<Tensor, Tensor, Tensor> encode_points(Tensor points, Tensor normals, Tensor encoder_params,
-                                                 double voxel_size, std::int64_t neighborhood, double min_pair_weight) {
-  STD_TORCH_CHECK(encoder_params.numel() == kEncoderParameters, "encode_points: encoder_params must have ",
-                  kEncoderParameters, " numbers, got ", encoder_params.numel());
-  STD_TORCH_CHECK(neighborhood == 64 || neighborhood == 8, "encode_points: neighborhood must be 64 or 8, got ",
+EncoderSettings checked_settings(const char* function, const Tensor& params, double voxel_size,
+                                 std::int64_t neighborhood, double min_pair_weight, bool tf32) {
+  STD_TORCH_CHECK(params.numel() == kEncoderParameters, function, ": encoder_params must have ", kEncoderParameters,
+                  " numbers, got ", params.numel());
+  STD_TORCH_CHECK(neighborhood == 64 || neighborhood == 8, function, ": neighborhood must be 64 or 8, got ",
                   neighborhood);
+  return {static_cast<float>(voxel_size), static_cast<std::int32_t>(neighborhood), static_cast<float>(min_pair_weight),
+          tf32};
+}
+
+std::tuple<Tensor, Tensor, Tensor> encode_points(Tensor points, Tensor normals, Tensor encoder_params,
+                                                 double voxel_size, std::int64_t neighborhood, double min_pair_weight,
+                                                 bool tf32) {
+  const EncoderSettings settings =
+      checked_settings("encode_points", encoder_params, voxel_size, neighborhood, min_pair_weight, tf32);
   points = contiguous(points);
   normals = contiguous(normals);
   encoder_params = contiguous(encoder_params);
-  const std::int64_t n = points.size(0);
-  const EncoderSettings settings{static_cast<float>(voxel_size), static_cast<std::int32_t>(neighborhood),
-                                 static_cast<float>(min_pair_weight)};
   DeviceScope scope(points);
-  const Tensor workspace =
-      empty(points, {encode_points_workspace_bytes(scope.context, n, settings.neighborhood)}, ScalarType::Byte);
+  Scratch scratch(points);
   Tensor voxel_coords, features, weights;
-  spslam::encode_points(scope.context, data<float>(points), data<float>(normals), n, data<float>(encoder_params),
-                        settings, mutable_data<std::uint8_t>(workspace), [&](std::int64_t count) {
+  spslam::encode_points(scope.context, data<float>(points), data<float>(normals), points.size(0),
+                        data<float>(encoder_params), settings, std::ref(scratch), [&](std::int64_t count) {
                           voxel_coords = empty(points, {count, 3}, ScalarType::Int);
                           features = empty(points, {count, kPriorFeatures}, ScalarType::Float);
                           weights = empty(points, {count}, ScalarType::Float);
@@ -61,6 +68,61 @@ std::tuple<Tensor, Tensor, Tensor> encode_points(Tensor points, Tensor normals, 
                                                mutable_data<float>(weights)};
                         });
   return {voxel_coords, features, weights};
+}
+
+FeatureVolume checked_volume(const Tensor& hash_keys, const Tensor& hash_values, const Tensor& voxel_coords,
+                             const Tensor& corner_ids, const Tensor& embeddings, const Tensor& weights,
+                             std::int64_t num_voxels, std::int64_t max_voxels) {
+  const std::int64_t rows = weights.numel(), slots = hash_keys.numel();
+  STD_TORCH_CHECK(voxel_coords.numel() == 3 * rows && corner_ids.numel() == 8 * rows && embeddings.numel() == 8 * rows,
+                  "encode_frame_: the volume's tensors must have as many rows each");
+  STD_TORCH_CHECK(slots >= 2 && (slots & (slots - 1)) == 0 && hash_values.numel() == slots,
+                  "encode_frame_: hash_keys must have a power of two of slots, got ", slots);
+  STD_TORCH_CHECK(0 <= num_voxels && num_voxels <= max_voxels && max_voxels <= rows && max_voxels <= slots / 2,
+                  "encode_frame_: num_voxels, max_voxels and the volume's room must not decrease in this order, got ",
+                  num_voxels, ", ", max_voxels, " and ", rows);
+  return {mutable_data<std::int64_t>(hash_keys),
+          mutable_data<std::int32_t>(hash_values),
+          slots,
+          mutable_data<std::int32_t>(voxel_coords),
+          mutable_data<std::int32_t>(corner_ids),
+          mutable_data<float>(embeddings),
+          mutable_data<float>(weights),
+          num_voxels,
+          max_voxels};
+}
+
+// `bounds` lies on the CPU: the caller needs it there.
+std::int64_t encode_frame_(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, Tensor corner_ids,
+                           Tensor embeddings, Tensor weights, std::int64_t num_voxels, std::int64_t max_voxels,
+                           Tensor points, Tensor normals, Tensor encoder_params, double voxel_size,
+                           std::int64_t neighborhood, double min_pair_weight, std::int64_t max_points,
+                           double min_weight, double kappa, double max_weight, bool fuse_known, bool tf32,
+                           Tensor bounds) {
+  const FusionSettings settings{
+      checked_settings("encode_frame_", encoder_params, voxel_size, neighborhood, min_pair_weight, tf32),
+      max_points,
+      static_cast<float>(min_weight),
+      static_cast<float>(kappa),
+      static_cast<float>(max_weight),
+      fuse_known};
+  STD_TORCH_CHECK(bounds.numel() == 6, "encode_frame_: bounds must have 6 numbers, got ", bounds.numel());
+  points = contiguous(points);
+  normals = contiguous(normals);
+  encoder_params = contiguous(encoder_params);
+  DeviceScope scope(embeddings);
+  Scratch scratch(points);
+  const EncodedFrame frame = encode_frame(
+      scope.context,
+      checked_volume(hash_keys, hash_values, voxel_coords, corner_ids, embeddings, weights, num_voxels, max_voxels),
+      data<float>(points), data<float>(normals), points.size(0), data<float>(encoder_params), settings,
+      std::ref(scratch));
+  float* bound = mutable_data<float>(bounds);
+  for (int a = 0; a < 3; ++a) {
+    bound[a] = frame.low[a];
+    bound[3 + a] = frame.high[a];
+  }
+  return frame.new_voxels;
 }
 
 Tensor random_embeddings(Tensor voxel_coords, std::int64_t seed, double scale) {
@@ -81,7 +143,13 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "max_jump) -> Tensor");
   m.def(
       "encode_points(Tensor points, Tensor normals, Tensor encoder_params, float voxel_size, int neighborhood, float "
-      "min_pair_weight) -> (Tensor, Tensor, Tensor)");
+      "min_pair_weight, bool tf32=True) -> (Tensor, Tensor, Tensor)");
+  m.def(
+      "encode_frame_(Tensor(a!) hash_keys, Tensor(b!) hash_values, Tensor(c!) voxel_coords, Tensor(d!) corner_ids, "
+      "Tensor(e!) embeddings, Tensor(f!) weights, int num_voxels, int max_voxels, Tensor points, Tensor normals, "
+      "Tensor "
+      "encoder_params, float voxel_size, int neighborhood, float min_pair_weight, int max_points, float min_weight, "
+      "float kappa, float max_weight, bool fuse_known, bool tf32, Tensor(g!) bounds) -> int");
   m.def(
       "fuse_prior_(Tensor(a!) embeddings, Tensor(b!) weights, Tensor voxel_ids, Tensor features, Tensor "
       "feature_weights, float max_weight) -> ()");
@@ -92,6 +160,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
 SPS_LIBRARY_IMPL(m) {
   m.impl("depth_normals", TORCH_BOX(&depth_normals));
   m.impl("encode_points", TORCH_BOX(&encode_points));
+  m.impl("encode_frame_", TORCH_BOX(&encode_frame_));
   m.impl("fuse_prior_", TORCH_BOX(&fuse_prior_));
   m.impl("random_embeddings", TORCH_BOX(&random_embeddings));
 }

@@ -4,7 +4,7 @@
 
 #include "core/half.h"
 #include "cpu/depth_normals.h"
-#include "kernels/pixel_record.h"
+#include "kernels/pixel_sampling_launch.h"
 
 namespace spslam {
 namespace {
@@ -88,5 +88,7 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
   }
   return num_valid;
 }
+
+SPS_INSTANTIATE_PIXEL_SAMPLING(Cpu)
 
 }  // namespace spslam

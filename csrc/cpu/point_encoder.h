@@ -75,20 +75,22 @@ struct CellPoint {
   float x[4], y[4], z[4];
 };
 
-// Encodes points one after the other into `entries` (a cell's vertex each): weighted sums of features and of weights.
+// Encodes points one after the other into `entries` (a cell's vertex each): weighted sums of features, and of weights
+// in units of 1 / weight_scale.
 class PointEncoder {
  public:
-  PointEncoder(const PackedEncoder& net, std::int64_t max_entries)
+  PointEncoder(const PackedEncoder& net, std::int64_t max_entries, float weight_scale)
       : net_(net),
+        weight_scale_(weight_scale),
         h1_(h1_buffer_.reserve(kRows * kEncoderHidden)),
         h2_(h2_buffer_.reserve(kRows * kEncoderHidden)),
         sums_(sums_buffer_.reserve(round_up(max_entries, kRowBlock) * kEncoderHidden)) {}
 
-  void begin(std::int64_t entries, float* weights) {
+  void begin(std::int64_t entries, std::int64_t* weights) {
     entries_ = entries;
     weights_ = weights;
     std::memset(sums_, 0, static_cast<std::size_t>(round_up(entries, kRowBlock) * kEncoderHidden) * sizeof(float));
-    std::memset(weights, 0, static_cast<std::size_t>(entries) * sizeof(float));
+    std::memset(weights, 0, static_cast<std::size_t>(entries) * sizeof(std::int64_t));
   }
 
   // Adds a point; entry_of_corner[c] is the entry of the cell's vertex c.
@@ -120,8 +122,9 @@ class PointEncoder {
         for (int m = 0; m < kRowBlock && row + m < entries_; ++m) {
           float lanes[N * kLanes<float>];
           std::memcpy(lanes, out[m], sizeof lanes);
+          const float weight = weight_of_units(weights_[row + m], weight_scale_);
           for (int c = 0; c < N * kLanes<float> && column + c < kPriorFeatures; ++c) {
-            features[(row + m) * kPriorFeatures + column + c] = lanes[c] + weights_[row + m] * net_.b3[column + c];
+            features[(row + m) * kPriorFeatures + column + c] = lanes[c] + weight * net_.b3[column + c];
           }
         }
       });
@@ -161,15 +164,16 @@ class PointEncoder {
         const V unit = load_vector<V>(h2_ + r * kEncoderHidden + c);
         store_vector(sum + c, load_vector<V>(sum + c) + weight_[r] * unit);
       }
-      weights_[entry_[r]] += weight_[r];
+      weights_[entry_[r]] += weight_units(weight_[r], weight_scale_);
     }
     rows_ = 0;
   }
 
   const PackedEncoder& net_;
+  const float weight_scale_;
   ScratchBuffer<float> h1_buffer_, h2_buffer_, sums_buffer_;
   float *const h1_, *const h2_, *const sums_;
-  float* weights_ = nullptr;
+  std::int64_t* weights_ = nullptr;
   std::int64_t entries_ = 0, rows_ = 0;
   alignas(64) float parts_[3][4][kEncoderHidden];
   std::int32_t entry_[kRows];

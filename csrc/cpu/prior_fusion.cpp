@@ -16,12 +16,12 @@ struct KeyedPoint {
   std::int64_t index;
 };
 
-// Sums of features over voxel vertices, in the order in which they are added.
+// Sums of features over voxel vertices, in the order in which they are added, and of weights, see sum_scale.
 class VertexSums {
  public:
-  VertexSums() { resize_table(1 << 14); }
+  explicit VertexSums(float weight_scale) : weight_scale_(weight_scale) { resize_table(1 << 14); }
 
-  void add(std::int64_t key, const float* features, float weight) {
+  void add(std::int64_t key, const float* features, std::int64_t weight) {
     const std::int64_t row = row_of(key);
     float* sum = sums_.data() + row * kPriorFeatures;
     for (int c = 0; c < kPriorFeatures; ++c) sum[c] += features[c];
@@ -41,9 +41,10 @@ class VertexSums {
       out.voxel_coords[3 * i] = coord.x;
       out.voxel_coords[3 * i + 1] = coord.y;
       out.voxel_coords[3 * i + 2] = coord.z;
-      out.weights[i] = weights_[row];
+      const float weight = weight_of_units(weights_[row], weight_scale_);
+      out.weights[i] = weight;
       for (int c = 0; c < kPriorFeatures; ++c) {
-        out.features[kPriorFeatures * i + c] = sums_[kPriorFeatures * row + c] / weights_[row];
+        out.features[kPriorFeatures * i + c] = sums_[kPriorFeatures * row + c] / weight;
       }
     }
   }
@@ -57,7 +58,7 @@ class VertexSums {
     const std::int64_t row = static_cast<std::int64_t>(keys_.size());
     slots_[slot] = {key, row};
     keys_.push_back(key);
-    weights_.push_back(0.0f);
+    weights_.push_back(0);
     sums_.resize(sums_.size() + kPriorFeatures, 0.0f);
     if (2 * (row + 1) > mask_) resize_table(2 * (mask_ + 1));
     return row;
@@ -75,8 +76,9 @@ class VertexSums {
 
   std::int64_t mask_ = 0;
   std::vector<KeyedPoint> slots_;
-  std::vector<std::int64_t> keys_;
-  std::vector<float> sums_, weights_;
+  const float weight_scale_;
+  std::vector<std::int64_t> keys_, weights_;
+  std::vector<float> sums_;
 };
 
 // The points of valid cells, those of a cell side by side, and where each cell begins.
@@ -113,9 +115,11 @@ class Encoding {
         normals_(normals),
         inverse_voxel_size_(1.0f / settings.voxel_size),
         min_pair_weight_(settings.min_pair_weight),
+        weight_scale_(weight_scale(n)),
         neighborhood_(neighborhood_of(settings.neighborhood)),
         net_(params),
-        cells_(points, normals, n, inverse_voxel_size_) {}
+        cells_(points, normals, n, inverse_voxel_size_),
+        sums_(weight_scale_) {}
 
   void run(const AllocateEncodedVoxels& allocate) {
     for (std::int64_t first = 0; first < cells_.count(); first += kCellsAtOnce) {
@@ -160,7 +164,7 @@ class Encoding {
 
   void encode_cells(std::int64_t first, std::int64_t count) {
     parallel_for(count, kCellGrain, [&](std::int64_t begin, std::int64_t end) {
-      PointEncoder encoder(net_, kCellGrain * kMaxCorners);
+      PointEncoder encoder(net_, kCellGrain * kMaxCorners, weight_scale_);
       const std::int64_t base = entry_begins_[begin];
       encoder.begin(entry_begins_[end] - base, weights_.get() + base);
       for (std::int64_t cell = begin; cell < end; ++cell) {
@@ -194,26 +198,23 @@ class Encoding {
   }
 
   const float *points_, *normals_;
-  const float inverse_voxel_size_, min_pair_weight_;
+  const float inverse_voxel_size_, min_pair_weight_, weight_scale_;
   const Neighborhood neighborhood_;
   const PackedEncoder net_;
   const CellList cells_;
   std::vector<std::uint64_t> corners_;
   std::vector<std::int64_t> entry_begins_;
-  ScratchBuffer<float> features_, weights_;
+  ScratchBuffer<float> features_;
+  ScratchBuffer<std::int64_t> weights_;
   VertexSums sums_;
 };
 
 }  // namespace
 
 template <>
-std::int64_t encode_points_workspace_bytes<Cpu>(Cpu, std::int64_t, std::int32_t) {
-  return 0;
-}
-
-template <>
 void encode_points<Cpu>(Cpu, const float* points, const float* normals, std::int64_t n, const float* params,
-                        const EncoderSettings& settings, void*, const AllocateEncodedVoxels& allocate) {
+                        const EncoderSettings& settings, const AllocateScratch&,
+                        const AllocateEncodedVoxels& allocate) {
   Encoding(points, normals, n, params, settings).run(allocate);
 }
 

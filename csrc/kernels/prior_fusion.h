@@ -62,6 +62,34 @@ SPS_INLINE bool pair_counts(float weight, float min_pair_weight) {
   return weight >= min_pair_weight && weight >= kSmallestNormal;
 }
 
+// Sums over at most n points are kept as integers, in which order does not matter: the weight of a vertex is the same
+// number on every device, and so is what hangs on it. Terms are below 2^headroom_bits.
+SPS_INLINE float sum_scale(std::int64_t n, int headroom_bits) {
+  int bits = 62 - headroom_bits;
+  for (; n > 0; n >>= 1) --bits;
+  return static_cast<float>(std::int64_t{1} << bits);
+}
+
+SPS_INLINE float weight_scale(std::int64_t n) {
+  return sum_scale(n, 0);
+}
+
+// A weight in units of 1 / scale, rounded towards 0, but 1 at least: a sum of 0 says that there was none.
+SPS_INLINE std::int64_t weight_units(float weight, float scale) {
+  const std::int64_t units = static_cast<std::int64_t>(weight * scale);
+  return units > 0 ? units : 1;
+}
+
+SPS_INLINE float weight_of_units(std::int64_t units, float scale) {
+  return static_cast<float>(units) / scale;
+}
+
+// The share of a frame's features in a fusion, from the sum of their weights.
+SPS_INLINE float fusion_share(float weight, float kappa) {
+  const float share = weight / kappa;
+  return share < 1.0f ? share : 1.0f;
+}
+
 // The encoder's features of one pair: relative position and normal -> 64 -> 64 -> 8, ReLU inside.
 SPS_INLINE void encode_pair(const float* params, const float (&input)[kEncoderInputs],
                             float (&features)[kPriorFeatures]) {
@@ -86,15 +114,22 @@ SPS_INLINE void encode_pair(const float* params, const float (&input)[kEncoderIn
   }
 }
 
-// embedding = (weight * embedding + feature_weight * feature) / (weight + feature_weight), then the weight grows up to
-// max_weight. A feature without weight changes nothing.
-SPS_INLINE void fuse_feature(const float* feature, float feature_weight, float max_weight, float* embedding,
-                             float* weight) {
-  if (!(feature_weight > 0.0f)) return;
-  const float total = *weight + feature_weight;
-  const float share = feature_weight / total;
-  for (int c = 0; c < kPriorFeatures; ++c) embedding[c] += share * (feature[c] - embedding[c]);
-  *weight = total < max_weight ? total : max_weight;
+// Equation (1) for one number of an embedding: (weight * embedding + share * feature) / (weight + share).
+SPS_INLINE float fused_feature(float embedding, float weight, float feature, float share) {
+  return embedding + share / (weight + share) * (feature - embedding);
+}
+
+// The weight after a fusion; it grows up to max_weight.
+SPS_INLINE float fused_weight(float weight, float share, float max_weight) {
+  const float total = weight + share;
+  return total < max_weight ? total : max_weight;
+}
+
+// Both for a whole embedding. A feature without weight changes nothing.
+SPS_INLINE void fuse_feature(const float* feature, float share, float max_weight, float* embedding, float* weight) {
+  if (!(share > 0.0f)) return;
+  for (int c = 0; c < kPriorFeatures; ++c) embedding[c] = fused_feature(embedding[c], *weight, feature[c], share);
+  *weight = fused_weight(*weight, share, max_weight);
 }
 
 // Eight numbers from N(0, scale^2) by Box and Muller, with the coordinates as the Philox counter.

@@ -2,6 +2,7 @@
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
+from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
 from spslam.ops.gauss_newton import gauss_newton_poses, predict_pose, track_gauss_newton
 from spslam.ops.hash_table import VoxelHash
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
@@ -9,7 +10,7 @@ from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.optimize_map import AdamMoments, AdamTable, MapMoments, new_gradient_sums, optimize_map_
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
-from spslam.ops.pixel_sampling import PixelSampling, sample_frame_pixels
+from spslam.ops.pixel_sampling import PixelSampling, sample_frame_pixels, unproject_pixels
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_points, fuse_prior_, random_embeddings
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
@@ -33,6 +34,8 @@ __all__ = [
     "Activation",
     "AdamMoments",
     "AdamTable",
+    "EncodedFrame",
+    "FrameFusion",
     "Intrinsics",
     "LaunchGraph",
     "MapMoments",
@@ -44,8 +47,10 @@ __all__ = [
     "SceneView",
     "Stream",
     "VoxelHash",
+    "VolumeBuffers",
     "bilinear_interpolate",
     "depth_normals",
+    "encode_frame_",
     "encode_points",
     "fuse_prior_",
     "gauss_newton_poses",
@@ -75,6 +80,7 @@ __all__ = [
     "track_gauss_newton",
     "tri_plane_interpolate",
     "trilinear_interpolate",
+    "unproject_pixels",
     "volume_render",
     "voxel_hash_build_",
     "voxel_hash_find",

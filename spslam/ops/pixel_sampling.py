@@ -112,6 +112,46 @@ def sample_frame_pixels(
     return buffer, num_valid
 
 
+def unproject_pixels(
+    records: torch.Tensor, normals: torch.Tensor, pose: torch.Tensor, fx: float, fy: float, cx: float, cy: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Surface points and normals of a frame's pixels in the world: R z ((u - cx) / fx, (v - cy) / fy, 1) + t and R n.
+
+    Args:
+        records: int32 [P, 3], see `sample_frame_pixels`.
+        normals: float32 [P, 3], camera axes.
+        pose: float32 [7], T_world_camera as quaternion (w, x, y, z), of any length but 0, and translation (m).
+        fx, fy, cx, cy: pinhole camera, px.
+
+    Returns:
+        points float32 [P, 3], m, and normals float32 [P, 3]; devices differ by rounding. P = 0 gives empty tensors.
+        Not differentiable.
+
+    Raises:
+        ValueError: wrong shapes or devices, `fx` or `fy` not positive.
+        TypeError: wrong dtypes.
+
+    Example:
+        >>> depth = torch.tensor([2.0]).view(torch.int32).item()
+        >>> records, normals = torch.tensor([[30 | 10 << 16, depth, 0]], dtype=torch.int32), torch.zeros(1, 3)
+        >>> pose = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
+        >>> unproject_pixels(records, normals, pose, 10.0, 10.0, 20.0, 20.0)[0]
+        tensor([[ 2.5000, -2.0000,  2.0000]])
+    """
+    name = "unproject_pixels"
+    check_tensor(name, "records", records, ["P", 3], torch.int32)
+    check_tensor(name, "normals", normals, [records.shape[0], 3], torch.float32, like=records)
+    check_tensor(name, "pose", pose, [7], torch.float32, like=records)
+    check(fx > 0, name, "fx", "be positive", fx)
+    check(fy > 0, name, "fy", "be positive", fy)
+    return torch.ops.spslam.unproject_pixels(records, normals, pose.detach(), fx, fy, cx, cy)
+
+
+@torch.library.register_fake("spslam::unproject_pixels")
+def _(records, normals, pose, fx, fy, cx, cy):
+    return torch.empty_like(normals), torch.empty_like(normals)
+
+
 @torch.library.register_fake("spslam::sample_frame_pixels")
 def _(depth, color, fx, fy, cx, cy, count, min_depth, max_depth, step_px, max_jump, lattice_step, *key):
     height, width = (max(0, -((lattice_step // 2 - size) // lattice_step)) for size in depth.shape)

@@ -65,6 +65,7 @@ def encode_points(
     voxel_size: float,
     neighborhood: int = 64,
     min_pair_weight: float = 1e-4,
+    tf32: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Encodes surface points into features at the voxel vertices around them; section III.B of SP-SLAM.
 
@@ -79,11 +80,15 @@ def encode_points(
         voxel_size: metres.
         neighborhood: 64 or 8.
         min_pair_weight: pairs of a point and a vertex with less weight are left out, and never looked at again.
+        tf32: on CUDA devices from sm_80 on, let tensor cores multiply factors rounded to 10 bits of mantissa, which
+            changes features by some 1e-3 of their size. Elsewhere, and without it, everything is float32; sums of
+            weights always are exact.
 
     Returns:
         voxel_coords int32 [M, 3], the vertices reached, sorted by (x, y, z); features float32 [M, 8], weighted means;
         weights float32 [M], sums of weights. Same on every run and for every thread count; not differentiable.
-        N = 0 gives M = 0.
+        N = 0 gives M = 0. Coordinates and weights are the same on every device. On CUDA a feature that is not finite
+        or beyond 32768 makes all of them NaN, and the call waits for the device.
 
     Raises:
         ValueError: wrong shapes or devices, `voxel_size` not positive, another neighbourhood, a negative minimum.
@@ -102,7 +107,9 @@ def encode_points(
     check(voxel_size > 0, name, "voxel_size", "be positive", voxel_size)
     check(neighborhood in (8, 64), name, "neighborhood", "be 64 or 8", neighborhood)
     check(min_pair_weight >= 0, name, "min_pair_weight", "be at least 0", min_pair_weight)
-    return torch.ops.spslam.encode_points(points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight)
+    return torch.ops.spslam.encode_points(
+        points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight, tf32
+    )
 
 
 def fuse_prior_(
@@ -188,7 +195,7 @@ def _(depth, pixels, fx, fy, cx, cy, step_px, max_jump):
 
 
 @torch.library.register_fake("spslam::encode_points")
-def _(points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight):
+def _(points, normals, encoder_params, voxel_size, neighborhood, min_pair_weight, tf32=True):
     rows = torch.library.get_ctx().new_dynamic_size()
     return points.new_empty((rows, 3), dtype=torch.int32), points.new_empty((rows, FEATURES)), points.new_empty(rows)
 

@@ -30,9 +30,9 @@ class FeatureVolume(Protocol):
 
     def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor: ...
 
-    def fuse(
-        self, voxel_coords: torch.Tensor, features: torch.Tensor, feature_weights: torch.Tensor, max_weight: float
-    ) -> torch.Tensor: ...
+    def encode(
+        self, points: torch.Tensor, normals: torch.Tensor, encoder_params: torch.Tensor, fusion: ops.FrameFusion
+    ) -> ops.EncodedFrame: ...
 
 
 def encode_frame(
@@ -42,7 +42,7 @@ def encode_frame(
     prior: Prior | None,
     options: PriorOptions,
     seed: int = 0,
-) -> torch.Tensor:
+) -> ops.EncodedFrame:
     """Encodes a frame's surface points and fuses them into the volume; section III.B and equation (1) of SP-SLAM.
 
     Vertices whose points weigh more than `options.min_weight` in sum are allocated; the weight of a fusion is that sum
@@ -59,47 +59,43 @@ def encode_frame(
         seed: of the random embeddings.
 
     Returns:
-        voxel_ids int32 [M] of the vertices concerned; M = 0 where no point has a normal.
+        How many vertices were new, and the bounds of the points. On CUDA this waits for the device, once.
 
     Raises:
         ConfigError: `options.neighborhood` isn't the one that the weights were trained for.
         SpslamError: the volume's limit would be passed; it is then as before.
     """
-    known = (normals != 0).any(1).nonzero()[: options.points_per_frame, 0]
-    points, normals = points[known], normals[known]
     if prior is None:
         return _allocate(volume, points, normals, options, seed)
     if options.neighborhood != prior.neighborhood:
         raise ConfigError(
             f"prior.neighborhood must be {prior.neighborhood}, that of the weights, got {options.neighborhood}"
         )
-    voxel_coords, features, weights = ops.encode_points(
-        points,
-        normals,
-        prior.encoder_params.to(points.device),
+    fusion = ops.FrameFusion(
         volume.voxel_size_m,
         prior.neighborhood,
         options.min_weight * _LIGHT_PAIR,
+        options.points_per_frame,
+        options.min_weight,
+        options.kappa,
+        options.max_weight,
+        fuse_known=options.fusion,
     )
-    keep = weights > options.min_weight
-    voxel_coords, features = voxel_coords[keep], features[keep]
-    shares = (weights[keep] / options.kappa).clamp(max=1)
-    if options.fusion:
-        return volume.fuse(voxel_coords, features, shares, options.max_weight)
-    first_new = volume.num_voxels
-    voxel_ids = volume.insert(voxel_coords)
-    new = voxel_ids >= first_new
-    volume.fuse(voxel_coords[new], features[new], shares[new], options.max_weight)
-    return voxel_ids
+    return volume.encode(points, normals, prior.encoder_params.to(points.device), fusion)
 
 
 def _allocate(
     volume: FeatureVolume, points: torch.Tensor, normals: torch.Tensor, options: PriorOptions, seed: int
-) -> torch.Tensor:
+) -> ops.EncodedFrame:
     """Allocates the vertices that an encoder would reach; new ones get random embeddings."""
+    finite = points[points.isfinite().all(1)].cpu()
+    bounds = torch.stack([finite.amin(0), finite.amax(0)]) if len(finite) else torch.tensor([[torch.inf], [-torch.inf]])
+    known = (normals != 0).any(1).nonzero()[: options.points_per_frame, 0]
     no_encoder = points.new_zeros(ops.ENCODER_PARAMETERS)
-    voxel_coords, _, weights = ops.encode_points(points, normals, no_encoder, volume.voxel_size_m, options.neighborhood)
+    voxel_coords, _, weights = ops.encode_points(
+        points[known], normals[known], no_encoder, volume.voxel_size_m, options.neighborhood
+    )
     first_new = volume.num_voxels
-    voxel_ids = volume.insert(voxel_coords[weights > options.min_weight])
+    volume.insert(voxel_coords[weights > options.min_weight])
     volume.embeddings[first_new:] = ops.random_embeddings(volume.voxel_coords[first_new:], seed)
-    return voxel_ids
+    return ops.EncodedFrame(volume.num_voxels - first_new, True, bounds.expand(2, 3))

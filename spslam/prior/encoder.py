@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -45,6 +45,14 @@ class Prior:
     decoder_params: torch.Tensor
     neighborhood: int
     metadata: dict
+
+    def to(self, device: torch.device) -> Prior:
+        """The same on another device."""
+        if self.encoder_params.device == device:
+            return self
+        return replace(
+            self, encoder_params=self.encoder_params.to(device), decoder_params=self.decoder_params.to(device)
+        )
 
 
 def shipped_weights(neighborhood: int = 64) -> Path:

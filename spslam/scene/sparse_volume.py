@@ -137,6 +137,33 @@ class SparseVolume:
         ops.fuse_prior_(self.embeddings, self.weights, voxel_ids, features, feature_weights, max_weight)
         return voxel_ids
 
+    def encode(
+        self, points: torch.Tensor, normals: torch.Tensor, encoder_params: torch.Tensor, fusion: ops.FrameFusion
+    ) -> ops.EncodedFrame:
+        """Allocates the vertices around a frame's points and fuses their encoding, see `ops.encode_frame_`.
+
+        Args:
+            points: float32 [N, 3], world, metres.
+            normals: float32 [N, 3], world, unit; 0 = unknown.
+            encoder_params: float32 [5128], on the volume's device.
+            fusion: settings; of this volume's voxel size.
+
+        Raises:
+            SpslamError: more than `max_voxels` would exist. The volume is then as before.
+        """
+        while True:
+            buffers = ops.VolumeBuffers(
+                self.hash_keys, self.hash_values, self._voxel_coords, self._corner_ids, self._embeddings, self._weights
+            )
+            room = self.capacity if self.max_voxels is None else min(self.capacity, self.max_voxels)
+            encoded = ops.encode_frame_(buffers, self.num_voxels, room, points, normals, encoder_params, fusion)
+            wanted = self.num_voxels + encoded.new_voxels
+            if encoded.fits:
+                self.num_voxels = wanted
+                return encoded
+            self._check_limit("encode", wanted)
+            self._reserve(wanted)
+
     def lookup(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The cell around each point.
 

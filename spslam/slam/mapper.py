@@ -7,6 +7,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.geometry import quaternion_to_matrix
 from spslam.prior import Prior, encode_frame
+from spslam.scene import Scene
 from spslam.slam.covisibility import POINTS, select_frames
 from spslam.slam.optimization import render_options
 from spslam.slam.pixels import FramePixels, unpack_points
@@ -27,14 +28,19 @@ class Mapper:
         """Allocates voxels around the newest frame's surface, fills them from the prior, and covers it with planes."""
         if len(pixels.records) == 0:
             return
-        pose, scene = state.frames.poses[-1], state.scene
-        points = self._to_world(unpack_points(pixels.records, self.camera), pose)
-        margin = self.config.scene.truncation_m
-        moved = scene.planes.cover(torch.stack([points.min(0).values - margin, points.max(0).values + margin]))
+        scene = state.scene
+        points, normals = ops.unproject_pixels(pixels.records, pixels.normals, state.frames.poses[-1], *self.intrinsics)
+        encoded = encode_frame(scene.volume, points, normals, self._prior(scene), self.config.prior, self.config.seed)
+        margin = torch.tensor([[-1.0], [1.0]]) * self.config.scene.truncation_m
+        moved = scene.planes.cover(encoded.bounds + margin)
         if moved is not None and "texels" in state.moments:
             state.moments["texels"].move_rows(moved, len(scene.planes.texels))
-        normals = self._rotate(pixels.normals, pose)
-        encode_frame(scene.volume, points, normals, self.prior, self.config.prior, self.config.seed)
+
+    def _prior(self, scene: Scene) -> Prior | None:
+        """The prior, on the scene's device from the first use on."""
+        if self.prior is not None:
+            self.prior = self.prior.to(scene.device)
+        return self.prior
 
     def optimize(self, state: SlamState, iterations: int) -> torch.Tensor | None:
         """Joint optimisation of scene and poses over selected frames.

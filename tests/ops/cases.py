@@ -187,6 +187,25 @@ def _encode(generator, device, n):
     return _on(device, dict(points=points, normals=normals, encoder_params=params, voxel_size=VOXEL))
 
 
+def _encode_frame(generator, device, n):
+    volume = ops.VolumeBuffers(
+        *ops.new_voxel_hash(8192, device),
+        voxel_coords=torch.zeros(4096, 3, dtype=torch.int32, device=device),
+        corner_ids=torch.full((4096, 8), -1, dtype=torch.int32, device=device),
+        embeddings=torch.zeros(4096, 8, device=device),
+        weights=torch.zeros(4096, device=device),
+    )
+    call = _encode(generator, device, n)
+    fusion = ops.FrameFusion(call.pop("voxel_size"), 64, 1e-4, 8000, 0.006, 2.5, 20.0)
+    return dict(volume=volume, num_voxels=0, max_voxels=4096, **call, fusion=fusion)
+
+
+def _unproject(generator, device, n):
+    records = torch.randint(0, 2**30, (n, 3), generator=generator, dtype=torch.int32)
+    pose = torch.tensor([1.0, 0, 0, 0, 0.5, 0, 0])
+    return _on(device, dict(records=records, normals=_normal(generator, n, 3), pose=pose, **CAMERA))
+
+
 def _fuse(generator, device, n):
     ids = torch.randperm(n + 5, generator=generator)[:n].int()
     volume = dict(embeddings=_normal(generator, n + 5, 8), weights=_uniform(generator, n + 5))
@@ -278,6 +297,7 @@ CASES = {
     "sample_indices": Case(_index_draw),
     "sample_along_rays": Case(_along_rays, rows=("depth",)),
     "sample_frame_pixels": Case(_frame_pixels),
+    "unproject_pixels": Case(_unproject),
     "volume_render": Case(_render, ("sdf", "color", "t"), rows=("sdf", "color", "t", "valid")),
     "rendering_losses": Case(
         _losses,
@@ -290,6 +310,7 @@ CASES = {
     "solve_normal_equations": Case(_solve, rows=("hessian", "gradient")),
     "depth_normals": Case(_depth_normals, rows=("pixels",)),
     "encode_points": Case(_encode),
+    "encode_frame_": Case(_encode_frame, compiles=False),
     "fuse_prior_": Case(_fuse),
     "random_embeddings": Case(_random_embeddings, rows=("voxel_coords",)),
     "marching_cubes": Case(_marching_cubes),

@@ -10,7 +10,7 @@ from spslam import ops
 from tests.ops.cases import CASES, arguments
 
 each_op = pytest.mark.parametrize("name", CASES)
-CPU_ONLY = {"sample_frame_pixels"}
+CPU_ONLY = {"sample_frame_pixels", "encode_frame_"}
 # Integers that name rows or places. None may lead outside of a table, whatever its value.
 EXTREME_INTEGERS = (-(2**31), -1, 2**31 - 1)
 # Made by the voxel_hash functions alone; to look through them for sense would cost more than to use them.

@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from spslam import ops
+from spslam.geometry import quaternion_to_matrix
 from tests.reference import pixel_sampling as reference
 
 CAMERA = (61.0, 59.5, 33.2, 21.7)
 SAMPLING = ops.PixelSampling(1000, min_depth=0.1, max_depth=6.0, step_px=3, max_jump=0.05, lattice_step=16)
+# Float32 points within some metres.
+POINT_TOLERANCE_M = 2e-6
 KEY = (2**33 + 5, ops.Stream.PIXEL_DATABASE, 17)
 
 
@@ -181,3 +184,33 @@ def test_opcheck(generator):
         (depth, color, *CAMERA, *numbers),
         test_utils=("test_schema", "test_autograd_registration"),
     )
+    records, normals, pose = torch.zeros(4, 3, dtype=torch.int32), torch.zeros(4, 3), torch.ones(7)
+    torch.library.opcheck(torch.ops.spslam.unproject_pixels, (records, normals, pose, *CAMERA))
+
+
+def test_unprojection_is_the_formula(device, generator):
+    depth, color = frame(generator)
+    buffer, _ = ops.sample_frame_pixels(depth, color, *CAMERA, SAMPLING, *KEY)
+    records, normals, _ = split(buffer, SAMPLING, depth.shape)
+    pose = torch.tensor([0.7, -0.3, 0.5, 0.2, 1.5, -2.0, 0.3])  # not of unit length
+    rotation = torch.from_numpy(quaternion_to_matrix(pose[:4].double().numpy() / pose[:4].double().norm().item()))
+    u, v = records[:, 0] & 0xFFFF, records[:, 0] >> 16
+    z = records[:, 1].contiguous().view(torch.float32).double()
+    in_camera = torch.stack([(u - CAMERA[2]) / CAMERA[0] * z, (v - CAMERA[3]) / CAMERA[1] * z, z], 1)
+    points, world_normals = ops.unproject_pixels(*(x.to(device) for x in (records, normals, pose)), *CAMERA)
+    assert torch.allclose(points.cpu().double(), in_camera @ rotation.T + pose[4:], atol=POINT_TOLERANCE_M)
+    assert torch.allclose(world_normals.cpu().double(), normals.double() @ rotation.T, atol=1e-6)
+    empty = ops.unproject_pixels(*(x.to(device) for x in (records[:0], normals[:0], pose)), *CAMERA)
+    assert [x.shape for x in empty] == [(0, 3), (0, 3)]
+
+
+def test_unprojection_names_wrong_arguments():
+    records, normals, pose = torch.zeros(4, 3, dtype=torch.int32), torch.zeros(4, 3), torch.ones(7)
+    with pytest.raises(ValueError, match=r"unproject_pixels: normals must have shape \[4, 3\], got \[3, 3\]"):
+        ops.unproject_pixels(records, normals[1:], pose, *CAMERA)
+    with pytest.raises(ValueError, match=r"unproject_pixels: pose must have shape \[7\], got \[6\]"):
+        ops.unproject_pixels(records, normals, pose[1:], *CAMERA)
+    with pytest.raises(ValueError, match="unproject_pixels: fx must be positive, got 0"):
+        ops.unproject_pixels(records, normals, pose, 0, *CAMERA[1:])
+    with pytest.raises(TypeError, match="unproject_pixels: records must be int32, got int64"):
+        ops.unproject_pixels(records.long(), normals, pose, *CAMERA)

@@ -92,7 +92,7 @@ def test_encoding_matches_the_formula(device, neighborhood, min_pair_weight, gen
     points[3], points[4, 1], normals[5] = float("nan"), float("inf"), 0
     want = reference.encode_points(points, normals, params, VOXEL, neighborhood, min_pair_weight)
     got = ops.encode_points(
-        points.to(device), normals.to(device), params.to(device), VOXEL, neighborhood, min_pair_weight
+        points.to(device), normals.to(device), params.to(device), VOXEL, neighborhood, min_pair_weight, tf32=False
     )
     assert torch.equal(got[0].cpu(), want[0])
     assert torch.allclose(got[2].cpu().double(), want[2], rtol=WEIGHT_TOLERANCE, atol=1e-7)
@@ -104,7 +104,7 @@ def test_encoding_of_many_points_in_few_cells(device, generator):
     params = random_encoder(generator)
     points, normals = surface(300, generator, extent=0.07)
     want = reference.encode_points(points, normals, params, VOXEL, 64, 0.001)
-    got = ops.encode_points(points.to(device), normals.to(device), params.to(device), VOXEL, 64, 0.001)
+    got = ops.encode_points(points.to(device), normals.to(device), params.to(device), VOXEL, 64, 0.001, tf32=False)
     assert torch.equal(got[0].cpu(), want[0])
     assert torch.allclose(got[1].cpu().double(), want[1], atol=FEATURE_TOLERANCE)
     assert torch.allclose(got[2].cpu().double(), want[2], rtol=WEIGHT_TOLERANCE)

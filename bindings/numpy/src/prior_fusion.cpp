@@ -39,12 +39,11 @@ py::tuple encode(const py::object& points, const py::object& normals, const py::
   check(neighborhood == 8 || neighborhood == 64, {name, "neighborhood"}, "be 64 or 8", neighborhood);
   check(min_pair_weight >= 0, {name, "min_pair_weight"}, "be at least 0", min_pair_weight);
   const EncoderSettings settings{static_cast<float>(voxel_size), static_cast<std::int32_t>(neighborhood),
-                                 static_cast<float>(min_pair_weight)};
-  std::vector<std::uint8_t> workspace(encode_points_workspace_bytes(kCpu, n, settings.neighborhood));
+                                 static_cast<float>(min_pair_weight), false};
   py::array_t<std::int32_t> voxel_coords;
   py::array_t<float> features, weights;
   without_gil([&] {
-    encode_points(kCpu, at.data(), facing.data(), n, params.data(), settings, workspace.data(),
+    encode_points(kCpu, at.data(), facing.data(), n, params.data(), settings, AllocateScratch{},
                   [&](std::int64_t count) {
                     py::gil_scoped_acquire acquire;
                     voxel_coords = empty<std::int32_t>({count, 3});

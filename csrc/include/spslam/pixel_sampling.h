@@ -1,8 +1,9 @@
-// The pixels of a frame that tracking and mapping work on. On the CPU only: frames arrive there.
+// The pixels of a frame that tracking and mapping work on.
 #pragma once
 
 #include <cstdint>
 
+#include "core/device.h"
 #include "core/philox.h"
 
 namespace spslam {
@@ -35,8 +36,15 @@ constexpr std::int32_t lattice_size(std::int32_t size, std::int32_t step) {
 }
 
 // Draws pixels among those of valid depth, with replacement: the i-th takes element i of the key's draws. Returns how
-// many pixels were valid; where none was, records and normals are 0. Runs on the calling thread alone.
+// many pixels were valid; where none was, records and normals are 0. On the CPU only, where frames arrive, and on the
+// calling thread alone.
 std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling,
                            const SampledPixels& out);
+
+// Surface points [n, 3] (m) and normals [n, 3] in the world of pixels' records [n, 3] and normals [n, 3] in the camera
+// at `pose`: seven numbers, unit quaternion (w, x, y, z) and translation of T_world_camera, on the device.
+template <class Device>
+void unproject_pixels(Device device, const std::int32_t* records, const float* camera_normals, std::int64_t n,
+                      const float* pose, float fx, float fy, float cx, float cy, float* points, float* normals);
 
 }  // namespace spslam

@@ -38,6 +38,7 @@ struct EncoderSettings {
   float voxel_size;
   std::int32_t neighborhood;
   float min_pair_weight;
+  bool tf32;  // on CUDA: factors of products rounded to 10 bits of mantissa
 };
 
 struct EncodedVoxels {
@@ -47,16 +48,51 @@ struct EncodedVoxels {
 };
 using AllocateEncodedVoxels = std::function<EncodedVoxels(std::int64_t count)>;
 
-// Scratch bytes that encode_points needs for n points.
-template <class Device>
-std::int64_t encode_points_workspace_bytes(Device device, std::int64_t n, std::int32_t neighborhood);
+// Scratch memory on the device, kept until the call has returned.
+using AllocateScratch = std::function<void*(std::int64_t bytes)>;
 
 // Encodes points [n, 3] (m) with unit normals [n, 3]: per voxel vertex the weighted mean of the encoder's features over
 // the points around it and the sum of weights, sorted by packed coordinate. `allocate` is called once, with the number
 // of vertices, and says where to write. Points that are not finite, out of range or without a normal add nothing.
 template <class Device>
 void encode_points(Device device, const float* points, const float* normals, std::int64_t n, const float* params,
-                   const EncoderSettings& settings, void* workspace, const AllocateEncodedVoxels& allocate);
+                   const EncoderSettings& settings, const AllocateScratch& scratch,
+                   const AllocateEncodedVoxels& allocate);
+
+// A sparse volume's tensors, with room for max_voxels rows (and twice as many slots); those from num_voxels on hold 0,
+// and -1 as corner ids.
+struct FeatureVolume {
+  std::int64_t* hash_keys;
+  std::int32_t* hash_values;
+  std::int64_t hash_capacity;
+  std::int32_t* voxel_coords;
+  std::int32_t* corner_ids;
+  float* embeddings;
+  float* weights;
+  std::int64_t num_voxels, max_voxels;
+};
+
+struct FusionSettings {
+  EncoderSettings encoder;
+  std::int64_t max_points;  // the first so many with a normal are encoded
+  float min_weight;         // vertices of no more weight are left out
+  float kappa;              // the sum of weights that counts as one observation, the most there is
+  float max_weight;         // cap of the total weight
+  bool fuse_known;          // else only new vertices are filled
+};
+
+struct EncodedFrame {
+  std::int64_t new_voxels;  // vertices that the volume lacked
+  bool fits;                // whether there was room; else the volume is as before
+  float low[3], high[3];    // bounds of all finite points; low > high where there is none
+};
+
+// Encodes a frame's points into the volume: allocates the vertices it lacks, numbered in the order of their packed
+// coordinates, fuses features by equation (1) and completes the rows of corner ids. Waits for the device, once.
+template <class Device>
+EncodedFrame encode_frame(Device device, const FeatureVolume& volume, const float* points, const float* normals,
+                          std::int64_t n, const float* params, const FusionSettings& settings,
+                          const AllocateScratch& scratch);
 
 // Equation (1) of SP-SLAM on rows voxel_ids of an [V, 8] volume: weighted mean of what is there and what is new, the
 // total weight capped. Rows outside [0, V) are skipped; the ids are distinct.
