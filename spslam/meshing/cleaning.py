@@ -12,7 +12,7 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.meshing.mesh import face_components
+from spslam.meshing.mesh import face_components, face_normals
 from spslam.scene import SparseVolume
 
 # More views than this add nothing: neighbouring ones see the same.
@@ -97,9 +97,16 @@ def _faces_view(points: np.ndarray, normals: np.ndarray, camera: Camera, pose: n
     return in_view & (np.einsum("ij,ij->i", rays, normals) < 0)
 
 
-def in_large_part(faces: np.ndarray, num_vertices: int, min_faces: int) -> np.ndarray:
-    """Bool [L]: whether the connected part that a face belongs to has at least `min_faces` faces."""
-    if min_faces <= 1 or len(faces) == 0:
+def in_large_part(vertices: np.ndarray, faces: np.ndarray, min_area_m2: float) -> np.ndarray:
+    """Bool [L]: whether the connected part that a face belongs to has at least an area.
+
+    Args:
+        vertices: float32 [K, 3], m.
+        faces: integers [L, 3].
+        min_area_m2: 0 keeps everything.
+    """
+    if min_area_m2 <= 0 or len(faces) == 0:
         return np.ones(len(faces), dtype=bool)
-    part = face_components(faces, num_vertices)
-    return np.bincount(part)[part] >= min_faces
+    part = face_components(faces, len(vertices))
+    areas = np.linalg.norm(face_normals(vertices, faces), axis=1) / 2
+    return np.bincount(part, areas)[part] >= min_area_m2

@@ -16,7 +16,8 @@ CHUNK_POINTS = 1 << 19
 # The learnt field is no exact distance; beyond this slope a surface could be missed.
 MAX_SLOPE = 1.5
 MIN_SUPPORT = 0.1
-MIN_PART_FACES = 100
+# Smaller loose parts are as likely specks as surface; 20 cm2 is a dozen faces at a resolution of 2 cm.
+MIN_PART_M2 = 0.002
 # A block of more cubes an axis wastes samples far from the surface, one of fewer repeats too many at its border.
 _CUBES_PER_BLOCK = range(4, 8)
 
@@ -90,7 +91,7 @@ def extract_mesh(
     camera: Camera | None = None,
     poses: np.ndarray | None = None,
     min_support: float = MIN_SUPPORT,
-    min_part_faces: int = MIN_PART_FACES,
+    min_part_m2: float = MIN_PART_M2,
 ) -> TriangleMesh:
     """The mesh of a map: its SDF's zero level within the complete cells, coloured, without what was never measured.
 
@@ -103,7 +104,7 @@ def extract_mesh(
             borders.
         min_support: surface is dropped where the fusion weight is below this share of the largest one within a voxel
             around, as on the lips behind depth edges. 0 keeps everything.
-        min_part_faces: connected parts of fewer faces are dropped.
+        min_part_m2: connected parts of a smaller area are dropped.
 
     Returns:
         The mesh; empty for an empty map. Memory is bounded as `extract_surface` says. The same map gives the same mesh.
@@ -127,7 +128,7 @@ def extract_mesh(
     normals = vertex_normals(vertices, kept)
     if camera is not None and poses is not None and len(poses):
         kept = kept[faced_by_a_camera(vertices, normals, kept, camera, poses)]
-    kept = kept[in_large_part(kept, len(vertices), min_part_faces)]
+    kept = kept[in_large_part(vertices, kept, min_part_m2)]
     kept, used = compact(kept, len(vertices))
     colors = _colors(scene, points[torch.from_numpy(used).to(points.device)])
     return TriangleMesh(vertices[used], kept, colors, normals[used])

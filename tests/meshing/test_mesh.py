@@ -9,7 +9,7 @@ import trimesh
 from spslam.errors import OutputError
 from spslam.meshing import TriangleMesh, save_mesh
 from spslam.meshing.cleaning import in_large_part
-from spslam.meshing.mesh import vertex_normals
+from spslam.meshing.mesh import face_normals, vertex_normals
 
 
 def _sphere(subdivisions=3, offset=0.0):
@@ -62,12 +62,14 @@ def test_select_faces_drops_unused_vertices():
 
 def test_small_parts():
     small, large = _sphere(1), _sphere(2)
+    vertices = np.concatenate((0.1 * small.vertices, large.vertices))
     faces = np.concatenate((small.faces, large.faces + len(small.vertices)))
-    count = len(small.vertices) + len(large.vertices)
     is_large = np.arange(len(faces)) >= len(small.faces)
-    np.testing.assert_array_equal(in_large_part(faces, count, len(small.faces) + 1), is_large)
-    assert in_large_part(faces, count, len(small.faces)).all()
-    assert in_large_part(faces[:0], count, 100).shape == (0,)
+    area_m2 = np.linalg.norm(face_normals(vertices, small.faces), axis=1).sum() / 2
+    np.testing.assert_array_equal(in_large_part(vertices, faces, 1.001 * area_m2), is_large)
+    assert in_large_part(vertices, faces, 0.999 * area_m2).all()
+    assert in_large_part(vertices, faces, 0).all()
+    assert in_large_part(vertices, faces[:0], 1.0).shape == (0,)
 
 
 @pytest.mark.parametrize(
