@@ -1,5 +1,9 @@
-// Thread count of the CPU kernels. The op takes no tensor, so it is implemented for every backend at once.
-#ifndef SPS_CUDA
+// What has no tensor: the thread count of the CPU kernels, implemented for every backend at once, and the architectures
+// that the CUDA library was built for.
+#ifdef SPS_CUDA
+// Read from the file by `spslam doctor`, also where the library cannot be loaded.
+extern "C" __attribute__((used)) const char spslam_cuda_archs[] = "spslam-cuda-archs=" SPSLAM_CUDA_ARCHS;
+#else
 #include "bindings/common.h"
 #include "core/parallel.h"
 

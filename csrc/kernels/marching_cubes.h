@@ -92,14 +92,15 @@ SPS_INLINE std::int64_t region_owner(const std::int32_t* neighbors, int region) 
 SPS_INLINE void find_owners(const VoxelTable& table, const std::int32_t* coords, std::int64_t cell,
                             std::int64_t* owners, std::uint64_t* faults) {
   const VoxelCoord c = load_voxel(coords, cell);
-  if (!voxel_in_range(c)) {
+  const bool in_range = voxel_in_range(c);
+  if (!in_range) {
     set_bits(faults, kCoordOutOfRange);
   } else if (find_voxel(table, c) != cell) {
     set_bits(faults, kCoordRepeated);
   }
   std::int32_t neighbors[kNeighbors];
   for (int i = 0; i < kNeighbors; ++i) {
-    neighbors[i] = find_voxel(table, {c.x + i / 9 - 1, c.y + i / 3 % 3 - 1, c.z + i % 3 - 1});
+    neighbors[i] = in_range ? find_voxel(table, {c.x + i / 9 - 1, c.y + i / 3 % 3 - 1, c.z + i % 3 - 1}) : kNoVoxel;
   }
   neighbors[kOwnNeighbor] = static_cast<std::int32_t>(cell);
   for (int region = 0; region < kNeighbors; ++region) owners[region] = region_owner(neighbors, region);

@@ -41,11 +41,15 @@ SPS_INLINE bool voxel_in_range(VoxelCoord c) {
          c.z >= kVoxelCoordMin && c.z <= kVoxelCoordMax;
 }
 
-// 21 bits an axis, so that the order of keys is the lexicographic order of (x, y, z). c must be in range.
+// A coordinate counted from the lowest one; unsigned, so that one out of range is a wrong number and nothing worse.
+SPS_INLINE std::uint64_t voxel_axis_bits(std::int32_t c) {
+  return static_cast<std::uint32_t>(c) - static_cast<std::uint32_t>(kVoxelCoordMin);
+}
+
+// 21 bits an axis, so that the order of keys is the lexicographic order of (x, y, z). Out of range: some key.
 SPS_INLINE std::int64_t pack_voxel(VoxelCoord c) {
-  return (static_cast<std::int64_t>(c.x - kVoxelCoordMin) << (2 * kVoxelCoordBits)) |
-         (static_cast<std::int64_t>(c.y - kVoxelCoordMin) << kVoxelCoordBits) |
-         static_cast<std::int64_t>(c.z - kVoxelCoordMin);
+  return static_cast<std::int64_t>((voxel_axis_bits(c.x) << (2 * kVoxelCoordBits)) |
+                                   (voxel_axis_bits(c.y) << kVoxelCoordBits) | voxel_axis_bits(c.z));
 }
 
 SPS_INLINE VoxelCoord unpack_voxel(std::int64_t key) {

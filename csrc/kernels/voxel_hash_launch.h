@@ -56,6 +56,10 @@ void voxel_hash_update_corner_ids(Device device, const std::int64_t* hash_keys, 
   for_each(device, num_voxels - first_new, [=] SPS_HOST_DEVICE(std::int64_t i) {
     const std::int32_t id = static_cast<std::int32_t>(first_new + i);
     const VoxelCoord vertex = load_voxel(voxel_coords, id);
+    if (!voxel_in_range(vertex)) {  // no table holds it
+      for (int k = 0; k < kCellCorners; ++k) corner_ids[static_cast<std::int64_t>(kCellCorners) * id + k] = kNoVoxel;
+      return;
+    }
     for (int k = 0; k < kCellCorners; ++k) update_corner_row(table, vertex, first_new, k, id, corner_ids);
   });
 }
