@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import platform
+import re
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,26 @@ def execute(args: argparse.Namespace) -> None:
         _row("CUDA kernels", f"off: {ops.CUDA_OFF_REASON}")
     else:
         _row("CUDA kernels", _try(torch.device("cuda")))
+    archs = cuda_archs(Path(spslam.__file__).parent / "_ops_cuda.so")
+    if archs:
+        _row("built for", ", ".join(archs))
     for index in range(torch.cuda.device_count()):
         gpu = torch.cuda.get_device_properties(index)
         _row(f"GPU {index}", f"{gpu.name}, {gpu.total_memory / 2**30:.0f} GiB, compute {gpu.major}.{gpu.minor}")
+
+
+def cuda_archs(library: Path) -> list[str]:
+    """GPU architectures in a CUDA library, such as `sm_90` and `PTX 120`; it need not be loadable. [] without one."""
+    try:
+        found = re.search(rb"spslam-cuda-archs=([\w -]+)", library.read_bytes())
+    except OSError:
+        return []
+    names = []
+    for arch in found[1].decode().split() if found else []:
+        number, _, kind = arch.partition("-")
+        # CMake's words: nothing behind the number means both.
+        names += [f"sm_{number}"] * (kind != "virtual") + [f"PTX {number}"] * (kind != "real")
+    return names
 
 
 def _try(device: Any) -> str:

@@ -9,6 +9,7 @@ import pytest
 import spslam as package
 from spslam.cli import main as main_module
 from spslam.cli.arguments import parse_frames
+from spslam.cli.doctor import cuda_archs
 from spslam.cli.main import COMMANDS, main
 from spslam.errors import DatasetError
 from tests.cli.command import ROOT, assert_refused, spslam
@@ -126,6 +127,15 @@ def test_doctor_names_kernels_and_why_cuda_is_off(tmp_path):
     assert result.returncode == 0
     assert "working" in result.stdout
     assert "CUDA kernels" in result.stdout
+
+
+def test_doctor_reads_the_architectures_of_a_library(tmp_path):
+    library = tmp_path / "_ops_cuda.so"
+    assert cuda_archs(library) == []
+    library.write_bytes(b"\x7fELF\0spslam-cuda-archs=75-real 120 90-virtual\0\xff")
+    assert cuda_archs(library) == ["sm_75", "sm_120", "PTX 120", "PTX 90"]
+    library.write_bytes(b"\x7fELF")
+    assert cuda_archs(library) == []
 
 
 def test_reader_that_goes_away_is_no_error():
