@@ -122,8 +122,8 @@ def voxel_hash_find(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_co
         voxel_coords: int32 [N, 3].
 
     Returns:
-        voxel_ids int32 [N], -1 where a coordinate is absent or out of range. Exact on every device. N = 0 gives an empty
-        tensor.
+        voxel_ids int32 [N], -1 where a coordinate is absent or out of range. Exact on every device. N = 0
+        gives an empty tensor.
 
     Raises:
         ValueError: wrong shapes or devices.

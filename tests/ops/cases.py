@@ -280,6 +280,37 @@ def _frame_equations(generator, device, n):
     return dict(scene=scene, **frames, truncation=TRUNCATION, kernel=0.05)
 
 
+def _track_adam(generator, device, n):
+    call = _track(generator, device, n)
+    options = _render_step(generator, device, 1)["options"]
+    steps = dict(num_pixels=32, iterations=2, rotation_rate=1e-3, translation_rate=1e-3)
+    return dict(
+        scene=call["scene"],
+        records=call["pixels"],
+        pose=call["pose"],
+        intrinsics=INTRINSICS,
+        options=options,
+        **steps,
+    )
+
+
+def _optimize_map(generator, device, n):
+    call = _frame_equations(generator, device, max(n, 1))
+    params = call["scene"].geometry_params
+    decoder = ops.AdamMoments(torch.zeros_like(params), torch.zeros_like(params), rate=1e-3)
+    steps = dict(num_pixels=32, iterations=2, fixed_frame=0, first_step=1, first_stamp=1)
+    return dict(
+        scene=call["scene"],
+        records=call["pixels"],
+        poses=call["poses"],
+        frames=torch.tensor([0, 1]),
+        intrinsics=INTRINSICS,
+        options=_render_step(generator, device, 1)["options"],
+        moments=ops.MapMoments(geometry_params=decoder),
+        **steps,
+    )
+
+
 def _predict(generator, device, n):
     return dict(before=POSE.to(device), last=(POSE + torch.tensor([0, 0, 0, 0, 0.1, 0, 0])).to(device))
 
@@ -320,5 +351,7 @@ CASES = {
     "render_step": Case(_render_step),
     "track_gauss_newton": Case(_track),
     "gauss_newton_poses": Case(_frame_equations),
+    "track_adam": Case(_track_adam),
+    "optimize_map_": Case(_optimize_map),
     "predict_pose": Case(_predict),
 }

@@ -1,0 +1,85 @@
+"""Reconstructs an RGB-D sequence whose poses are known, with the kernels alone: no tracking, no optimisation.
+
+python examples/posed_fusion.py mesh.ply                     the generated room
+python examples/posed_fusion.py mesh.ply --data recording    a folder with color/, depth/, intrinsics.txt, poses.txt
+"""
+
+import argparse
+
+import torch
+import trimesh
+
+from spslam import ops
+from spslam.config import load_config
+from spslam.datasets import open_dataset
+from spslam.prior import load_prior
+
+VOXEL_M, CUBES = 0.04, 2  # edge of a voxel; marching cubes in each, along an axis
+POINTS = 8000  # a frame
+MIN_WEIGHT, FULL_WEIGHT, MAX_WEIGHT = 0.006, 2.5, 20.0  # of what the points give to a vertex; of a vertex in all
+
+
+def surface_points(frame, camera):
+    """World points and unit normals [N, 3] of randomly drawn pixels."""
+    depth = torch.from_numpy(frame.depth)
+    measured = depth.flatten().nonzero()[:, 0]
+    drawn = measured[ops.sample_indices(0, ops.Stream.ENCODER_POINTS, frame.index, 0, POINTS, max(len(measured), 1))]
+    u, v, z = drawn % camera.width, drawn // camera.width, depth.flatten()[drawn]
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    normals = ops.depth_normals(depth, torch.stack([u, v], 1).int(), *intrinsics, step_px=4, max_jump=0.05)
+    points = torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
+    T_world_camera = torch.from_numpy(frame.pose).float()
+    known, rotation = (normals != 0).any(1), T_world_camera[:3, :3]
+    return points[known] @ rotation.T + T_world_camera[:3, 3], normals[known] @ rotation.T
+
+
+def fuse(frames, camera, prior):
+    """Encodes every frame's points and averages the features at the vertices around them (equation 1)."""
+    cells, embeddings, weights = ops.VoxelHash(), torch.zeros(0, 8), torch.zeros(0)
+    for frame in frames:
+        encoded = ops.encode_points(*surface_points(frame, camera), prior.encoder_params, VOXEL_M, prior.neighborhood)
+        keep = encoded[2] > MIN_WEIGHT
+        coords, features, share = (part[keep] for part in encoded)
+        ids = cells.insert(coords)
+        embeddings = torch.nn.functional.pad(embeddings, (0, 0, 0, len(cells) - len(embeddings)))
+        weights = torch.nn.functional.pad(weights, (0, len(cells) - len(weights)))
+        ops.fuse_prior_(embeddings, weights, ids, features, (share / FULL_WEIGHT).clamp(max=1), MAX_WEIGHT)
+    return cells, embeddings
+
+
+def extract_mesh(cells, embeddings, prior):
+    """Decodes the distance on a grid in every cell (equation 2) and cuts it at zero."""
+    complete = cells.corner_ids[:, 0] >= 0
+    coords, corners = cells.voxel_coords[complete], cells.corner_ids[complete]
+    local = torch.cartesian_prod(*[torch.linspace(0, 1, CUBES + 1)] * 3)
+    per_cell = (len(coords), len(local))
+    features = ops.trilinear_interpolate(
+        embeddings, corners[:, None].expand(*per_cell, 8).reshape(-1, 8), local.expand(*per_cell, 3).reshape(-1, 3)
+    )
+    positions = VOXEL_M * (coords[:, None] + local).view(-1, 3)
+    inputs = torch.cat([0.25 * positions, features], 1)
+    sdf = ops.mlp(inputs, prior.decoder_params, hidden=32, output=1, activation=ops.Activation.TANH)
+    vertices, faces = ops.marching_cubes(coords, sdf.view(-1, *[CUBES + 1] * 3))
+    return VOXEL_M * vertices, faces
+
+
+def main():
+    parser = argparse.ArgumentParser(description="fuse an RGB-D sequence with known poses into a mesh")
+    parser.add_argument("mesh", help="file to write, .ply, .obj or .glb")
+    parser.add_argument("--data", help="folder with color/, depth/, intrinsics.txt and poses.txt")
+    parser.add_argument("--frames", type=int, default=60, help="of the generated room")
+    args = parser.parse_args()
+    config = load_config(
+        "folder" if args.data else "demo", overrides=[] if args.data else [f"dataset.frames={args.frames}"]
+    )
+    dataset, prior = open_dataset(config.dataset, args.data), load_prior()
+    if dataset.poses() is None:
+        parser.error(f"{args.data}: poses.txt is needed here")
+    cells, embeddings = fuse(dataset, dataset.camera, prior)
+    vertices, faces = extract_mesh(cells, embeddings, prior)
+    trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False).export(args.mesh)
+    print(f"{len(dataset)} frames, {len(cells)} voxels, {len(vertices)} vertices, {len(faces)} faces: {args.mesh}")
+
+
+if __name__ == "__main__":
+    main()
