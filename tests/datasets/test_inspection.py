@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from spslam.camera import Camera
-from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.inspection import inspect_dataset
+from spslam.datasets.replica import open_replica
+from spslam.datasets.seven_scenes import open_seven_scenes
+from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
+from spslam.datasets.tum import open_tum
 from spslam.errors import DatasetError
 from spslam.geometry import inverse, pose_from
+from tests.datasets.layouts import shared_data
 
 CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
 HALF_SIZE = np.array([3.0, 2.0, 2.5])
@@ -135,3 +140,49 @@ def test_jumps_and_gaps_are_reported():
 
 def test_one_frame_is_enough_to_look_at():
     assert inspect_dataset(BoxRoom(1)).problems == ["only one frame"]
+
+
+RECORDINGS = {
+    "7scenes-redkitchen": open_seven_scenes,
+    "tum-fr1-rpy-60": open_tum,
+    "synthetic-grey-white-room": open_synthetic_rgbd,
+    "replica-layout": open_replica,
+}
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_recordings_as_distributed_are_sound(name):
+    found = inspect_dataset(RECORDINGS[name](shared_data(name)), frames=5)
+    assert found.problems == []
+    assert found.poses.agreement.median_cm < 2
+
+
+class Spoilt(Subset):
+    """A recording whose poses or depth were converted wrongly."""
+
+    def __init__(self, dataset, change_poses=None, scale=1.0):
+        super().__init__(dataset)
+        self.change_poses, self.scale = change_poses or (lambda poses: poses), scale
+
+    def poses(self):
+        return self.change_poses(super().poses())
+
+    def read(self, index):
+        frame = super().read(index)
+        frame.depth *= np.float32(self.scale)
+        return frame
+
+
+@pytest.mark.parametrize("words", SPOILERS)
+@pytest.mark.parametrize("name", ["7scenes-redkitchen", "synthetic-grey-white-room"])
+def test_wrong_poses_of_recordings_are_explained(name, words):
+    spoilt = Spoilt(RECORDINGS[name](shared_data(name)), SPOILERS[words])
+    assert any(words in problem for problem in inspect_dataset(spoilt, frames=3).problems)
+
+
+@pytest.mark.parametrize(("scale", "fix"), [(0.2, 5), (5, 0.2), (0.1526, 6.5535)])
+@pytest.mark.parametrize("name", ["7scenes-redkitchen", "synthetic-grey-white-room"])
+def test_wrong_depth_scale_of_recordings_is_named(name, scale, fix):
+    spoilt = Spoilt(RECORDINGS[name](shared_data(name)), scale=scale)
+    problems = inspect_dataset(spoilt, frames=3).problems
+    assert any(f"depths {fix:g} times as large would fit" in problem for problem in problems)
