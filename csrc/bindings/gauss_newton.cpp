@@ -5,12 +5,6 @@
 namespace spslam::bindings {
 namespace {
 
-Intrinsics load_intrinsics(const std::vector<double>& intrinsics) {
-  STD_TORCH_CHECK(intrinsics.size() == 4, "spslam: intrinsics must be fx, fy, cx, cy");
-  return {static_cast<float>(intrinsics[0]), static_cast<float>(intrinsics[1]), static_cast<float>(intrinsics[2]),
-          static_cast<float>(intrinsics[3])};
-}
-
 Tensor predict_pose(Tensor before, Tensor last) {
   STD_TORCH_CHECK(before.numel() == kPoseSize && last.numel() == kPoseSize,
                   "predict_pose: before and last must have 7 elements");

@@ -7,6 +7,7 @@
 #include "core/cuda_check.cuh"
 #include "core/for_each.h"
 #include "cuda/geometry_fragments.cuh"
+#include "cuda/warp_sums.cuh"
 #include "kernels/gauss_newton.h"
 #include "spslam/gauss_newton.h"
 
@@ -14,11 +15,11 @@ namespace spslam {
 namespace {
 
 constexpr int kWarps = 4;
-constexpr int kThreads = kWarps * kWarpSize;
-constexpr int kBlockPixels = kWarps * kTileSamples;
+constexpr int kThreads = kWarps * kWarp;
+constexpr int kBlockPixels = kWarps * fused::kTileRows;
 // A barrier of the whole grid needs all blocks resident at once: few enough for the smallest device.
 constexpr std::int64_t kMaxTrackingBlocks = 16;
-constexpr int kPaddedTerms = kWarpSize;  // kTrackingTerms, one a lane
+constexpr int kPaddedTerms = kWarp;  // kTrackingTerms, one a lane
 static_assert(kTrackingTerms <= kPaddedTerms, "one lane a term");
 
 std::int64_t block_count(std::int64_t pixels) {
@@ -51,7 +52,7 @@ struct Measurement {
 };
 
 // Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms.
-template <MlpPrecision kPrecision>
+template <Precision kPrecision>
 __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Measurement& measure, const Pose<float>& pose, const Pixel& pixel,
                                                int lane, float* terms) {
@@ -78,7 +79,7 @@ class PixelQueue {
   __device__ PixelQueue(const PixelSource& source, std::int64_t frame)
       : source_(source),
         frame_(frame),
-        own_(blockIdx.x * kBlockPixels + threadIdx.x / kWarpSize * kTileSamples + lane_sample(threadIdx.x % kWarpSize)),
+        own_(blockIdx.x * kBlockPixels + threadIdx.x / kWarp * fused::kTileRows + lane_sample(threadIdx.x % kWarp)),
         at_(own_),
         next_(source.load(frame, own_)) {}
 
@@ -106,11 +107,11 @@ class PixelQueue {
 };
 
 // Sums over the pixels of a frame that this block takes; thread t < 32 returns term t.
-template <MlpPrecision kPrecision>
+template <Precision kPrecision>
 __device__ __forceinline__ double sum_block(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                             const Measurement& measure, const Pose<float>& pose, PixelQueue& queue,
                                             float (&sums)[kWarps][kPaddedTerms]) {
-  const int lane = threadIdx.x % kWarpSize, warp = threadIdx.x / kWarpSize;
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   float terms[kPaddedTerms] = {};
   for (Pixel pixel; queue.pop(pixel);) add_pixel_tile(scene, network, measure, pose, pixel, lane, terms);
   sums[warp][lane] = transpose_sum(terms, lane);
@@ -125,7 +126,7 @@ __device__ __forceinline__ double sum_block(const SceneView& scene, const Geomet
 // terms[t] = sum over blocks of partials[block][t], each warp a strided share, the shares added in order.
 __device__ void add_partials(const double* partials, std::int64_t blocks, double (&shares)[kWarps][kPaddedTerms],
                              double* terms) {
-  const int lane = threadIdx.x % kWarpSize, warp = threadIdx.x / kWarpSize;
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   double sum = 0.0;
   for (std::int64_t b = warp; b < blocks; b += kWarps) sum += __ldcg(partials + b * kPaddedTerms + lane);
   shares[warp][lane] = sum;
@@ -138,11 +139,13 @@ __device__ void add_partials(const double* partials, std::int64_t blocks, double
   __syncthreads();
 }
 
-template <MlpPrecision kPrecision>
+template <Precision kPrecision>
 __global__ void __launch_bounds__(kThreads)
     track_kernel(SceneView scene, const std::int32_t* pixels, std::int64_t num_records, TrackingOptions options,
                  double* partials, float* pose, float* stats, float* hessian) {
-  __shared__ GeometryNetwork<kPrecision> network;
+  // Devices without matrix units for tf32 compute in float32 all the same.
+  constexpr Precision kUsed = fused::kArchitecture < fused::kTensorArchitecture ? Precision::kFp32 : kPrecision;
+  __shared__ GeometryNetwork<kUsed> network;
   __shared__ float sums[kWarps][kPaddedTerms];
   __shared__ double shares[kWarps][kPaddedTerms], terms[kPaddedTerms];
   __shared__ float own_pose[kPoseSize], own_stats[kTrackingStatSize], own_hessian[36];
@@ -161,7 +164,7 @@ __global__ void __launch_bounds__(kThreads)
     cooperative_groups::this_grid().sync();
     add_partials(shared_sums, gridDim.x, shares, terms);
     if (threadIdx.x == 0) tracking_step(terms, options.damping, own_pose, own_stats + 2, own_hessian);
-    if (threadIdx.x == kWarpSize) tracking_fit(terms, options.num_pixels, own_stats);
+    if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
     __syncthreads();
     if (blockIdx.x == 0 && threadIdx.x < kTrackingStatSize) {
       stats[iteration * kTrackingStatSize + threadIdx.x] = own_stats[threadIdx.x];
@@ -175,7 +178,7 @@ __global__ void __launch_bounds__(kThreads)
 // partials[frame][block][term] of given pixels.
 __global__ void __launch_bounds__(kThreads)
     residual_kernel(SceneView scene, PixelSource source, const float* poses, Measurement measure, double* partials) {
-  __shared__ GeometryNetwork<MlpPrecision::kFloat32> network;
+  __shared__ GeometryNetwork<Precision::kFp32> network;
   __shared__ float sums[kWarps][kPaddedTerms];
   network.load(scene.geometry_params);
   __syncthreads();
@@ -228,7 +231,7 @@ void track_gauss_newton<Cuda>(Cuda device, const SceneView& scene, const std::in
                        &pose,
                        &stats,
                        &hessian};
-  const auto kernel = options.tf32 ? track_kernel<MlpPrecision::kTf32> : track_kernel<MlpPrecision::kFloat32>;
+  const auto kernel = options.tf32 ? track_kernel<Precision::kTf32> : track_kernel<Precision::kFp32>;
   SPS_CUDA_CHECK(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel),
                                              dim3(static_cast<unsigned>(tracking_block_count(options.num_pixels))),
                                              dim3(kThreads), arguments, 0, static_cast<cudaStream_t>(device.stream)));

@@ -1,9 +1,9 @@
-// SDF of a scene and its gradient for 16 points at a time by one warp (mlp_fragments.cuh).
+// SDF of a scene and its gradient for 16 points at a time by one warp (fused/fragment.cuh).
 #pragma once
 
 #include <cstdint>
 
-#include "cuda/mlp_fragments.cuh"
+#include "cuda/fused/fragment.cuh"
 #include "kernels/decoders.h"
 #include "kernels/interpolation.h"
 #include "spslam/scene_view.h"
@@ -12,7 +12,7 @@ namespace spslam {
 
 // The geometry decoder in shared memory. Its inputs are ordered embedding (8), scaled position (3), one (the first
 // bias), and padded to 16.
-template <MlpPrecision kPrecision>
+template <Precision kPrecision>
 class GeometryNetwork {
  public:
   // By all threads of a block, which must synchronise before the first use.
@@ -23,13 +23,13 @@ class GeometryNetwork {
     for (int i = threadIdx.x; i < kPaddedInputs * kHidden; i += blockDim.x) {
       const int k = i / kHidden, n = i % kHidden;
       const float w = k < 8 ? w1[n * kInputs + 3 + k] : k < 11 ? w1[n * kInputs + k - 8] : k == 11 ? b1[n] : 0.0f;
-      store_fragment<kPrecision, kPaddedInputs, kHidden>(w1_, k, n, w);
-      store_fragment<kPrecision, kHidden, kPaddedInputs>(w1_transposed_, n, k, w);
+      put(w1_, k, n, kPaddedInputs, kHidden, w);
+      put(w1_transposed_, n, k, kHidden, kPaddedInputs, w);
     }
     for (int i = threadIdx.x; i < kHidden * kHidden; i += blockDim.x) {
       const int n = i / kHidden, k = i % kHidden;
-      store_fragment<kPrecision, kHidden, kHidden>(w2_, k, n, w2[i]);
-      store_fragment<kPrecision, kHidden, kHidden>(w2_transposed_, n, k, w2[i]);
+      put(w2_, k, n, kHidden, kHidden, w2[i]);
+      put(w2_transposed_, n, k, kHidden, kHidden, w2[i]);
     }
     for (int i = threadIdx.x; i < kHidden; i += blockDim.x) b2_[i] = b2[i], w3_[i] = w3[i];
     if (threadIdx.x == 0) b3_ = w3[kHidden];
@@ -38,20 +38,15 @@ class GeometryNetwork {
   // sdf[r] of the lane's samples g and g + 8, all four lanes of a sample alike; keeps in `active` which units fired.
   __device__ void forward(const float (&x)[2][4], int lane, std::uint32_t (&active)[2], float (&sdf)[2]) const {
     float h1[4][4] = {}, h2[4][4];
-    multiply_add<kPrecision>(w1_, x, h1, lane);
-    active[0] = rectify(h1);
-    load_bias(b2_, h2, lane);
-    multiply_add<kPrecision>(w2_, h1, h2, lane);
-    active[1] = rectify(h2);
-    float y[2] = {};
+    fused::layer<kPrecision>(w1_, x, h1, lane);
+    active[0] = fused::rectify(h1);
+    fused::fill_columns(h2, b2_, lane);
+    fused::layer<kPrecision>(w2_, h1, h2, lane);
+    active[1] = fused::rectify(h2);
+    float y[2];
+    fused::dot_rows(h2, w3_, lane, y);
 #pragma unroll
-    for (int j = 0; j < 4; ++j) {
-      const float2 w = output_weights(j, lane);
-#pragma unroll
-      for (int r = 0; r < 2; ++r) y[r] += h2[j][2 * r] * w.x + h2[j][2 * r + 1] * w.y;
-    }
-#pragma unroll
-    for (int r = 0; r < 2; ++r) sdf[r] = activate(MlpActivation::kTanh, quad_sum(y[r]) + b3_);
+    for (int r = 0; r < 2; ++r) sdf[r] = activate(MlpActivation::kTanh, y[r] + b3_);
   }
 
   // grad_x = slope[r] times the derivative of the value before the tanh by the network's inputs.
@@ -64,16 +59,21 @@ class GeometryNetwork {
 #pragma unroll
       for (int r = 0; r < 2; ++r) g2[j][2 * r] = slope[r] * w.x, g2[j][2 * r + 1] = slope[r] * w.y;
     }
-    rectify_gradient(active[1], g2);
-    multiply_add<kPrecision>(w2_transposed_, g2, g1, lane);
-    rectify_gradient(active[0], g1);
+    fused::mask(g2, active[1]);
+    fused::layer<kPrecision>(w2_transposed_, g2, g1, lane);
+    fused::mask(g1, active[0]);
 #pragma unroll
     for (int j = 0; j < 2; ++j) grad_x[j][0] = grad_x[j][1] = grad_x[j][2] = grad_x[j][3] = 0.0f;
-    multiply_add<kPrecision>(w1_transposed_, g1, grad_x, lane);
+    fused::layer<kPrecision>(w1_transposed_, g1, grad_x, lane);
   }
 
  private:
   static constexpr int kPaddedInputs = 16;
+
+  static __device__ void put(float* image, int k, int n, int inputs, int outputs, float weight) {
+    if (kPrecision == Precision::kTf32) weight = fused::round_to_tf32(weight);
+    image[fused::fragment_index<kPrecision>(k, n, inputs, outputs)] = weight;
+  }
 
   __device__ float2 output_weights(int j, int lane) const {
     return *reinterpret_cast<const float2*>(w3_ + 8 * j + 2 * (lane % 4));
@@ -87,11 +87,11 @@ class GeometryNetwork {
 
 // The lane's own value, or that of the neighbour who brings the quad's other sample.
 __device__ __forceinline__ float of_sample(float own, bool is_own) {
-  const float other = __shfl_xor_sync(kWholeWarp, own, 1);
+  const float other = __shfl_xor_sync(fused::kAllLanes, own, 1);
   return is_own ? own : other;
 }
 __device__ __forceinline__ std::int32_t of_sample(std::int32_t own, bool is_own) {
-  const std::int32_t other = __shfl_xor_sync(kWholeWarp, own, 1);
+  const std::int32_t other = __shfl_xor_sync(fused::kAllLanes, own, 1);
   return is_own ? own : other;
 }
 __device__ __forceinline__ Vec3<float> of_sample(const Vec3<float>& own, bool is_own) {
@@ -131,7 +131,7 @@ __device__ __forceinline__ int lane_sample(int lane) {
 
 // SDF and gradient of the lane's own sample, at a world point in the cell of lowest vertex `voxel`; kNoVoxel stands for
 // a sample that is outside, whose result means nothing.
-template <MlpPrecision kPrecision>
+template <Precision kPrecision>
 __device__ __forceinline__ float geometry_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Vec3<float>& point, const Vec3<float>& local, std::int32_t voxel,
                                                int lane, Vec3<float>& gradient) {
@@ -175,7 +175,7 @@ __device__ __forceinline__ float geometry_tile(const SceneView& scene, const Geo
     Vec3<float> sum = inverse_voxel * (g[0][2 * r] * slopes[r][0] + g[0][2 * r + 1] * slopes[r][1]);
     if (q == 0) sum = sum + scene.position_scale * Vec3<float>{g[1][2 * r], g[1][2 * r + 1], 0.0f};
     if (q == 1) sum.z += scene.position_scale * g[1][2 * r];
-    sum = {quad_sum(sum.x), quad_sum(sum.y), quad_sum(sum.z)};
+    sum = {fused::sum_quad(sum.x), fused::sum_quad(sum.y), fused::sum_quad(sum.z)};
     if (r == own) gradient = sum;
   }
   return own ? sdf[1] : sdf[0];

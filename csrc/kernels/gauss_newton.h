@@ -31,20 +31,26 @@ SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pos
   return {offset + pose.translation, offset};
 }
 
-// Adds an inlier's residual to sums of type T. sdf is normalised, gradient its derivative by the world point (1/m).
+// Adds a residual (m) of weight 1 / (1 + (r / kernel)^2)^2 to sums of type T. slope is its derivative by the surface
+// point, offset the point seen from the camera centre that the increment turns about.
 template <class T>
-SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
-                                      float truncation, float kernel, T* terms) {
-  const float residual = sdf * truncation;
-  const Vec3<float> g = truncation * gradient;
-  const Vec3<float> torque = cross(offset, g);
+SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, float kernel,
+                                    T* terms) {
+  const Vec3<float> torque = cross(offset, slope);
   const float ratio = residual / kernel;
   const float root = 1.0f / (1.0f + ratio * ratio);
-  const T jacobian[6] = {g.x, g.y, g.z, torque.x, torque.y, torque.z};
+  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
   const T weight = static_cast<T>(root * root);
   add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
   terms[kNormalTerms] += weight;
   terms[kNormalTerms + 1] += T(1);
+}
+
+// The same of an inlier's SDF, which is normalised, and its gradient by the world point (1/m).
+template <class T>
+SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
+                                      float truncation, float kernel, T* terms) {
+  add_robust_residual(offset, sdf * truncation, truncation * gradient, kernel, terms);
 }
 
 SPS_INLINE bool is_tracking_inlier(float depth, bool inside, float sdf) {
@@ -90,9 +96,10 @@ SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, 
 
 // What an iteration's sums say of the pose before its step; columns 0, 1 and 4 of its statistics.
 SPS_INLINE void tracking_fit(const double* terms, std::int64_t num_pixels, float* stats) {
+  const double count = static_cast<double>(num_pixels > 0 ? num_pixels : 1);
   stats[0] = static_cast<float>(tracking_cost(terms));
-  stats[1] = static_cast<float>(terms[kNormalTerms + 1] / static_cast<double>(num_pixels));
-  stats[4] = static_cast<float>(terms[kNormalTerms] / static_cast<double>(num_pixels));
+  stats[1] = static_cast<float>(terms[kNormalTerms + 1] / count);
+  stats[4] = static_cast<float>(terms[kNormalTerms] / count);
 }
 
 // The pose after `before` and `last` if the camera goes on as it went, T1 T0^-1 T1, its w not negative.

@@ -1,6 +1,7 @@
 """Kernels for sparse neural reconstruction: the public op library, independent of the rest of spslam."""
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
+from spslam.ops.covisibility import frame_overlap, select_covisible_frames
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
 from spslam.ops.gauss_newton import gauss_newton_poses, predict_pose, track_gauss_newton
@@ -12,6 +13,7 @@ from spslam.ops.optimize_map import AdamMoments, AdamTable, MapMoments, new_grad
 from spslam.ops.optimizer import normal_equations, solve_normal_equations, sparse_adam_
 from spslam.ops.pixel_sampling import PixelSampling, sample_frame_pixels, unproject_pixels
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_points, fuse_prior_, random_embeddings
+from spslam.ops.projective_icp import projective_icp
 from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
@@ -52,6 +54,7 @@ __all__ = [
     "depth_normals",
     "encode_frame_",
     "encode_points",
+    "frame_overlap",
     "fuse_prior_",
     "gauss_newton_poses",
     "get_num_threads",
@@ -64,6 +67,7 @@ __all__ = [
     "optimize_map_",
     "philox_uniform",
     "predict_pose",
+    "projective_icp",
     "query_color",
     "query_sdf",
     "query_sdf_gradient",
@@ -73,6 +77,7 @@ __all__ = [
     "sample_along_rays",
     "sample_frame_pixels",
     "sample_indices",
+    "select_covisible_frames",
     "set_num_threads",
     "solve_normal_equations",
     "sparse_adam_",

@@ -315,6 +315,29 @@ def _predict(generator, device, n):
     return dict(before=POSE.to(device), last=(POSE + torch.tensor([0, 0, 0, 0, 0.1, 0, 0])).to(device))
 
 
+def _icp(generator, device, n):
+    vertices = _uniform(generator, 6, 8, 3) + torch.tensor([-0.5, -0.5, 1.0])
+    normals = torch.nn.functional.normalize(_normal(generator, 6, 8, 3), dim=-1)
+    points = _uniform(generator, n, 3) + torch.tensor([-0.5, -0.5, 1.0])
+    tensors = dict(points=points, vertices=vertices, normals=normals, pose=POSE)
+    return _on(device, tensors) | dict(intrinsics=ops.Intrinsics(8.0, 8.0, 3.5, 2.5), iterations=3)
+
+
+def _views(generator, device, n):
+    lattices = (1 + _uniform(generator, n, 3, 4)).half()
+    return _on(device, dict(poses=POSE.repeat(n, 1), lattices=lattices)) | dict(intrinsics=INTRINSICS, lattice_step=16)
+
+
+def _overlap(generator, device, n):
+    return dict(points=_normal(generator, n, 3).to(device)) | _views(generator, device, n)
+
+
+def _select(generator, device, n):
+    counts = dict(num_points=20, num_covisible=5, count=9, threshold=0.1, seed=7, frame=3)
+    tensors = _on(device, dict(records=_records(generator, max(n, 1)), candidates=torch.arange(n)))
+    return tensors | dict(current=0) | _views(generator, device, max(n, 1)) | counts
+
+
 CASES = {
     "voxel_hash_find": Case(_find, rows=("voxel_coords",)),
     "voxel_hash_insert": Case(_insert),
@@ -354,4 +377,7 @@ CASES = {
     "track_adam": Case(_track_adam),
     "optimize_map_": Case(_optimize_map),
     "predict_pose": Case(_predict),
+    "projective_icp": Case(_icp),
+    "frame_overlap": Case(_overlap),
+    "select_covisible_frames": Case(_select),
 }

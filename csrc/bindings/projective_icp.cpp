@@ -1,0 +1,50 @@
+#include "spslam/projective_icp.h"
+
+#include "bindings/scene.h"
+
+namespace spslam::bindings {
+namespace {
+
+std::tuple<Tensor, Tensor, Tensor> projective_icp(Tensor points, Tensor vertices, Tensor normals, Tensor pose,
+                                                  std::vector<double> intrinsics, std::int64_t iterations,
+                                                  double max_distance, double kernel_start, double kernel_end,
+                                                  double damping) {
+  STD_TORCH_CHECK(points.dim() == 2 && points.size(1) == 3, "projective_icp: points must have shape [N, 3]");
+  STD_TORCH_CHECK(vertices.dim() == 3 && vertices.size(2) == 3 && normals.numel() == vertices.numel(),
+                  "projective_icp: vertices and normals must have shape [H, W, 3]");
+  STD_TORCH_CHECK(pose.numel() == kPoseSize, "projective_icp: pose must have 7 elements");
+  STD_TORCH_CHECK(iterations >= 1, "projective_icp: iterations must be >= 1");
+  DeviceScope scope(points);
+  points = torch::stable::contiguous(points);
+  vertices = torch::stable::contiguous(vertices);
+  normals = torch::stable::contiguous(normals);
+  Tensor result = torch::stable::clone(torch::stable::contiguous(pose));
+  Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
+  Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
+  const std::int64_t count = points.size(0);
+  Tensor workspace = empty(points, {projective_icp_workspace_size(scope.context, count)}, ScalarType::Byte);
+  const SurfaceMaps target{data<float>(vertices), data<float>(normals), vertices.size(0), vertices.size(1),
+                           load_intrinsics(intrinsics)};
+  const IcpOptions options{iterations, static_cast<float>(max_distance), static_cast<float>(kernel_start),
+                           static_cast<float>(kernel_end), damping};
+  spslam::projective_icp(scope.context, data<float>(points), count, target, options, workspace.mutable_data_ptr(),
+                         mutable_data<float>(result), mutable_data<float>(stats), mutable_data<float>(hessian));
+  return {result, stats, hessian};
+}
+
+}  // namespace
+
+#ifndef SPS_CUDA
+STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def(
+      "projective_icp(Tensor points, Tensor vertices, Tensor normals, Tensor pose, float[] intrinsics, "
+      "int iterations, float max_distance, float kernel_start, float kernel_end, float damping) "
+      "-> (Tensor, Tensor, Tensor)");
+}
+#endif
+
+SPS_LIBRARY_IMPL(m) {
+  m.impl("projective_icp", TORCH_BOX(&projective_icp));
+}
+
+}  // namespace spslam::bindings

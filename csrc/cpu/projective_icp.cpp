@@ -1,0 +1,44 @@
+#include "spslam/projective_icp.h"
+
+#include "core/parallel.h"
+#include "kernels/projective_icp.h"
+
+namespace spslam {
+namespace {
+
+// Points summed by one worker before its sums are added to the others', in order.
+constexpr std::int64_t kPointGrain = 512;
+
+}  // namespace
+
+template <>
+std::int64_t projective_icp_workspace_size<Cpu>(Cpu, std::int64_t num_points) {
+  return (chunk_count(num_points, kPointGrain) + 1) * kTrackingTerms * static_cast<std::int64_t>(sizeof(double));
+}
+
+template <>
+void projective_icp<Cpu>(Cpu, const float* points, std::int64_t num_points, const SurfaceMaps& target,
+                         const IcpOptions& options, void* workspace, float* pose, float* stats, float* hessian) {
+  double* terms = static_cast<double*>(workspace);
+  double* partials = terms + kTrackingTerms;
+  for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
+    const Pose<float> current = load_pose(pose);
+    const float kernel = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
+    parallel_chunks(num_points, kPointGrain, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {
+      double* own = partials + chunk * kTrackingTerms;
+      for (int t = 0; t < kTrackingTerms; ++t) own[t] = 0.0;
+      for (std::int64_t i = begin; i < end; ++i) {
+        add_icp_residual(target, points + 3 * i, current, options.max_distance, kernel, own);
+      }
+    });
+    for (int t = 0; t < kTrackingTerms; ++t) terms[t] = 0.0;
+    for (std::int64_t chunk = 0; chunk < chunk_count(num_points, kPointGrain); ++chunk) {
+      for (int t = 0; t < kTrackingTerms; ++t) terms[t] += partials[chunk * kTrackingTerms + t];
+    }
+    float* own_stats = stats + kTrackingStatSize * iteration;
+    tracking_fit(terms, num_points, own_stats);
+    tracking_step(terms, options.damping, pose, own_stats + 2, hessian);
+  }
+}
+
+}  // namespace spslam

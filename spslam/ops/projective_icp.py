@@ -1,0 +1,91 @@
+"""Relative camera pose by point-to-plane ICP with projective association. Not differentiable.
+
+A source point x falls on the pixel pi(T x) of the target's maps, whose vertex v and normal n it is held against: the
+residual is r = n . (T x - v), its weight 1 / (1 + (r / k)^2)^2. Chen and Medioni 1992; association by projection after
+Blais and Levine 1995.
+"""
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._checks import check, check_tensor
+from spslam.ops.scene_view import Intrinsics
+
+
+def projective_icp(
+    points: torch.Tensor,
+    vertices: torch.Tensor,
+    normals: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    *,
+    iterations: int = 15,
+    max_distance: float = 0.3,
+    kernel_start: float = 0.1,
+    kernel_end: float = 0.03,
+    damping: float = 1e-4,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Moves a cloud of points onto a surface that a camera sees; all iterations in one call, on CUDA in one kernel.
+
+    Each iteration associates anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the step
+    to a norm of 0.15 (m and rad). The kernel width k goes geometrically from `kernel_start` to `kernel_end`, reached
+    one iteration before the last.
+
+    Args:
+        points: float32 [N, 3] source points, m, in the source camera's axes.
+        vertices: float32 [H, W, 3] target points, m, in the target camera's axes; z = 0 where there is none.
+        normals: float32 [H, W, 3] their unit normals; 0 where unknown. Such pixels take no part.
+        pose: float32 [7] start, unit quaternion (w, x, y, z) and translation (m), T_target_source.
+        intrinsics: of the maps, in their own pixels: a map of every s-th pixel has focal lengths f / s and principal
+            point (c + 1/2) / s - 1/2.
+        iterations: how many.
+        max_distance: farthest a point may lie from its vertex, m.
+        kernel_start: first width k of the robust kernel, m.
+        kernel_end: last width, m.
+        damping: relative Levenberg damping.
+
+    Returns:
+        float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of points
+        with a partner, the norms of the step in translation (m) and rotation (rad), and the mean weight over all
+        points, each before the iteration's step; float32 [6, 6] H of the last iteration. The same to the bit every time
+        on one device, and for any number of CPU threads. N = 0 or an empty map leaves the pose as it is.
+
+    Raises:
+        TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+
+    Example:
+        >>> rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(8.0), indexing="ij")
+        >>> wall = torch.stack([(columns - 3.5) / 8, (rows - 2.5) / 8, torch.ones(6, 8)], -1)
+        >>> normals = torch.tensor([0.0, 0.0, -1.0]).expand(6, 8, 3)
+        >>> start = torch.tensor([1.0, 0, 0, 0, 0, 0, 0.1])
+        >>> pose, _, _ = projective_icp(wall.reshape(-1, 3), wall, normals, start, Intrinsics(8.0, 8.0, 3.5, 2.5))
+        >>> bool(pose[6].abs() < 1e-3)
+        True
+    """
+    name = "projective_icp"
+    check_tensor(name, "points", points, ("N", 3), torch.float32)
+    check_tensor(name, "vertices", vertices, ("H", "W", 3), torch.float32, like=points)
+    check_tensor(name, "normals", normals, tuple(vertices.shape), torch.float32, like=points)
+    check_tensor(name, "pose", pose, (7,), torch.float32, like=points)
+    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
+    check(max_distance > 0, name, "max_distance", "be positive", max_distance)
+    kernels = (kernel_start, kernel_end)
+    check(min(kernels) > 0, name, "kernel_start and kernel_end", "be positive", kernels)
+    check(damping >= 0, name, "damping", "be at least 0", damping)
+    return torch.ops.spslam.projective_icp(
+        points,
+        vertices,
+        normals,
+        pose,
+        list(intrinsics),
+        iterations,
+        max_distance,
+        kernel_start,
+        kernel_end,
+        damping,
+    )
+
+
+@torch.library.register_fake("spslam::projective_icp")
+def _(points, vertices, normals, pose, intrinsics, iterations, *_):
+    return pose.new_empty(7), pose.new_empty((iterations, 5)), pose.new_empty((6, 6))
