@@ -5,12 +5,11 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.geometry import quaternion_to_matrix
 from spslam.prior import Prior, encode_frame
 from spslam.scene import Scene
-from spslam.slam.covisibility import POINTS, select_frames
+from spslam.slam.covisibility import select_frames
 from spslam.slam.optimization import render_options
-from spslam.slam.pixels import FramePixels, unpack_points
+from spslam.slam.pixels import FramePixels
 from spslam.slam.state import Moments, SlamState
 
 
@@ -96,28 +95,10 @@ class Mapper:
         )
 
     def _select(self, state: SlamState) -> torch.Tensor:
-        config, frames, usable = self.config, state.frames, state.usable
-        current = int(usable.nonzero()[-1])
-        records = state.pixels.records[current]
-        draw = ops.sample_indices(
-            config.seed, ops.Stream.COVISIBILITY, len(frames) - 1, 0, POINTS, len(records), records.device
+        frames = state.frames
+        return select_frames(
+            state.pixels.records, frames.poses, frames.lattices, state.usable, self.camera, self.config
         )
-        points = self._to_world(unpack_points(records[draw], self.camera), frames.poses[current])
-        rotations = _rotations(frames.poses)
-        return select_frames(points, rotations, frames.poses[:, 4:], frames.lattices, usable, self.camera, config)
-
-    def _to_world(self, points: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
-        return self._rotate(points, pose) + pose[4:]
-
-    @staticmethod
-    def _rotate(vectors: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
-        return vectors.to(pose.device) @ _rotations(pose[None])[0].T
-
-
-def _rotations(poses: torch.Tensor) -> torch.Tensor:
-    """float32 [F, 3, 3] rotations of poses [F, 7]."""
-    matrices = quaternion_to_matrix(poses[:, :4].double().cpu().numpy())
-    return torch.from_numpy(matrices).to(poses.device, torch.float32)
 
 
 def _moments(state: SlamState, name: str, parameter: torch.Tensor) -> Moments:
