@@ -12,6 +12,9 @@ import torch
 
 from benchmarks import room, timing
 from spslam import ops
+from spslam.camera import Camera
+from spslam.slam.pixels import FramePixels, unpack_points
+from spslam.slam.rescue import POINTS, surface_maps
 
 PIXELS_PER_FRAME = 15000
 TRACKING = dict(
@@ -66,6 +69,58 @@ def tracking_rows(scene: ops.SceneView, rays: ops.RayBatch, rounds: int) -> list
     return rows
 
 
+def icp_rows(rays: ops.RayBatch, rounds: int) -> list[dict[str, object]]:
+    """ICP of 15 iterations over 4096 points against maps of 80 x 60, and what one more iteration costs."""
+    camera = Camera(room.WIDTH, room.HEIGHT, *rays.intrinsics)
+    normals = torch.tensor([0.0, 0.0, -1.0], device=rays.pixels.device).expand(len(rays.pixels), 3)
+    buffer = torch.cat([rays.pixels.flatten(), normals.contiguous().view(torch.int32).flatten()])
+    pixels = FramePixels(buffer, len(rays.pixels), (0, 0), 1.0)
+    vertices, map_normals, intrinsics = surface_maps(pixels, camera)
+    points = unpack_points(rays.pixels[:POINTS], camera)
+    start = torch.tensor([1.0, 0, 0, 0, 0, 0, 0.05], device=points.device)
+    times = {
+        iterations: median_us(
+            lambda iterations=iterations: ops.projective_icp(
+                points, vertices, map_normals, start, intrinsics, iterations=iterations
+            ),
+            rounds,
+        )
+        for iterations in (15, 30)
+    }
+    name = f"projective_icp, 15 x {len(points)} points"
+    return [{"op": name, "call us": times[15], "iteration us": (times[30] - times[15]) / 15}]
+
+
+def selection_rows(rays: ops.RayBatch, rounds: int) -> list[dict[str, object]]:
+    """The choice of 180 frames among as many as a run has after 10 seconds, and after 5 minutes."""
+    rows: list[dict[str, object]] = []
+    device = rays.pixels.device
+    for frames in (300, 9000):
+        poses = rays.poses.repeat(-(-frames // len(rays.poses)), 1)[:frames]
+        lattices = torch.full((frames, 30, 40), 2.0, dtype=torch.float16, device=device)
+        candidates = torch.randperm(frames - 20, generator=torch.Generator().manual_seed(0)).to(device)
+        time = median_us(
+            lambda poses=poses, lattices=lattices, candidates=candidates: ops.select_covisible_frames(
+                rays.pixels,
+                len(poses) - 1,
+                poses,
+                lattices,
+                candidates,
+                rays.intrinsics,
+                lattice_step=16,
+                num_points=256,
+                num_covisible=90,
+                count=180,
+                threshold=0.1,
+                seed=0,
+                frame=0,
+            ),
+            rounds,
+        )
+        rows.append({"op": f"select_covisible_frames, 180 of {frames}", "call us": time, "iteration us": ""})
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=100, help="replays of each")
@@ -74,7 +129,11 @@ def main() -> None:
     device, generator = torch.device("cuda"), torch.Generator().manual_seed(0)
     scene = room.make_scene(generator, device)
     rays = room.make_rays(generator, PIXELS_PER_FRAME, 1, device)
-    rows = tracking_rows(scene, rays, args.rounds)
+    rows = [
+        *tracking_rows(scene, rays, args.rounds),
+        *icp_rows(rays, args.rounds),
+        *selection_rows(rays, args.rounds),
+    ]
     timing.report(f"room of {len(scene.embeddings)} vertices", rows, device, args.json)
 
 

@@ -123,6 +123,8 @@ class TrackingOptions(Section):
     kernel_start_m: float = _option("gauss_newton: width of the robust kernel in the first iteration", "m", gt=0)
     kernel_end_m: float = _option("gauss_newton: width of the robust kernel in the last iteration", "m", gt=0)
     damping: float = _option("gauss_newton: share of its diagonal added to the normal matrix", ge=0)
+    rescue: bool = _option("gauss_newton: start anew from projective ICP where a frame fits the map badly")
+    rescue_below: float = _option("rescue where the mean robust weight of the pixels is below this", ge=0, le=1)
     min_inlier_share: float = _option("a frame with a smaller share of pixels on mapped surface is lost", ge=0, le=1)
     min_valid_share: float = _option("a frame with depth in a smaller share of its image is lost", ge=0, le=1)
 

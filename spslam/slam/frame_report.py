@@ -24,6 +24,8 @@ class FrameReport:
         tracking_iterations: of this frame; 0 for the first.
         residual_cm: weighted RMS distance of its pixels to the map; None where it was not tracked.
         inliers: share of its pixels on mapped surface; None where it was not tracked.
+        support: mean robust weight of its pixels on the map, from 0 to 1; None where it was not tracked, or by Adam.
+        rescued: whether its pose comes from a start that projective ICP found.
         mapping_iterations: of the joint optimisation after this frame.
         loss: total loss of the last mapping iteration; None where there was none.
         voxels: allocated vertices.
@@ -44,6 +46,8 @@ class FrameReport:
     tracking_iterations: int
     residual_cm: float | None
     inliers: float | None
+    support: float | None
+    rescued: bool
     mapping_iterations: int
     loss: float | None
     voxels: int

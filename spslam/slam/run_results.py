@@ -44,15 +44,16 @@ def write_results(
     frames, skipped = system.state.frames, files.read_skipped()
     if len(frames) == 0:
         raise DatasetError(f"{dataset.name}: no frame could be read; the first: {skipped[0]['error']}")
-    trajectory, truth = system.trajectory(), dataset.poses()
+    trajectory, truth, log = system.trajectory(), dataset.poses(), files.read_log()
     trajectory.save_tum(files.trajectory)
     system.state.scene.save(files.map)
     metrics = {
         **provenance(config, system.device),
         "frames": len(frames),
         **_speed(clock),
-        **_timings(files.read_log(), clock),
+        **_timings(log, clock),
         "lost_frames": int(frames.lost.sum()),
+        "rescued_frames": sum(line["rescued"] for line in log),
         "skipped_frames": len(skipped),
         **_sizes(system),
     }

@@ -14,6 +14,7 @@ from spslam.slam.frame_feed import PreparedFrame, Upload
 from spslam.slam.frame_report import FrameMarks, FrameReport, PendingReport
 from spslam.slam.mapper import Mapper
 from spslam.slam.pixels import FramePixels, sample_frame
+from spslam.slam.rescue import EarlierFrame
 from spslam.slam.state import SlamState, pose_tensor
 from spslam.slam.timeline import Mark, mark
 from spslam.slam.tracker import Tracker, TrackingResult
@@ -97,6 +98,8 @@ class SlamSystem:
             "tracking_iterations": tracked.iterations,
             "residual_cm": _known(tracked.residual_cm),
             "inliers": _known(tracked.inlier_share),
+            "support": _known(tracked.support),
+            "rescued": tracked.rescued,
             "mapping_iterations": iterations,
             "voxels": self.state.scene.volume.num_voxels,
             "decode_ms": frame.decode_ms,
@@ -129,9 +132,16 @@ class SlamSystem:
             return TrackingResult(pose, 0, math.nan, math.nan, lost=self.tracker.is_blind(pixels))
         begin = self._mark()
         start = self.tracker.predict(self.state.frames)
-        tracked = self.tracker.track(self.state.scene, pixels, start, number)
+        tracked = self.tracker.track(self.state.scene, pixels, start, number, self._earlier())
         marks.tracking = (begin, self._mark())
         return tracked
+
+    def _earlier(self) -> EarlierFrame | None:
+        """The last frame with pixels and a pose to be trusted."""
+        rows = self.state.usable.nonzero()[:, 0]
+        if len(rows) == 0:
+            return None
+        return EarlierFrame(self.state.pixels.records[rows[-1]], self.state.frames.poses[rows[-1]])
 
     def _is_mapping_frame(self, number: int) -> bool:
         return number % self.config.mapping.every == 0 or self.state.scene.volume.num_voxels == 0

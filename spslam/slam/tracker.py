@@ -1,18 +1,20 @@
 """Finds the pose of one frame against the frozen map (section III.D)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.geometry import constant_speed
 from spslam.scene import Scene
 from spslam.slam.optimization import render_options
 from spslam.slam.pixels import FramePixels
-from spslam.slam.state import FrameTable, pose_tensor
+from spslam.slam.rescue import EarlierFrame, IcpRescue
+from spslam.slam.state import FrameTable
+
+RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class TrackingResult:
         residual_cm: weighted root mean squared distance of the pixels to the mapped surface; NaN if not tracked.
         inlier_share: share of pixels that fall on mapped surface; NaN if not tracked.
         lost: whether the pose is not to be trusted.
+        support: mean robust weight of all pixels, from 0 (none fits the map) to 1 (all do); NaN where not known.
+        rescued: whether the pose comes from a start that ICP found.
     """
 
     pose: torch.Tensor
@@ -32,6 +36,8 @@ class TrackingResult:
     residual_cm: float
     inlier_share: float
     lost: bool
+    support: float = math.nan
+    rescued: bool = False
 
 
 class Tracker:
@@ -47,23 +53,33 @@ class Tracker:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
         if len(frames) < 2 or bool(frames.lost[-2:].any()):
             return frames.poses[-1].clone()
-        before, last = frames.matrices(-2)
-        return pose_tensor(constant_speed(before, last), frames.poses.device)
+        return ops.predict_pose(frames.poses[-2], frames.poses[-1])
 
-    def track(self, scene: Scene, pixels: FramePixels, start: torch.Tensor, frame: int) -> TrackingResult:
-        """Optimises the pose from `start`.
+    def track(
+        self,
+        scene: Scene,
+        pixels: FramePixels,
+        start: torch.Tensor,
+        frame: int,
+        earlier: EarlierFrame | None = None,
+    ) -> TrackingResult:
+        """Optimises the pose from `start`; where that fits badly, tries again from where ICP leads.
 
         Args:
             scene: the map, not changed.
             pixels: of the frame.
             start: float32 [7].
             frame: number of the frame, keys the random draws.
+            earlier: the last frame whose pose is trusted; without it there is no second try.
         """
         if self.is_blind(pixels):
             return TrackingResult(start.clone(), 0, math.nan, math.nan, lost=True)
         if self.config.tracking.optimizer == "adam":
             return self._track_adam(scene, pixels.records, start, frame)
-        return self._track_gauss_newton(scene, pixels.records, start, frame)
+        result = self._track_gauss_newton(scene, pixels.records, start, frame)
+        if earlier is None or not self._is_doubtful(result):
+            return result
+        return self._rescue(scene, pixels, start, frame, earlier, result)
 
     def is_blind(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to tell a pose from."""
@@ -92,8 +108,38 @@ class Tracker:
             stream=ops.Stream.TRACKING_PIXELS,
             frame=frame,
         )
-        cost, inlier_share = stats[-1, :2].tolist()
-        return self._judged(start, pose, len(stats), cost, inlier_share)
+        cost, inlier_share, _, _, support = stats[-1].tolist()  # the frame's one wait for the device
+        return self._judged(start, pose, len(stats), cost, inlier_share, support)
+
+    def _is_doubtful(self, result: TrackingResult) -> bool:
+        """Whether so little of the frame fits the map that the pose may be a wrong one."""
+        return self.config.tracking.rescue and (result.lost or result.support < self.config.tracking.rescue_below)
+
+    def _rescue(
+        self,
+        scene: Scene,
+        pixels: FramePixels,
+        start: torch.Tensor,
+        frame: int,
+        earlier: EarlierFrame,
+        first: TrackingResult,
+    ) -> TrackingResult:
+        """The best supported of the first result and those from ICP's poses, begun at `start` and at the last pose."""
+        icp, best = IcpRescue(pixels, earlier, self.camera), first
+        iterations = first.iterations
+        for guess in (start, earlier.pose):
+            again = self._track_gauss_newton(scene, pixels.records, icp.pose(guess), frame)
+            iterations += again.iterations
+            if self._is_better(again, best):
+                best = replace(again, rescued=True)
+        pose = start.clone() if best.lost else best.pose
+        return replace(best, pose=pose, iterations=iterations)
+
+    def _is_better(self, result: TrackingResult, than: TrackingResult) -> bool:
+        """Whether a second result replaces the first; in place of a lost one only what needs no rescue itself."""
+        if than.lost:
+            return not self._is_doubtful(result)
+        return not result.lost and result.support > than.support + RESCUE_GAIN
 
     def _track_adam(self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int) -> TrackingResult:
         tracking, iterations = self.config.tracking, self._iterations(frame)
@@ -122,9 +168,17 @@ class Tracker:
         return self._judged(start, best, iterations, *fit)
 
     def _judged(
-        self, start: torch.Tensor, pose: torch.Tensor, iterations: int, cost: float, inlier_share: float
+        self,
+        start: torch.Tensor,
+        pose: torch.Tensor,
+        iterations: int,
+        cost: float,
+        inlier_share: float,
+        support: float = math.nan,
     ) -> TrackingResult:
-        """The result with `pose`, or with `start` where that is lost; `cost` in m^2."""
-        found = bool(torch.isfinite(pose).all()) and inlier_share >= self.config.tracking.min_inlier_share
+        """The result with `pose`, or with `start` where that is lost; `cost` in m^2. A pose of NaN has no inliers."""
+        found = inlier_share >= self.config.tracking.min_inlier_share
         residual_cm = 100 * math.sqrt(max(cost, 0.0))
-        return TrackingResult(pose if found else start.clone(), iterations, residual_cm, inlier_share, not found)
+        return TrackingResult(
+            pose if found else start.clone(), iterations, residual_cm, inlier_share, not found, support
+        )

@@ -1,0 +1,77 @@
+"""A second start for tracking: the frame is laid onto an earlier one by projective ICP, which needs no map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix
+from spslam.slam.pixels import FramePixels, unpack_points
+
+MAP_COLUMNS = 80  # of the frame's surface maps: about three pixel records a cell
+POINTS = 4096  # of the earlier frame
+
+
+@dataclass(frozen=True)
+class EarlierFrame:
+    """A frame whose pose is known.
+
+    Attributes:
+        records: int32 [P, 3] its packed pixels in random order.
+        pose: float32 [7] T_world_camera.
+    """
+
+    records: torch.Tensor
+    pose: torch.Tensor
+
+
+class IcpRescue:
+    """Poses of one frame by ICP against an earlier one, from any number of starts."""
+
+    def __init__(self, pixels: FramePixels, earlier: EarlierFrame, camera: Camera):
+        self._maps = surface_maps(pixels, camera)
+        self._points = unpack_points(earlier.records[:POINTS], camera)
+        self._earlier = earlier
+
+    def pose(self, start: torch.Tensor) -> torch.Tensor:
+        """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
+        earlier = _matrix(self._earlier.pose)
+        between = _pose(compose(inverse(_matrix(start)), earlier), start.device)
+        vertices, normals, intrinsics = self._maps
+        between, _, _ = ops.projective_icp(self._points, vertices, normals, between, intrinsics)
+        return _pose(compose(earlier, inverse(_matrix(between))), start.device)
+
+
+def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:
+    """What a frame's pixel records show of the surface, as maps of at most `MAP_COLUMNS` columns.
+
+    A cell holds the first record that falls in it and has a normal, so both devices choose the same.
+
+    Returns:
+        vertices float32 [h, w, 3] (m, camera axes; 0 where there is none), normals float32 [h, w, 3], and the
+        intrinsics of the maps.
+    """
+    step = -(-camera.width // MAP_COLUMNS)
+    rows, columns = -(-camera.height // step), -(-camera.width // step)
+    records, normals = pixels.records, pixels.normals
+    u, v = records[:, 0] & 0xFFFF, (records[:, 0] >> 16) & 0xFFFF
+    cell = (v // step * columns + u // step).long()
+    count = len(records)
+    order = torch.where(normals.any(1), torch.arange(count, device=records.device), count)
+    first = torch.full((rows * columns,), count, device=records.device).scatter_reduce_(0, cell, order, "amin")
+    points = torch.cat([unpack_points(records, camera), normals.new_zeros(1, 3)])
+    normals = torch.cat([normals, normals.new_zeros(1, 3)])
+    intrinsics = ops.Intrinsics(
+        camera.fx / step, camera.fy / step, (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5
+    )
+    return points[first].view(rows, columns, 3), normals[first].view(rows, columns, 3), intrinsics
+
+
+def _matrix(pose: torch.Tensor) -> np.ndarray:
+    return pose7_to_matrix(pose.cpu().numpy().astype(np.float64))
+
+
+def _pose(matrix: np.ndarray, device: torch.device) -> torch.Tensor:
+    return torch.from_numpy(matrix_to_pose7(matrix)).to(device, torch.float32)
