@@ -35,8 +35,11 @@ __global__ void __launch_bounds__(kThreads) resolve_vertices(FuseFrame frame) {
       key = vertex_key(sums, i);
       id = find_voxel_key(frame.table(), key);
     }
-    sums.ids[i] = id;
     list_vertex(sums, id == kNoVoxel, key, i);
+    const std::uint32_t place = list_place(id >= 0, &sums.counters->found);
+    if (id < 0) continue;
+    sums.found[place] = static_cast<std::int32_t>(i);
+    sums.found_ids[place] = id;
   }
 }
 
@@ -81,8 +84,7 @@ __device__ int count_smaller(const VertexSums& sums, std::uint32_t count, unsign
 __global__ void __launch_bounds__(kThreads) fuse_vertices(FuseFrame frame) {
   if (!frame.fits()) return;
   const VertexSums& sums = frame.sums;
-  const std::int64_t work = num_vertices(sums) * kPriorFeatures,
-                     stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
+  const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
   const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
   const int lane = threadIdx.x % kWarpSize, channel = threadIdx.x % kPriorFeatures;
   const std::uint32_t fresh = sums.counters->listed;
@@ -93,21 +95,36 @@ __global__ void __launch_bounds__(kThreads) fuse_vertices(FuseFrame frame) {
     if (lane < kPriorFeatures) fuse_vertex(frame, sums.listed[i], id, channel);
   }
   if (!frame.fuse_known) return;
-  for (std::int64_t i = thread; i < work; i += stride) {
-    const std::int32_t id = sums.ids[i / kPriorFeatures];
-    if (id >= 0) fuse_vertex(frame, i / kPriorFeatures, id, channel);
+  const std::int64_t known = static_cast<std::int64_t>(sums.counters->found) * kPriorFeatures;
+  for (std::int64_t i = thread; i < known; i += stride) {
+    fuse_vertex(frame, sums.found[i / kPriorFeatures], sums.found_ids[i / kPriorFeatures], channel);
   }
+}
+
+// update_corner_row by eight lanes, a corner each: one after the other, the searches would take most of the time.
+__device__ void update_corner_row_together(const FuseFrame& frame, std::int32_t id, int k) {
+  const int corner = threadIdx.x % kCellCorners, first_lane = threadIdx.x % kWarpSize - corner;
+  const std::uint32_t together = 0xffu << first_lane;
+  const std::int64_t first_new = frame.volume.num_voxels;
+  const VoxelCoord vertex = load_voxel(frame.volume.voxel_coords, id);
+  const VoxelCoord lowest{vertex.x - (k & 1), vertex.y - ((k >> 1) & 1), vertex.z - ((k >> 2) & 1)};
+  const std::int32_t own = find_voxel(frame.table(), cell_corner(lowest, corner));
+  const bool complete = __ballot_sync(together, own != kNoVoxel) == together;
+  const bool new_before = __ballot_sync(together, corner < k && own >= first_new) != 0;
+  const std::int32_t row = __shfl_sync(together, own, first_lane);
+  // A new vertex writes its own row, and older ones that it completes and of which it is the first new corner.
+  if (k != 0 && (!complete || new_before)) return;
+  frame.volume.corner_ids[static_cast<std::int64_t>(kCellCorners) * row + corner] = complete ? own : kNoVoxel;
 }
 
 __global__ void __launch_bounds__(kThreads) complete_corner_rows(FuseFrame frame) {
   if (!frame.fits()) return;
-  const FeatureVolume& volume = frame.volume;
-  const std::int64_t work = static_cast<std::int64_t>(frame.sums.counters->listed) * kCellCorners;
+  const std::int64_t work = static_cast<std::int64_t>(frame.sums.counters->listed) * kCellCorners * kCellCorners;
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
   for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x; i < work; i += stride) {
-    const std::int32_t id = static_cast<std::int32_t>(volume.num_voxels + i / kCellCorners);
-    update_corner_row(frame.table(), load_voxel(volume.voxel_coords, id), volume.num_voxels,
-                      static_cast<int>(i % kCellCorners), id, volume.corner_ids);
+    const std::int64_t fresh = i / (kCellCorners * kCellCorners);
+    update_corner_row_together(frame, static_cast<std::int32_t>(frame.volume.num_voxels + fresh),
+                               static_cast<int>(i / kCellCorners % kCellCorners));
   }
 }
 
@@ -134,7 +151,7 @@ template <>
 EncodedFrame encode_frame<Cuda>(Cuda device, const FeatureVolume& volume, const float* points, const float* normals,
                                 std::int64_t n, const float* params, const FusionSettings& settings,
                                 const AllocateScratch& scratch) {
-  constexpr int kBlocks = 264;
+  constexpr int kBlocks = 1056;  // as many as an H100 holds at once: these kernels wait for memory
   const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
   for (int attempt = 0;; ++attempt) {
     const std::int32_t neighborhood = settings.encoder.neighborhood;

@@ -18,7 +18,7 @@ constexpr int kStagedStride = 12;  // floats: reads of one column by all lanes t
 
 template <MlpPrecision kPrecision>
 constexpr int encoder_warps() {
-  return kPrecision == MlpPrecision::kTf32 ? 8 : 4;
+  return kPrecision == MlpPrecision::kTf32 ? 16 : 4;
 }
 
 // What a lane brings to the next 32 pairs of its warp.
@@ -104,7 +104,7 @@ __global__ void __launch_bounds__(encoder_warps<kPrecision>() * kWarpSize)
 template <MlpPrecision kPrecision>
 void launch_encoder(Cuda device, const VertexSums& sums, const float* points, const float* normals, const float* params,
                     const EncoderSettings& settings) {
-  constexpr int kBlocksPerProcessor = 2;
+  constexpr int kBlocksPerProcessor = kPrecision == MlpPrecision::kTf32 ? 1 : 2;
   int gpu = 0, processors = 0;
   SPS_CUDA_CHECK(cudaGetDevice(&gpu));
   SPS_CUDA_CHECK(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, gpu));

@@ -25,7 +25,7 @@ void write_sorted(Cuda device, const VertexSums& sums, std::int64_t vertices, co
   const int count = static_cast<int>(vertices);
   unsigned long long* keys = static_cast<unsigned long long*>(scratch(vertices * sizeof(*keys)));
   const auto sort = [&](void* workspace, std::size_t* bytes) {
-    SPS_CUDA_CHECK(cub::DeviceRadixSort::SortPairs(workspace, *bytes, sums.listed_keys, keys, sums.listed, sums.ids,
+    SPS_CUDA_CHECK(cub::DeviceRadixSort::SortPairs(workspace, *bytes, sums.listed_keys, keys, sums.listed, sums.found,
                                                    count, 0, 64, stream));
   };
   std::size_t bytes = 0;
@@ -36,10 +36,10 @@ void write_sorted(Cuda device, const VertexSums& sums, std::int64_t vertices, co
     out.voxel_coords[3 * i] = coord.x;
     out.voxel_coords[3 * i + 1] = coord.y;
     out.voxel_coords[3 * i + 2] = coord.z;
-    const float weight = vertex_weight(sums, sums.ids[i]);
+    const float weight = vertex_weight(sums, sums.found[i]);
     out.weights[i] = weight;
     for (int c = 0; c < kPriorFeatures; ++c) {
-      out.features[kPriorFeatures * i + c] = vertex_feature(sums, sums.ids[i], c, weight);
+      out.features[kPriorFeatures * i + c] = vertex_feature(sums, sums.found[i], c, weight);
     }
   });
 }

@@ -32,7 +32,10 @@ __global__ void __launch_bounds__(kThreads)
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kThreads;
   for (std::int64_t i = thread; i < sums.slots; i += stride) sums.keys[i] = 0;
   SumCounters& counters = *sums.counters;
-  if (thread == 0) counters.pairs = counters.blocks = counters.listed = counters.overflow = counters.poisoned = 0;
+  if (thread == 0) {
+    counters.pairs = counters.blocks = counters.listed = counters.found = 0;
+    counters.overflow = counters.poisoned = 0;
+  }
   for (std::int64_t i = 6 * gridDim.x + thread; i < 6 * kBoundsRows; i += stride) {
     counters.bounds[i / 6][i % 6] = kInfinity;
   }
@@ -245,9 +248,10 @@ VertexSums lay_out_sums(void* workspace, std::int64_t n, std::int64_t max_points
   take(sums.block_keys, sums.max_blocks);
   take(sums.features, kPriorFeatures * vertices);
   take(sums.weights, vertices);
-  take(sums.ids, vertices);
   take(sums.listed_keys, vertices);
   take(sums.listed, vertices);
+  take(sums.found, vertices);
+  take(sums.found_ids, vertices);
   take(sums.pairs, std::min(n, max_points) * neighborhood);
   take(sums.known, (n + kWarpSize - 1) / kWarpSize);
   *bytes = end;

@@ -26,7 +26,7 @@ constexpr int kBoundsRows = 128;
 
 // What a call counts, and all that the host reads back.
 struct SumCounters {
-  std::uint32_t pairs, blocks, listed;
+  std::uint32_t pairs, blocks, listed, found;
   std::uint32_t overflow;        // the table was too small: nothing but this and the bounds means anything
   std::uint32_t poisoned;        // a feature was too large or not finite
   float bounds[kBoundsRows][6];  // of some finite points the least x, y, z, -x, -y and -z
@@ -40,16 +40,16 @@ struct PointPair {
 // The arrays of one call, on the device. A vertex's number is 64 times its block's, plus its place therein.
 struct VertexSums {
   SumCounters* counters;
-  unsigned long long* keys;         // [slots], packed block coordinates plus one; 0 is empty
-  std::int32_t* blocks;             // [slots], number of the block
-  std::int64_t* block_keys;         // [max_blocks], packed block coordinates
-  unsigned long long* features;     // [max_blocks, 64, 8], units of 1 / feature_scale
-  unsigned long long* weights;      // [max_blocks, 64], units of 1 / weight_scale; 0 where no pair reaches the vertex
-  std::int32_t* ids;                // [max_blocks, 64], for what follows
-  unsigned long long* listed_keys;  // [max_blocks, 64], likewise
-  std::int32_t* listed;             // [max_blocks, 64], likewise
-  PointPair* pairs;                 // [points * neighborhood]
-  std::uint32_t* known;             // one bit for each point: it has a normal
+  unsigned long long* keys;      // [slots], packed block coordinates plus one; 0 is empty
+  std::int32_t* blocks;          // [slots], number of the block
+  std::int64_t* block_keys;      // [max_blocks], packed block coordinates
+  unsigned long long* features;  // [max_blocks, 64, 8], units of 1 / feature_scale
+  unsigned long long* weights;   // [max_blocks, 64], units of 1 / weight_scale; 0 where no pair reaches the vertex
+  // Lists of vertices for what follows, [max_blocks, 64]: those that a volume lacks, and those that it has.
+  unsigned long long* listed_keys;
+  std::int32_t *listed, *found, *found_ids;
+  PointPair* pairs;      // [points * neighborhood]
+  std::uint32_t* known;  // one bit for each point: it has a normal
   std::int64_t slots, max_blocks;
   float feature_scale, weight_scale;
 };
@@ -115,14 +115,17 @@ __device__ inline float vertex_feature(const VertexSums& sums, std::int64_t vert
   return static_cast<float>(units) / sums.feature_scale / weight;
 }
 
-// Appends to the list of vertices, for a whole warp at once.
-__device__ inline void list_vertex(const VertexSums& sums, bool wanted, std::int64_t key, std::int64_t vertex) {
+// A place in a list for each lane of a whole warp that wants one.
+__device__ inline std::uint32_t list_place(bool wanted, std::uint32_t* count) {
   const std::uint32_t all = __ballot_sync(0xffffffffu, wanted);
-  if (all == 0) return;
   const int lane = threadIdx.x % 32;
-  std::uint32_t place = 0;
-  if (lane == 0) place = atomicAdd(&sums.counters->listed, static_cast<std::uint32_t>(__popc(all)));
-  place = __shfl_sync(0xffffffffu, place, 0) + __popc(all & ((1u << lane) - 1u));
+  std::uint32_t first = 0;
+  if (lane == 0 && all != 0) first = atomicAdd(count, static_cast<std::uint32_t>(__popc(all)));
+  return __shfl_sync(0xffffffffu, first, 0) + __popc(all & ((1u << lane) - 1u));
+}
+
+__device__ inline void list_vertex(const VertexSums& sums, bool wanted, std::int64_t key, std::int64_t vertex) {
+  const std::uint32_t place = list_place(wanted, &sums.counters->listed);
   if (!wanted) return;
   sums.listed_keys[place] = static_cast<unsigned long long>(key);
   sums.listed[place] = static_cast<std::int32_t>(vertex);

@@ -138,7 +138,12 @@ class SparseVolume:
         return voxel_ids
 
     def encode(
-        self, points: torch.Tensor, normals: torch.Tensor, encoder_params: torch.Tensor, fusion: ops.FrameFusion
+        self,
+        points: torch.Tensor,
+        normals: torch.Tensor,
+        encoder_params: torch.Tensor,
+        fusion: ops.FrameFusion,
+        tf32: bool = True,
     ) -> ops.EncodedFrame:
         """Allocates the vertices around a frame's points and fuses their encoding, see `ops.encode_frame_`.
 
@@ -147,6 +152,7 @@ class SparseVolume:
             normals: float32 [N, 3], world, unit; 0 = unknown.
             encoder_params: float32 [5128], on the volume's device.
             fusion: settings; of this volume's voxel size.
+            tf32: see `ops.encode_points`.
 
         Raises:
             SpslamError: more than `max_voxels` would exist. The volume is then as before.
@@ -156,7 +162,7 @@ class SparseVolume:
                 self.hash_keys, self.hash_values, self._voxel_coords, self._corner_ids, self._embeddings, self._weights
             )
             room = self.capacity if self.max_voxels is None else min(self.capacity, self.max_voxels)
-            encoded = ops.encode_frame_(buffers, self.num_voxels, room, points, normals, encoder_params, fusion)
+            encoded = ops.encode_frame_(buffers, self.num_voxels, room, points, normals, encoder_params, fusion, tf32)
             wanted = self.num_voxels + encoded.new_voxels
             if encoded.fits:
                 self.num_voxels = wanted
