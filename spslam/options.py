@@ -219,7 +219,7 @@ class Config(Section):
         "`cpu`, `cuda`, `cuda:N`, or `auto`, which is the GPU if there is one", pattern=r"^(auto|cpu|cuda(:\d+)?)$"
     )
     precision: Literal["tf32", "fp32"] = _text(
-        "cuda: how the decoders multiply while tracking (adam) and mapping, `tf32` on matrix units or `fp32`"
+        "cuda: how networks multiply while tracking (adam), encoding and mapping, `tf32` on matrix units or `fp32`"
     )
     dataset: DatasetOptions
     scene: SceneOptions

@@ -31,7 +31,12 @@ class FeatureVolume(Protocol):
     def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor: ...
 
     def encode(
-        self, points: torch.Tensor, normals: torch.Tensor, encoder_params: torch.Tensor, fusion: ops.FrameFusion
+        self,
+        points: torch.Tensor,
+        normals: torch.Tensor,
+        encoder_params: torch.Tensor,
+        fusion: ops.FrameFusion,
+        tf32: bool = True,
     ) -> ops.EncodedFrame: ...
 
 
@@ -42,6 +47,7 @@ def encode_frame(
     prior: Prior | None,
     options: PriorOptions,
     seed: int = 0,
+    tf32: bool = True,
 ) -> ops.EncodedFrame:
     """Encodes a frame's surface points and fuses them into the volume; section III.B and equation (1) of SP-SLAM.
 
@@ -57,6 +63,7 @@ def encode_frame(
         prior: the networks; None for random embeddings.
         options: the configuration's section `prior`.
         seed: of the random embeddings.
+        tf32: how the encoder multiplies on CUDA, see `ops.encode_points`.
 
     Returns:
         How many vertices were new, and the bounds of the points. On CUDA this waits for the device, once.
@@ -81,7 +88,7 @@ def encode_frame(
         options.max_weight,
         fuse_known=options.fusion,
     )
-    return volume.encode(points, normals, prior.encoder_params.to(points.device), fusion)
+    return volume.encode(points, normals, prior.encoder_params.to(points.device), fusion, tf32)
 
 
 def _allocate(

@@ -29,7 +29,10 @@ class Mapper:
             return
         scene = state.scene
         points, normals = ops.unproject_pixels(pixels.records, pixels.normals, state.frames.poses[-1], *self.intrinsics)
-        encoded = encode_frame(scene.volume, points, normals, self._prior(scene), self.config.prior, self.config.seed)
+        tf32 = self.config.precision == "tf32"
+        encoded = encode_frame(
+            scene.volume, points, normals, self._prior(scene), self.config.prior, self.config.seed, tf32
+        )
         margin = torch.tensor([[-1.0], [1.0]]) * self.config.scene.truncation_m
         moved = scene.planes.cover(encoded.bounds + margin)
         if moved is not None and "texels" in state.moments:
