@@ -56,6 +56,7 @@ class TriangleSurface:
             )
         corners = vertices[faces]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        self._vertices, self._faces = vertices, faces[areas > 0]
         self._corners = corners[areas > 0]
         self._areas = areas[areas > 0]
 
@@ -76,7 +77,7 @@ class TriangleSurface:
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices [V,3] and faces [L,3], those of no area left out."""
-        return self._corners.reshape(-1, 3), np.arange(3 * len(self._corners)).reshape(-1, 3)
+        return self._vertices, self._faces
 
     @property
     def area_m2(self) -> float:

@@ -170,7 +170,9 @@ class _Setup:
 
 def _to_camera(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
     T_camera_world = inverse(T_world_camera)
-    return (points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).reshape(-1, 3)
+    # Not @: BLAS would set all cores spinning for products this thin.
+    turned = np.einsum("ij,kj->ik", points.reshape(-1, 3), T_camera_world[:3, :3])
+    return turned + T_camera_world[:3, 3]
 
 
 def _in_view(points: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
