@@ -19,6 +19,7 @@ from spslam.slam.timeline import Mark, StreamMark, mark
 
 # More threads than this decode no faster: they would wait for each other's turn at the interpreter.
 MOST_WORKERS = 16
+LEAST_WORKERS = 2
 LEAST_AHEAD = 8
 
 
@@ -137,6 +138,7 @@ class _Preparation:
 
 
 def automatic_workers(device: torch.device) -> int:
-    """Reading threads for a run on `device`: all cores feed a GPU; beside the kernels on the CPU a few are enough."""
+    """Reading threads for a run on `device`: all cores but the loop's own feed a GPU; beside CPU kernels few will do."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_WORKERS) if device.type == "cuda" else min(max(2, cores // 4), MOST_WORKERS)
+    wanted = cores - 1 if device.type == "cuda" else cores // 4
+    return min(max(wanted, LEAST_WORKERS), MOST_WORKERS)

@@ -10,6 +10,7 @@ from spslam.slam.frame_feed import PreparedFrame, Uploader
 from spslam.slam.frame_report import FrameReport
 from spslam.slam.pixels import sample_frame
 from spslam.slam.system import SlamSystem
+from spslam.slam.timeline import mark
 
 FRAMES = 4
 DEPTH_M = 2.0
@@ -37,6 +38,7 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
         sent = uploader.send(pixels) if uploader else pixels
         reports.append(system.submit(PreparedFrame(index, float(index), sent)).result())
     system.finish()
+    mark(device).wait()
     return reports
 
 
