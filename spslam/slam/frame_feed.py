@@ -15,7 +15,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
 from spslam.slam.pixels import FramePixels, sample_frame
-from spslam.slam.timeline import Mark, StreamMark, mark
+from spslam.slam.timeline import Mark, StreamMark, marker
 
 # More threads than this decode no faster: they would wait for each other's turn at the interpreter.
 MOST_WORKERS = 16
@@ -48,22 +48,26 @@ class Upload:
 
 
 class Uploader:
-    """Copies frames to a CUDA device beside whatever it does; may be used from several threads."""
+    """Copies frames to a CUDA device beside whatever it does; each thread that uses it has a stream of its own."""
 
     def __init__(self, device: torch.device):
         self.device = device
-        self._stream = torch.cuda.Stream(device)
-        self._turn = threading.Lock()
+        self._own = threading.local()
 
     def send(self, pixels: FramePixels) -> Upload:
         """Starts the copy and returns."""
         source = pixels.holding(pixels.buffer.pin_memory())
-        # One after another, so that the marks enclose one copy.
-        with self._turn, torch.cuda.stream(self._stream):
+        stream = self._stream()
+        with torch.cuda.stream(stream):
             buffer = torch.empty(len(source.buffer), dtype=torch.int32, device=self.device)
-            begin = StreamMark(self._stream)
+            begin = StreamMark(stream)
             buffer.copy_(source.buffer, non_blocking=True)
-            return Upload(pixels.holding(buffer), source, begin, StreamMark(self._stream))
+            return Upload(pixels.holding(buffer), source, begin, StreamMark(stream))
+
+    def _stream(self) -> torch.cuda.Stream:
+        if not hasattr(self._own, "stream"):
+            self._own.stream = torch.cuda.Stream(self.device)
+        return self._own.stream
 
 
 @dataclass
@@ -97,7 +101,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         run = config.run
         workers = automatic_workers(device) if run.prefetch_workers is None else run.prefetch_workers
         ahead = max(2 * workers, LEAST_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
-        self._device = device
+        self._mark = marker(device)
         self._reader = prefetch(_Preparation(dataset, config, device, start), workers, ahead)
 
     @property
@@ -106,7 +110,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         return self._reader.read_seconds
 
     def __next__(self) -> PreparedFrame | DatasetError:
-        asked, began = mark(self._device), time.perf_counter()
+        asked, began = self._mark(), time.perf_counter()
         item = next(self._reader)
         if isinstance(item, PreparedFrame):
             item.asked, item.wait_ms = asked, 1e3 * (time.perf_counter() - began)
@@ -138,7 +142,7 @@ class _Preparation:
 
 
 def automatic_workers(device: torch.device) -> int:
-    """Reading threads for a run on `device`: all cores but the loop's own feed a GPU; beside CPU kernels few will do."""
+    """Reading threads for a run on `device`: a GPU is fed by all cores but the loop's, CPU kernels get by with few."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = cores - 1 if device.type == "cuda" else cores // 4
     return min(max(wanted, LEAST_WORKERS), MOST_WORKERS)

@@ -1,6 +1,7 @@
 """The system's whole state, as one explicit object that can be checkpointed."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -68,12 +69,10 @@ class FrameTable:
         if self._count == len(self._columns["poses"]):
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._columns = {name: resize_rows(column, capacity) for name, column in self._columns.items()}
-        row, self._count = self._count, self._count + 1
-        self.poses[row] = pose
-        self.timestamps[row] = timestamp
-        self.indices[row] = index
-        self.lost[row] = lost
-        self.lattices[row] = lattice
+        values: dict[str, Any] = {"poses": pose, "timestamps": timestamp, "indices": index, "lost": lost, "lattices": lattice}
+        for name, value in values.items():
+            self._columns[name][self._count] = value
+        self._count += 1
 
     def matrices(self, first: int = 0) -> np.ndarray:
         """float64 [F, 4, 4] T_world_camera of the rows from `first` on; negative ones count from the end."""

@@ -16,7 +16,7 @@ from spslam.slam.mapper import Mapper
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.rescue import EarlierFrame
 from spslam.slam.state import SlamState, pose_tensor
-from spslam.slam.timeline import Mark, mark
+from spslam.slam.timeline import marker
 from spslam.slam.tracker import Tracker, TrackingResult
 from spslam.trajectory import Trajectory
 
@@ -76,6 +76,7 @@ class SlamSystem:
 
     def submit(self, frame: PreparedFrame) -> PendingReport:
         """Takes the next frame in as `process` does, but waits only for its pose: mapping goes on behind."""
+        self._mark = marker(self.device)
         began = self._mark()
         marks = FrameMarks(asked=frame.asked or began, began=began, done=began)
         pixels = self._receive(frame, marks)
@@ -117,9 +118,6 @@ class SlamSystem:
         frames = self.state.frames
         return Trajectory(frames.timestamps.numpy().copy(), frames.matrices(), frames.lost.numpy().copy())
 
-    def _mark(self) -> Mark:
-        return mark(self.device)
-
     def _receive(self, frame: PreparedFrame, marks: FrameMarks) -> FramePixels:
         if not isinstance(frame.pixels, Upload):
             return frame.pixels.to(self.device)
@@ -138,10 +136,11 @@ class SlamSystem:
 
     def _earlier(self) -> EarlierFrame | None:
         """The last frame with pixels and a pose to be trusted."""
-        rows = self.state.usable.nonzero()[:, 0]
-        if len(rows) == 0:
-            return None
-        return EarlierFrame(self.state.pixels.records[rows[-1]], self.state.frames.poses[rows[-1]])
+        has_pixels, lost = self.state.pixels.has_pixels, self.state.frames.lost
+        for row in reversed(range(len(lost))):
+            if has_pixels[row] and not lost[row]:
+                return EarlierFrame(self.state.pixels.records[row], self.state.frames.poses[row])
+        return None
 
     def _is_mapping_frame(self, number: int) -> bool:
         return number % self.config.mapping.every == 0 or self.state.scene.volume.num_voxels == 0

@@ -2,6 +2,7 @@
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -56,6 +57,9 @@ class StreamMark(Mark):
         return earlier.event.elapsed_time(self.event)
 
 
-def mark(device: torch.device) -> Mark:
-    """When the device has done all it was given so far: on CUDA by this thread's current stream."""
-    return StreamMark(torch.cuda.current_stream(device)) if device.type == "cuda" else HostMark()
+def marker(device: torch.device) -> Callable[[], Mark]:
+    """Makes marks of when the device has done all it was given so far: on CUDA by this thread's current stream."""
+    if device.type != "cuda":
+        return HostMark
+    stream = torch.cuda.current_stream(device)
+    return lambda: StreamMark(stream)

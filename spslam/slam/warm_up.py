@@ -10,7 +10,7 @@ from spslam.slam.frame_feed import PreparedFrame, Uploader
 from spslam.slam.frame_report import FrameReport
 from spslam.slam.pixels import sample_frame
 from spslam.slam.system import SlamSystem
-from spslam.slam.timeline import mark
+from spslam.slam.timeline import marker
 
 FRAMES = 4
 DEPTH_M = 2.0
@@ -38,7 +38,7 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
         sent = uploader.send(pixels) if uploader else pixels
         reports.append(system.submit(PreparedFrame(index, float(index), sent)).result())
     system.finish()
-    mark(device).wait()
+    marker(device)().wait()
     return reports
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from spslam.slam.frame_report import FrameMarks, PendingReport
-from spslam.slam.timeline import mark
+from spslam.slam.timeline import marker
 
 
 class At:
@@ -69,9 +69,10 @@ def test_a_report_is_done_with_the_frames_last_mark():
 
 
 def test_marks_of_a_device_are_in_order(device):
-    first = mark(device)
+    mark = marker(device)
+    first = mark()
     torch.ones(1000, device=device).sum()
-    second = mark(device)
+    second = mark()
     second.wait()
     assert first.has_passed()
     assert second.has_passed()
