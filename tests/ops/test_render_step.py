@@ -136,6 +136,19 @@ def test_losses_and_gradients_are_those_of_the_composition(device, options, gene
         _assert_close(got[name], want[name], rough=options.precision == "tf32")
 
 
+def test_many_rays(device, options, generator):
+    """More than are under way at once, on CUDA several to a warp; against the CPU, which the reference vouches for."""
+    scene = make_scene(generator, random_decoder=False, device=device)
+    rays = _rays(generator, counts=(2600, 1900, 41), device=device)
+    losses, got = _step(scene, rays, options, _gradients(scene))
+    cpu_rays = replace(rays, **{name: getattr(rays, name).cpu() for name in ("pixels", "ray_frames", "poses")})
+    cpu_scene = make_scene(torch.Generator().manual_seed(0), random_decoder=False)
+    want_losses, want = _step(cpu_scene, cpu_rays, options, _gradients(cpu_scene))
+    torch.testing.assert_close(losses.cpu(), want_losses, **_loss_tolerance(options))
+    for name in want:
+        _assert_close(got[name], want[name].double())
+
+
 def test_where_the_scene_means_something(device, options, generator):
     """The corner's own SDF: surfaces are crossed once, so the rendering terms and the mask matter."""
     scene = make_scene(generator, random_decoder=False, device=device)

@@ -193,7 +193,7 @@ class WeightGradients<Precision::kTf32, kWarps> {
   float sums_[kOwned][4][4] = {}, biases_[kOwned][4][4] = {};
 };
 
-// ---- float: lane n holds unit n, its warp every kWarps-th row of the matrices.
+// ---- float: lane n holds unit n, its warp some neighbouring rows of the matrices.
 
 template <int kWarps>
 class WeightGradients<Precision::kFp32, kWarps> {
@@ -252,10 +252,14 @@ class WeightGradients<Precision::kFp32, kWarps> {
   static __device__ __forceinline__ void add_layer(const float (&x)[kTileRows][kStride],
                                                    const float (&d)[kTileRows][Tiles::kWide], int warp, int lane,
                                                    float (&sums)[kRows]) {
+    static_assert(kRows % 4 == 0, "rows are read four at a time");
     for (int row = 0; row < kTileRows; ++row) {
       const float delta = d[row][lane];
 #pragma unroll
-      for (int i = 0; i < kRows; ++i) sums[i] += x[row][warp + kWarps * i] * delta;
+      for (int i = 0; i < kRows; i += 4) {
+        const float4 v = *reinterpret_cast<const float4*>(&x[row][kRows * warp + i]);
+        sums[i] += v.x * delta, sums[i + 1] += v.y * delta, sums[i + 2] += v.z * delta, sums[i + 3] += v.w * delta;
+      }
     }
   }
 
@@ -280,7 +284,7 @@ class WeightGradients<Precision::kFp32, kWarps> {
   template <int kRows, class Store>
   static __device__ __forceinline__ void store_layer(const float (&sums)[kRows], int warp, const Store& store) {
 #pragma unroll
-    for (int i = 0; i < kRows; ++i) store(warp + kWarps * i, sums[i]);
+    for (int i = 0; i < kRows; ++i) store(kRows * warp + i, sums[i]);
   }
 
   float geometry1_[kGeometrySlots / kWarps] = {}, geometry2_[kHidden / kWarps] = {};
