@@ -69,7 +69,13 @@ class FrameTable:
         if self._count == len(self._columns["poses"]):
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._columns = {name: resize_rows(column, capacity) for name, column in self._columns.items()}
-        values: dict[str, Any] = {"poses": pose, "timestamps": timestamp, "indices": index, "lost": lost, "lattices": lattice}
+        values: dict[str, Any] = {
+            "poses": pose,
+            "timestamps": timestamp,
+            "indices": index,
+            "lost": lost,
+            "lattices": lattice,
+        }
         for name, value in values.items():
             self._columns[name][self._count] = value
         self._count += 1

@@ -136,11 +136,13 @@ class SlamSystem:
 
     def _earlier(self) -> EarlierFrame | None:
         """The last frame with pixels and a pose to be trusted."""
-        has_pixels, lost = self.state.pixels.has_pixels, self.state.frames.lost
-        for row in reversed(range(len(lost))):
-            if has_pixels[row] and not lost[row]:
-                return EarlierFrame(self.state.pixels.records[row], self.state.frames.poses[row])
-        return None
+        row, has_pixels, lost = -1, self.state.pixels.has_pixels, self.state.frames.lost
+        if lost[row] or not has_pixels[row]:
+            rows = self.state.usable.nonzero()[:, 0]
+            if len(rows) == 0:
+                return None
+            row = int(rows[-1])
+        return EarlierFrame(self.state.pixels.records[row], self.state.frames.poses[row])
 
     def _is_mapping_frame(self, number: int) -> bool:
         return number % self.config.mapping.every == 0 or self.state.scene.volume.num_voxels == 0
