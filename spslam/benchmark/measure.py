@@ -20,7 +20,8 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
-from spslam.evaluation.finished_run import surface_figures, view_figures
+from spslam.evaluation.finished_run import NOVEL_VIEWS, surface_figures, view_figures
+from spslam.evaluation.mesh import SAMPLES
 from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import ate, rpe
@@ -75,15 +76,17 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
     data = None if job.data is None else Path(job.data)
     dataset = open_dataset(config.dataset, data)
     truth = _true_surface(dataset, job.mesh)
-    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=truth is not None or job.views)
+    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=truth is not None or job.thorough)
     if "peak_gpu_mb" in figures:
         figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
     run = RunOutput.read(folder)
     if run.mesh() is None:
         # A run that was lost throughout has an empty mesh, which is no reason to lose its other figures.
         return figures
-    figures |= {} if truth is None else surface_figures(run, dataset, truth)
-    return {**figures, **view_figures(run, dataset)} if job.views else figures
+    if truth is not None:
+        extent = (SAMPLES, NOVEL_VIEWS) if job.thorough else (SAMPLES // 5, 0)
+        figures |= surface_figures(run, dataset, truth, *extent)
+    return {**figures, **view_figures(run, dataset)} if job.thorough else figures
 
 
 def _true_surface(dataset: RgbdDataset, mesh: str | None) -> Surface | None:

@@ -12,7 +12,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.depth import depth_l1
 from spslam.evaluation.images import psnr_db, ssim
-from spslam.evaluation.mesh import evaluate_surface, observed_mask
+from spslam.evaluation.mesh import SAMPLES, evaluate_surface, observed_mask
 from spslam.evaluation.run_output import Mesh, RunOutput, match_times
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import Alignment, ate, rpe
@@ -39,7 +39,9 @@ def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, fl
     return {**figures, **ate(run.trajectory.poses, run.truth, with_scale=True)} if with_scale else figures
 
 
-def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dict[str, float]:
+def surface_figures(
+    run: RunOutput, dataset: RgbdDataset, truth: Surface, samples: int = SAMPLES, novel_views: int = NOVEL_VIEWS
+) -> dict[str, float]:
     """Accuracy, completeness, F1 and depth from novel views of the run's mesh, as metrics.json names them.
 
     The mesh is carried into the truth's world by the rigid motion that best carries estimated onto true views (camera
@@ -51,6 +53,8 @@ def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dic
     run : with a mesh.
     dataset : the one that the run was over, or that it took its frames from; its depth says what was observed.
     truth : the true surface.
+    samples : points compared each way, 100,000 as in the paper.
+    novel_views : views whose depth is compared; 0 leaves those figures out.
 
     Raises
     ------
@@ -68,12 +72,15 @@ def surface_figures(run: RunOutput, dataset: RgbdDataset, truth: Surface) -> dic
     def observed(points: np.ndarray) -> np.ndarray:
         return observed_mask(points, depths, poses[rows], dataset.camera)
 
+    figures = evaluate_surface(TriangleSurface(vertices, mesh.faces), truth, observed, samples)
+    if not novel_views:
+        return figures
     known = np.flatnonzero(np.isfinite(poses[rows]).all(axis=(1, 2)))
-    views = novel_poses(poses[rows][known], [depths[row] for row in known], dataset.camera, NOVEL_VIEWS)
+    views = novel_poses(poses[rows][known], [depths[row] for row in known], dataset.camera, novel_views)
     height_px = max(round(dataset.camera.height * _NOVEL_WIDTH_PX / dataset.camera.width), 1)
     camera = dataset.camera.resized(_NOVEL_WIDTH_PX, height_px)
-    pairs = novel_depth((vertices, mesh.faces), truth.triangles(), views, camera, observed, NOVEL_VIEWS)
-    return {**evaluate_surface(TriangleSurface(vertices, mesh.faces), truth, observed), **depth_l1(pairs)}
+    pairs = novel_depth((vertices, mesh.faces), truth.triangles(), views, camera, observed, novel_views)
+    return {**figures, **depth_l1(pairs)}
 
 
 def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:

@@ -32,7 +32,7 @@ def tiny_job(method: str = SPSLAM, seed: int = 0, **changes) -> Job:
         "device": "cpu",
         "data": None,
         "mesh": None,
-        "views": False,
+        "thorough": False,
     }
     return Job(**{**values, **changes})
 

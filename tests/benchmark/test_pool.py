@@ -21,7 +21,7 @@ def by_key(*jobs):
 
 
 def test_runs_leave_records_once(tmp_path):
-    jobs = by_key(tiny_job(views=True), tiny_job(GICP))
+    jobs = by_key(tiny_job(thorough=True), tiny_job(GICP))
     reports = []
     outcomes = run_jobs(jobs, tmp_path, PoolOptions(workers=2, threads=1, keep=True), lambda *r: reports.append(r))
     assert [(done, total) for done, total, _ in reports] == [(1, 2), (2, 2)]

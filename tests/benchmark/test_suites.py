@@ -114,7 +114,7 @@ def test_a_key_names_what_decides_on_the_figures():
         tiny_job(frames="0:5"),
         tiny_job(preset="paper"),
         tiny_job(mesh="truth.ply"),
-        tiny_job(views=True),
+        tiny_job(thorough=True),
         tiny_job(options=()),
     ]
     assert len({job.key(), *(other.key() for other in others)}) == 8

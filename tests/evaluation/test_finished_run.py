@@ -50,6 +50,9 @@ def test_perfect_run_has_perfect_figures(output, room):
     assert figures["depth_l1_cm"] < 0.1
     assert figures["depth_l1_coverage"] > 99.9
     assert surface_figures(run, room, room.room) == figures
+    quick = surface_figures(run, room, room.room, samples=2000, novel_views=0)
+    assert quick.keys() == {name for name in figures if not name.startswith("depth_l1")}
+    assert quick["f1_5cm"] > 99.9
 
 
 class WithoutSomeFrames(Subset):

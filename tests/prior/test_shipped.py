@@ -11,8 +11,10 @@ REPRODUCED = 0.05
 VIEWS = ((75, 80, 85),)
 
 
-def test_validation_figures_are_those_of_the_provenance():
-    prior = load_prior()
+@pytest.mark.parametrize("neighborhood", [64, 8])
+def test_validation_figures_are_those_of_the_provenance(neighborhood):
+    prior = load_prior(neighborhood=neighborhood)
+    assert prior.neighborhood == neighborhood
     got = validate(prior.encoder_params, prior.decoder_params, prior.neighborhood, 0.0)
     for name in ("near_mae_mm", "far_mae_mm", "sign_accuracy", "zero_crossing_mm"):
         assert got["mean"][name] == pytest.approx(prior.metadata["validation"]["mean"][name], rel=REPRODUCED)
