@@ -1,6 +1,6 @@
 """How exact the surface is after encoding alone, before any iteration of mapping.
 
-    python benchmarks/prior_accuracy.py [--weights FILE] [--output FILE.json]
+    python -m benchmarks.prior_accuracy [--weights FILE] [--output FILE.json] [--report PAGE.md]
 
 Three frames of a generated room, which the prior never saw, get Gaussian noise on their depth, or a Kinect's errors,
 and are encoded and fused. Then rays through pixels of the three views look for the first zero crossing of the decoded
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,8 @@ import numpy as np
 import torch
 
 from spslam import __version__, ops
+from spslam.benchmark.report import fill_regions
+from spslam.benchmark.tables import Table, to_markdown, to_text
 from spslam.config import Config, load_config
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.depth_noise import kinect_depth
@@ -55,7 +58,7 @@ def measure(prior: Prior, noise: float | str, triples=TRIPLES, seed: int = 0, co
     ``found`` the share of rays that met a crossing; in the seen space within one voxel of the surface ``band_mm``, the
     mean error of the field, and ``covered``, the share with all eight corners; ``voxels``, and ``encode_ms`` a frame.
     """
-    config = config or load_config("demo")
+    config = config or load_config("demo", overrides=[("prior.neighborhood", prior.neighborhood)])
     dataset = GeneratedDataset(frames=max(map(max, triples)) + 1, width=640, height=480, seed=ROOM_SEED)
     parts = [_measure_triple(prior, dataset, triple, noise, seed, config) for triple in triples]
     crossing, band, covered, found = (
@@ -149,29 +152,65 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Surface error after encoding three frames, without any iteration.")
     parser.add_argument("--weights", metavar="FILE", help="weights to measure; the shipped ones if not given")
     parser.add_argument("--output", metavar="FILE", type=Path, help="also write the figures as JSON")
+    parser.add_argument("--report", metavar="PAGE", type=Path, help="put the tables into a page's regions, too")
     parser.add_argument("--noise", metavar="MM", nargs="+", default=[*NOISE_MM, KINECT], help="depth noise, or kinect")
     args = parser.parse_args()
     prior = load_prior(args.weights)
-    print(
-        f"{'noise':>8}{'mean':>8}{'median':>8}{'p95':>8}{'bias':>8}{'band':>8}{'found':>9}{'covered':>9}{'voxels':>9}{'encode':>9}"
-    )
     rows = {}
     for noise in args.noise:
-        row = rows[str(noise)] = measure(prior, noise if noise == KINECT else float(noise))
-        lengths = "".join(f"{row[name]:8.2f}" for name in ("mean_mm", "median_mm", "p95_mm", "bias_mm", "band_mm"))
-        shares = f"{row['found']:9.1%}{row['covered']:9.1%}"
-        print(f"{noise!s:>8}{lengths}{shares}{row['voxels']:9.0f}{row['encode_ms']:6.0f} ms", flush=True)
+        rows[str(noise)] = measure(prior, noise if noise == KINECT else float(noise))
+        print(f"noise {noise}: {rows[str(noise)]['mean_mm']:.2f} mm", file=sys.stderr, flush=True)
+    tables = {"accuracy": accuracy_table(rows), "validation": validation_table(prior)}
+    print(to_text(tables["accuracy"]))
     if args.output:
-        record = {
-            "benchmark": "prior_accuracy",
-            "weights": str(args.weights or "shipped"),
-            "noise_mm": rows,
-            "version": __version__,
-            "torch": torch.__version__,
-            "cpu_kernels": ops.CPU_ISA,
-            "threads": torch.get_num_threads(),
-        }
-        atomic_write(args.output, json.dumps(record, indent=1) + "\n")
+        atomic_write(args.output, json.dumps(_record(args.weights, rows), indent=1) + "\n")
+    if args.report:
+        fill_regions(args.report, "one-shot", {name: to_markdown(table) for name, table in tables.items()})
+
+
+def accuracy_table(rows: dict[str, dict]) -> Table:
+    """One line a noise, from what `measure` gives."""
+    header = ("noise mm", "mean mm", "median mm", "95 % mm", "bias mm", "field mm", "found", "covered", "voxels")
+    lengths = ("mean_mm", "median_mm", "p95_mm", "bias_mm", "band_mm")
+    lines = [
+        (
+            noise,
+            *(f"{row[name]:.2f}" for name in lengths),
+            f"{row['found']:.1%}",
+            f"{row['covered']:.1%}",
+            f"{row['voxels']:.0f}",
+        )
+        for noise, row in rows.items()
+    ]
+    return Table("accuracy", "Surface error before any iteration", "", header, tuple(lines))
+
+
+def validation_table(prior: Prior) -> Table:
+    """The figures in the weights' provenance: solids of kinds that they weren't trained on, 2 mm of noise."""
+    header = ("held out", "0-4 cm mm", "4-8 cm mm", "sign", "crossing mm")
+    lines = [
+        (
+            kind.replace("_", " "),
+            f"{row['near_mae_mm']:.2f}",
+            f"{row['far_mae_mm']:.2f}",
+            f"{row['sign_accuracy']:.2%}",
+            f"{row['zero_crossing_mm']:.2f}",
+        )
+        for kind, row in prior.metadata["validation"].items()
+    ]
+    return Table("validation", "Held-out solids", "", header, tuple(lines))
+
+
+def _record(weights: str | None, rows: dict[str, dict]) -> dict:
+    return {
+        "benchmark": "prior_accuracy",
+        "weights": str(weights or "shipped"),
+        "noise_mm": rows,
+        "version": __version__,
+        "torch": torch.__version__,
+        "cpu_kernels": ops.CPU_ISA,
+        "threads": torch.get_num_threads(),
+    }
 
 
 if __name__ == "__main__":

@@ -23,12 +23,13 @@ _MAX_ITERATIONS = 30
 _NEVER = 1 << 30
 
 
-def require_small_gicp() -> None:
-    """Raises SpslamError, naming the extra to install, where small_gicp is missing."""
+def gicp_off_reason() -> str:
+    """Why the baseline can't run, empty if it can."""
     try:
         import small_gicp  # noqa: F401
-    except ImportError as error:
-        raise SpslamError("the classical baseline needs small_gicp: pip install 'spslam[bench]'") from error
+    except ImportError:
+        return "needs small_gicp: pip install 'spslam[bench]'"
+    return ""
 
 
 class GicpOdometry:
@@ -43,7 +44,8 @@ class GicpOdometry:
     """
 
     def __init__(self, camera: Camera, first_pose: np.ndarray, voxel_m: float = 0.04, threads: int = 1) -> None:
-        require_small_gicp()
+        if reason := gicp_off_reason():
+            raise SpslamError(f"the classical baseline {reason}")
         import small_gicp
 
         self._rays = camera.ray_directions()[::_PIXEL_STEP, ::_PIXEL_STEP].reshape(-1, 3).astype(np.float64)

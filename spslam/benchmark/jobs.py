@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from spslam.benchmark.suites import SPSLAM, Sequence, Suite, Variant
+from spslam.benchmark.gicp import gicp_off_reason
+from spslam.benchmark.suites import GICP, SPSLAM, Sequence, Suite, Variant
 from spslam.config import Config, config_names, load_config
 from spslam.prior.encoder import shipped_weights
 from spslam.slam.checkpoint import fingerprint
@@ -95,7 +96,7 @@ class Plan:
     ----------
     jobs : every run by its key; runs that several studies ask for are there once.
     cells : keys of the runs behind (study, sequence, variant).
-    skipped : sequences that aren't run, and why.
+    skipped : sequences and variants that aren't run, and why.
     """
 
     jobs: dict[str, Job]
@@ -127,6 +128,9 @@ def make_plan(suite: Suite, data: Path | None, device: str) -> Plan:
                 skipped[sequence.name] = reason
                 continue
             for variant in study.variants:
+                if variant.method == GICP and (reason := gicp_off_reason()):
+                    skipped[variant.name] = reason
+                    continue
                 job = replace(_job(sequence, variant, folder, data, device), thorough="psnr_db" in study.columns)
                 wanted = {seeded.key(): seeded for seeded in _seeded(job, suite.seeds)}
                 jobs |= wanted

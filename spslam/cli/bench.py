@@ -60,11 +60,9 @@ def execute(args: argparse.Namespace) -> None:
 
 
 def _run_suite(suite: Any, args: argparse.Namespace) -> None:
-    from spslam.benchmark.gicp import require_small_gicp
     from spslam.benchmark.jobs import make_plan
     from spslam.benchmark.pool import PoolOptions, run_jobs
     from spslam.benchmark.report import describe_gaps, update_page, write_results
-    from spslam.benchmark.suites import GICP
     from spslam.benchmark.summary import summarize
     from spslam.benchmark.tables import to_text
     from spslam.slam.device import resolve_device
@@ -75,8 +73,6 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     if args.list:
         _print_plan(plan)
         return
-    if any(job.method == GICP for job in plan.jobs.values()):
-        require_small_gicp()
     output = args.output or Path("runs") / f"bench-{suite.name}"
     outcomes = run_jobs(
         plan.jobs, output, PoolOptions(args.workers, args.threads, args.keep), None if args.quiet else _print_progress
@@ -124,7 +120,7 @@ def _check_frames(text: str) -> None:
 
 def _print_plan(plan: Any) -> None:
     for key, job in plan.jobs.items():
-        options = ", ".join(f"{name}={value}" for name, value in job.options)
+        options = ", ".join(f"{name}={value}" for name, value in (*job.options, *job.method_options))
         print(f"{key}  {job.method} {job.preset or ''} {job.frames or 'all frames'} {options}".rstrip())
     for name, reason in plan.skipped.items():
         print(f"skipped {name}: {reason}")

@@ -1,5 +1,7 @@
 """The shipped suites, and what the paper prints about them."""
 
+import sys
+
 import pytest
 
 from spslam.benchmark.figures import FIGURES
@@ -98,6 +100,13 @@ def test_without_data_only_what_needs_none_is_planned():
     plan = make_plan(load_suite("quick"), None, "cpu")
     assert {job.sequence for job in plan.jobs.values()} == {"room"}
     assert set(plan.skipped.values()) == {"no --data given"}
+
+
+def test_without_its_package_the_baseline_is_skipped(monkeypatch):
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    plan = make_plan(load_suite("quick", presets=["fast"], sequences=["room"]), None, "cpu")
+    assert [job.method for job in plan.jobs.values()] == ["spslam"]
+    assert plan.skipped == {"GICP odometry, 4 cm": "needs small_gicp: pip install 'spslam[bench]'"}
 
 
 def test_studies_share_their_runs():
