@@ -15,7 +15,12 @@ import spslam
 from spslam import ops
 
 
-def compare(contenders: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
+def compare(
+    contenders: dict[str, Callable[[], object]],
+    rounds: int,
+    device: torch.device,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
     """Median milliseconds of each contender.
 
     They take turns, so that a machine that others use slows all of them alike. Two warm-up turns are not counted.
@@ -24,11 +29,11 @@ def compare(contenders: dict[str, Callable[[], object]], rounds: int, device: to
     for turn in range(rounds + 2):
         for name, function in contenders.items():
             _synchronize(device)
-            start = time.perf_counter()
+            start = clock()
             function()
             _synchronize(device)
             if turn >= 2:
-                times[name].append((time.perf_counter() - start) * 1e3)
+                times[name].append((clock() - start) * 1e3)
     return {name: statistics.median(values) for name, values in times.items()}
 
 

@@ -1,0 +1,152 @@
+"""Each op against whatever else one would write for it, the best alternative first: how many times slower it is.
+
+python -m benchmarks.alternatives --device cpu --threads 2
+python -m benchmarks.alternatives --cpu-time     on a machine that others use: the CPU time of one thread
+"""
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+
+from benchmarks import map_ops, room, timing
+from benchmarks import ops as composable
+from benchmarks.compose import TORCH
+from spslam import ops
+
+SIDE, POINTS, CHANNELS = 64, 88_064, 8  # a dense volume, and as many points in it as a mapping iteration has samples
+DECODER = (11, 32, 1)
+Contenders = dict[str, Callable]
+
+
+def dense_volume(generator: torch.Generator, device: torch.device) -> tuple[list, Contenders]:
+    """A volume that is dense, where grid_sample can be used; the op finds its cells by hash and is charged for it."""
+    cells = ops.VoxelHash(SIDE**3, device)
+    cells.insert(torch.cartesian_prod(*[torch.arange(SIDE, dtype=torch.int32)] * 3).to(device))
+    x, y, z = cells.voxel_coords.long().unbind(1)
+    embeddings = torch.randn(SIDE**3, CHANNELS, generator=generator).to(device)
+    points = (torch.rand(POINTS, 3, generator=generator) * (SIDE - 1)).to(device)
+    order = torch.empty_like(x)
+    order[(x * SIDE + y) * SIDE + z] = torch.arange(len(x), device=device)
+
+    def hashed(embeddings, points):
+        return ops.trilinear_interpolate(embeddings, *cells.lookup(points, 1.0))
+
+    def grid_sample(embeddings, points):
+        grid = embeddings.index_select(0, order).view(SIDE, SIDE, SIDE, CHANNELS).permute(3, 0, 1, 2)[None]
+        return _grid_sample(grid, points.flip(1), SIDE - 1)
+
+    def sampled(grid, points):
+        return _grid_sample(grid, points.flip(1), SIDE - 1)
+
+    grid = embeddings[order].view(SIDE, SIDE, SIDE, CHANNELS).permute(3, 0, 1, 2)[None].contiguous()
+    torch.testing.assert_close(hashed(embeddings, points), grid_sample(embeddings, points), rtol=1e-4, atol=1e-4)
+    return [(embeddings, points), (grid, points)], {"spslam": hashed, "grid_sample": sampled}
+
+
+def _grid_sample(grid: torch.Tensor, points: torch.Tensor, last: int) -> torch.Tensor:
+    scaled = (points * (2 / last) - 1)[None, None, None]
+    sampled = torch.nn.functional.grid_sample(grid, scaled, align_corners=True, padding_mode="border")
+    return sampled[0, :, 0, 0].T
+
+
+def gather_bilinear(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
+    """`bilinear_interpolate` by index and gather."""
+    height, width, channels = texels.shape
+    u, v = uv[:, 0].clamp(0, width - 1), uv[:, 1].clamp(0, height - 1)
+    iu, iv = u.detach().floor().clamp(max=width - 2), v.detach().floor().clamp(max=height - 2)
+    row = (iv * width + iu).long()
+    rows = torch.stack([row, row + 1, row + width, row + width + 1], 1).flatten()
+    fu, fv = u - iu, v - iv
+    weights = torch.stack([(1 - fu) * (1 - fv), fu * (1 - fv), (1 - fu) * fv, fu * fv], 1)
+    gathered = texels.view(-1, channels).index_select(0, rows).view(-1, 4, channels)
+    return torch.bmm(weights[:, None], gathered)[:, 0]
+
+
+def decoder(generator: torch.Generator, device: torch.device) -> tuple[list, Contenders]:
+    """The geometry decoder on a mapping iteration's samples."""
+    inputs, hidden, outputs = DECODER
+    x = torch.randn(POINTS, inputs, generator=generator).to(device)
+    params = (torch.randn(ops.mlp_num_params(*DECODER), generator=generator) / 6).to(device)
+    return [x, params], {
+        "spslam": lambda x, params: ops.mlp(x, params, hidden, outputs, ops.Activation.TANH),
+        "torch.nn.functional.linear": lambda x, params: TORCH.mlp(x, params, outputs, ops.Activation.TANH),
+    }
+
+
+Suite = tuple[str, dict[str, tuple[Callable, list]], Sequence[int]]  # name, contenders with arguments, differentiable
+
+
+def suites(generator: torch.Generator, device: torch.device) -> list[Suite]:
+    """All differentiable ops with their alternatives."""
+    (own, other), dense = dense_volume(generator, device)
+    found: list[Suite] = [
+        (
+            f"trilinear, dense {SIDE}^3, lookup included",
+            {"spslam": (dense["spslam"], list(own)), "grid_sample": (dense["grid_sample"], list(other))},
+            (0, 1),
+        )
+    ]
+    for name, ours, theirs, inputs, differentiable in composable.cases(generator, device):
+        contenders = {"spslam": (ours, inputs), "torch": (theirs, inputs)}
+        if name == "bilinear_interpolate":
+            torch.testing.assert_close(ours(*inputs), gather_bilinear(*inputs), rtol=1e-4, atol=1e-4)
+            contenders = {
+                "spslam": (ours, inputs),
+                "grid_sample": (theirs, inputs),
+                "gather": (gather_bilinear, inputs),
+            }
+        found.append((name, contenders, differentiable))
+    inputs, contenders = decoder(generator, device)
+    found.append(("mlp 11-32-32-1", {name: (function, inputs) for name, function in contenders.items()}, (0, 1)))
+    return found
+
+
+def row(name: str, direction: str, times: dict[str, float], own: str = "spslam") -> dict[str, object]:
+    """Our time, the best alternative and its time as a multiple of ours."""
+    others = {key: value for key, value in times.items() if not key.startswith("spslam")}
+    best = min(others, key=others.__getitem__)
+    return {
+        "op": name,
+        "pass": direction,
+        "spslam ms": times[own],
+        "best alternative": best,
+        "its ms": others[best],
+        "ratio": others[best] / times[own],
+    }
+
+
+def main() -> None:
+    parser = timing.arguments("ops against their best alternatives")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="time of one CPU thread, whatever else the machine does"
+    )
+    args = parser.parse_args()
+    device = torch.device(args.device)
+    timing.use_threads(1 if args.cpu_time else args.threads)
+    clock = time.process_time if args.cpu_time else time.perf_counter
+    compare = functools.partial(timing.compare, rounds=args.rounds, device=device, clock=clock)
+    generator = torch.Generator().manual_seed(0)
+    rows: list[dict[str, object]] = []
+    for name, contenders, differentiable in suites(generator, device):
+        forward = {key: composable.forward(*pair) for key, pair in contenders.items()}
+        rows.append(row(name, "forward", compare(forward)))
+        if differentiable:
+            both = {key: composable.forward_and_backward(*pair, differentiable) for key, pair in contenders.items()}
+            rows.append(row(name, "forward + backward", compare(both)))
+    named = {
+        f"sparse_adam_, {map_ops.TOUCHED} of {map_ops.ROWS} rows": map_ops.adam(generator, device),
+        "normal equations and solution": map_ops.gauss_newton_step(generator, device),
+        **map_ops.hash_contenders(generator, device),
+        "marching_cubes, sphere in 256^3": map_ops.marching_cubes(device),
+    }
+    for name, functions in named.items():
+        times = compare(functions)
+        for own in (key for key in times if key.startswith("spslam")):
+            rows.append(row(name + own.removeprefix("spslam"), "forward", times, own))
+    timing.report(f"{room.FRAMES} frames, {composable.RAYS} rays", rows, device, args.json)
+
+
+if __name__ == "__main__":
+    main()
