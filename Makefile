@@ -52,12 +52,12 @@ test-numpy: dev ## install bindings/numpy and test it against the torch ops
 
 test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined-behaviour sanitizers
 	$(RUN) cmake -S . -B build/asan -G Ninja -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPSLAM_SANITIZE=ON -DSPSLAM_CUDA=OFF \
-	  -DSPSLAM_CPU_ISAS=baseline -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
+	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
 	$(RUN) cmake --build build/asan -j $(JOBS)
 	rm -rf build/asan-site && mkdir build/asan-site
 	cp -r spslam tests configs pyproject.toml build/asan-site && rm -f build/asan-site/spslam/*.so
 	$(RUN) cmake --install build/asan --component python --prefix build/asan-site > /dev/null
-	cd build/asan-site && SPSLAM_CPU_ISA=baseline LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
+	cd build/asan-site && LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops
 
 lint: $(ENVIRONMENT) ## style and types
