@@ -21,24 +21,33 @@ struct FactorTile {
   std::uint32_t low[kPrecision == MlpPrecision::kFloat32 ? 4 : 1];
 };
 
-// sum += a b on a 16 x 8 x 8 product; a plain loop where there are no tensor cores.
+// sum + a b on a 16 x 8 x 8 product where there are no tensor cores. A call of its own: in place a hundred times over
+// it would keep the compiler busy for many minutes.
+__device__ __noinline__ inline float4 multiply_tile_plainly(float4 sum, uint4 a, float2 b) {
+  const int lane = threadIdx.x % kWarpSize, row = lane / 4, column = 2 * (lane % 4);
+#pragma unroll 1
+  for (int k = 0; k < 8; ++k) {
+    const int source = k % 4;
+    const float upper = __shfl_sync(kWholeWarp, __uint_as_float(k < 4 ? a.x : a.z), 4 * row + source);
+    const float lower = __shfl_sync(kWholeWarp, __uint_as_float(k < 4 ? a.y : a.w), 4 * row + source);
+    const float left = __shfl_sync(kWholeWarp, k < 4 ? b.x : b.y, 4 * column + source);
+    const float right = __shfl_sync(kWholeWarp, k < 4 ? b.x : b.y, 4 * (column + 1) + source);
+    sum.x += upper * left;
+    sum.y += upper * right;
+    sum.z += lower * left;
+    sum.w += lower * right;
+  }
+  return sum;
+}
+
+// sum += a b on a 16 x 8 x 8 product.
 __device__ __forceinline__ void multiply_tile(float (&sum)[4], const std::uint32_t (&a)[4], float b0, float b1) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   mma_tf32(sum, a, b0, b1);
 #else
-  const int lane = threadIdx.x % kWarpSize, row = lane / 4, column = 2 * (lane % 4);
-#pragma unroll
-  for (int k = 0; k < 8; ++k) {
-    const int source = k % 4;
-    const float upper = __uint_as_float(__shfl_sync(kWholeWarp, a[k / 4 * 2], 4 * row + source));
-    const float lower = __uint_as_float(__shfl_sync(kWholeWarp, a[k / 4 * 2 + 1], 4 * row + source));
-    const float left = __shfl_sync(kWholeWarp, k < 4 ? b0 : b1, 4 * column + source);
-    const float right = __shfl_sync(kWholeWarp, k < 4 ? b0 : b1, 4 * (column + 1) + source);
-    sum[0] += upper * left;
-    sum[1] += upper * right;
-    sum[2] += lower * left;
-    sum[3] += lower * right;
-  }
+  const float4 result = multiply_tile_plainly(make_float4(sum[0], sum[1], sum[2], sum[3]),
+                                              make_uint4(a[0], a[1], a[2], a[3]), make_float2(b0, b1));
+  sum[0] = result.x, sum[1] = result.y, sum[2] = result.z, sum[3] = result.w;
 #endif
 }
 
