@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.timing import environment
 from spslam import ops
+from spslam.benchmark.environment import describe_environment
 from spslam.config import load_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
@@ -49,7 +49,9 @@ def main() -> None:
     for row in rows:
         print(*(f"{name} {value:.3g}" for name, value in row.items()), sep="  ")
     if args.json:
-        args.json.write_text(json.dumps({**environment(torch.device(args.device)), "rows": rows}, indent=1) + "\n")
+        args.json.write_text(
+            json.dumps({**describe_environment(torch.device(args.device)), "rows": rows}, indent=1) + "\n"
+        )
 
 
 def measure(args: argparse.Namespace) -> dict[tuple[int, int], dict[str, list[bool]]]:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spslam import __version__, ops
+from spslam.benchmark.environment import describe_environment
 from spslam.benchmark.report import fill_regions
 from spslam.benchmark.tables import Table, to_markdown, to_text
 from spslam.config import Config, load_config
@@ -206,10 +206,7 @@ def _record(weights: str | None, rows: dict[str, dict]) -> dict:
         "benchmark": "prior_accuracy",
         "weights": str(weights or "shipped"),
         "noise_mm": rows,
-        "version": __version__,
-        "torch": torch.__version__,
-        "cpu_kernels": ops.CPU_ISA,
-        "threads": torch.get_num_threads(),
+        "environment": describe_environment(torch.device("cpu")),
     }
 
 

@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from benchmarks.timing import environment
 from spslam import ops
+from spslam.benchmark.environment import describe_environment
 from spslam.config import load_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
@@ -56,7 +56,7 @@ def main() -> None:
     print_table(rows)
     if args.json:
         with open(args.json, "w", encoding="utf-8") as file:
-            json.dump({**environment(torch.device("cpu")), "rows": rows}, file, indent=1)
+            json.dump({**describe_environment(torch.device("cpu")), "rows": rows}, file, indent=1)
 
 
 def parse_job(sequence: str, setting: str) -> Job:

@@ -2,17 +2,15 @@
 
 import argparse
 import json
-import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
-import spslam
 from spslam import ops
+from spslam.benchmark.environment import describe_environment
 
 
 def compare(
@@ -58,40 +56,6 @@ def use_threads(threads: int) -> None:
     ops.set_num_threads(threads)
 
 
-def environment(device: torch.device) -> dict[str, object]:
-    """What a result depends on."""
-    return {
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else processor_name(),
-        "threads": torch.get_num_threads(),
-        "isa": ops.CPU_ISA,
-        "spslam": spslam.__version__,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "commit": commit(),
-    }
-
-
-def commit() -> str | None:
-    """The commit measured, with a plus where files differ from it; None outside a repository."""
-    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
-    try:
-        return subprocess.run(
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def processor_name() -> str:
-    """The CPU's model name where the system tells, else its architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
-
-
 def report(title: str, rows: list[dict[str, object]], device: torch.device, path: Path | None) -> None:
     """Prints rows as a table, and writes them with their environment where a path is given."""
     columns = list(rows[0])
@@ -101,4 +65,4 @@ def report(title: str, rows: list[dict[str, object]], device: torch.device, path
     for line in cells:
         print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)))
     if path is not None:
-        path.write_text(json.dumps({"environment": environment(device), "rows": rows}, indent=1) + "\n")
+        path.write_text(json.dumps({"environment": describe_environment(device), "rows": rows}, indent=1) + "\n")

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 import torch
 
 from spslam import ops
-from tests.ops.scenes import INTRINSICS, TRUNCATION, make_scene
+from tests.ops import scene_cases
+from tests.ops.case_inputs import CAMERA, KEY, LAYOUT, SAMPLES, VOXEL, normal, on_device, random_coords, uniform
+from tests.ops.scenes import TRUNCATION
 
-VOXEL = 0.04
-LAYOUT = [0, -3, 2, 7, 5, 35, -3, -1, 7, 4, 63, 2, -1, 5, 4]
-KEY = dict(seed=7, stream=ops.Stream.MAPPING_RAYS, frame=3, iteration=1)
-CAMERA = dict(fx=60.0, fy=60.0, cx=31.5, cy=23.5)
-SAMPLES = 21
 Build = Callable[[torch.Generator, torch.device, int], dict]
 
 
@@ -38,26 +35,10 @@ def arguments(name: str, generator: torch.Generator, device: torch.device | str 
     return CASES[name].build(generator, torch.device(device), rows)
 
 
-def _coords(generator, n, span=4):
-    return torch.randint(-span, span, (n, 3), generator=generator, dtype=torch.int32)
-
-
-def _normal(generator, *shape):
-    return torch.randn(*shape, generator=generator)
-
-
-def _uniform(generator, *shape):
-    return torch.rand(*shape, generator=generator)
-
-
-def _on(device, values):
-    return {name: value.to(device) if isinstance(value, torch.Tensor) else value for name, value in values.items()}
-
-
 def _table(generator, device, n):
     """A table of `n` coordinates, repetitions included: keys, values, coordinates, corner ids."""
     keys, values = ops.new_voxel_hash(1024, device)
-    coords = ops.voxel_hash_insert(keys, values, _coords(generator, n).to(device), 0)
+    coords = ops.voxel_hash_insert(keys, values, random_coords(generator, n).to(device), 0)
     corners = torch.full((len(coords), 8), -1, dtype=torch.int32, device=device)
     ops.voxel_hash_update_corner_ids(keys, values, coords, corners, 0)
     return keys, values, coords, corners
@@ -65,8 +46,8 @@ def _table(generator, device, n):
 
 def _hash(generator, device, n, **more):
     keys, values, coords, corners = _table(generator, device, max(n, 1) * 4)
-    known = dict(hash_keys=keys, hash_values=values, voxel_coords=_coords(generator, n), corner_ids=corners)
-    return _on(device, {name: known.get(name, value) for name, value in more.items()})
+    known = dict(hash_keys=keys, hash_values=values, voxel_coords=random_coords(generator, n), corner_ids=corners)
+    return on_device(device, {name: known.get(name, value) for name, value in more.items()})
 
 
 def _find(generator, device, n):
@@ -88,7 +69,7 @@ def _update_corners(generator, device, n):
 
 
 def _lookup(generator, device, n):
-    points = 0.1 * _normal(generator, n, 3)
+    points = 0.1 * normal(generator, n, 3)
     return _hash(
         generator, device, n, hash_keys=None, hash_values=None, corner_ids=None, points=points, voxel_size=VOXEL
     )
@@ -96,18 +77,18 @@ def _lookup(generator, device, n):
 
 def _trilinear(generator, device, n):
     ids = torch.randint(-1, 40, (n, 8), generator=generator, dtype=torch.int32)
-    return _on(
-        device, dict(embeddings=_normal(generator, 40, 8), corner_ids=ids, local_coords=_uniform(generator, n, 3))
+    return on_device(
+        device, dict(embeddings=normal(generator, 40, 8), corner_ids=ids, local_coords=uniform(generator, n, 3))
     )
 
 
 def _bilinear(generator, device, n):
-    return _on(device, dict(texels=_normal(generator, 6, 9, 5), uv=10 * _uniform(generator, n, 2) - 1))
+    return on_device(device, dict(texels=normal(generator, 6, 9, 5), uv=10 * uniform(generator, n, 2) - 1))
 
 
 def _tri_plane(generator, device, n):
-    points = 0.5 * _uniform(generator, n, 3) - 0.2
-    return _on(device, dict(texels=_normal(generator, 83, 32), points=points, cell_size=VOXEL, layout=LAYOUT))
+    points = 0.5 * uniform(generator, n, 3) - 0.2
+    return on_device(device, dict(texels=normal(generator, 83, 32), points=points, cell_size=VOXEL, layout=LAYOUT))
 
 
 def _uniform_draw(generator, device, n):
@@ -120,71 +101,73 @@ def _index_draw(generator, device, n):
 
 def _along_rays(generator, device, n):
     shape = dict(num_uniform=16, num_surface=5, near=0.2, far=1.02, truncation=TRUNCATION)
-    return _on(device, dict(depth=_uniform(generator, n) + 0.5, **shape, **KEY))
+    return on_device(device, dict(depth=uniform(generator, n) + 0.5, **shape, **KEY))
 
 
 def _frame_pixels(generator, device, n):
     color = torch.randint(0, 256, (48, 64, 3), generator=generator).to(torch.uint8)
     sampling = ops.PixelSampling(n, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, lattice_step=16)
     key = dict(seed=7, stream=ops.Stream.PIXEL_DATABASE, frame=3)
-    return dict(depth=1 + 0.1 * _uniform(generator, 48, 64), color=color, **CAMERA, sampling=sampling, **key)
+    return dict(depth=1 + 0.1 * uniform(generator, 48, 64), color=color, **CAMERA, sampling=sampling, **key)
 
 
 def _samples(generator, n):
-    t = 1 + _uniform(generator, n, SAMPLES).sort(1).values
+    t = 1 + uniform(generator, n, SAMPLES).sort(1).values
     sdf = ((1.5 - t) / TRUNCATION).clamp(-1, 1)
-    return dict(sdf=sdf, color=_uniform(generator, n, SAMPLES, 3), t=t, valid=_uniform(generator, n, SAMPLES) < 0.9)
+    return dict(sdf=sdf, color=uniform(generator, n, SAMPLES, 3), t=t, valid=uniform(generator, n, SAMPLES) < 0.9)
 
 
 def _render(generator, device, n):
-    return _on(device, dict(_samples(generator, n), truncation=TRUNCATION))
+    return on_device(device, dict(_samples(generator, n), truncation=TRUNCATION))
 
 
 def _losses(generator, device, n):
-    samples = _samples(generator, n) | dict(color=_uniform(generator, n, 3), depth=1 + _uniform(generator, n))
+    samples = _samples(generator, n) | dict(color=uniform(generator, n, 3), depth=1 + uniform(generator, n))
     targets = dict(
-        rendered=_uniform(generator, n) < 0.9,
-        target_color=_uniform(generator, n, 3),
-        target_depth=1 + _uniform(generator, n),
-        cosine=_uniform(generator, n),
+        rendered=uniform(generator, n) < 0.9,
+        target_color=uniform(generator, n, 3),
+        target_depth=1 + uniform(generator, n),
+        cosine=uniform(generator, n),
     )
-    return _on(device, samples | targets | dict(truncation=TRUNCATION, cosine_targets=True))
+    return on_device(device, samples | targets | dict(truncation=TRUNCATION, cosine_targets=True))
 
 
 def _mlp(generator, device, n):
-    params = _normal(generator, ops.mlp_num_params(11, 32, 3)) / 6
-    return _on(device, dict(input=_normal(generator, n, 11), params=params, hidden=32, output=3, activation=1))
+    params = normal(generator, ops.mlp_num_params(11, 32, 3)) / 6
+    return on_device(device, dict(input=normal(generator, n, 11), params=params, hidden=32, output=3, activation=1))
 
 
 def _adam(generator, device, n):
     names = ("param", "grad", "exp_avg", "exp_avg_sq")
     stamps = torch.randint(0, 2, (n,), generator=generator, dtype=torch.int32)
-    tables = {name: _uniform(generator, n, 8) for name in names}
-    return _on(device, tables | dict(stamps=stamps, stamp=1, lr=1e-2, step=3))
+    tables = {name: uniform(generator, n, 8) for name in names}
+    return on_device(device, tables | dict(stamps=stamps, stamp=1, lr=1e-2, step=3))
 
 
 def _equations(generator, device, n):
     shapes = dict(residuals=(2, n), jacobians=(2, n, 6), weights=(2, n))
-    return _on(device, {name: _uniform(generator, *shape) for name, shape in shapes.items()})
+    return on_device(device, {name: uniform(generator, *shape) for name, shape in shapes.items()})
 
 
 def _solve(generator, device, n):
-    root = _normal(generator, n, 6, 6)
+    root = normal(generator, n, 6, 6)
     hessian = root @ root.mT + 6 * torch.eye(6)
-    return _on(device, dict(hessian=hessian, gradient=_normal(generator, n, 6), damping=1e-4, absolute_damping=1e-9))
+    return on_device(
+        device, dict(hessian=hessian, gradient=normal(generator, n, 6), damping=1e-4, absolute_damping=1e-9)
+    )
 
 
 def _depth_normals(generator, device, n):
     pixels = torch.randint(0, 48, (n, 2), generator=generator, dtype=torch.int32)
-    image = 1 + 0.1 * _uniform(generator, 48, 64)
-    return _on(device, dict(depth=image, pixels=pixels, **CAMERA, step_px=2, max_jump=0.1))
+    image = 1 + 0.1 * uniform(generator, 48, 64)
+    return on_device(device, dict(depth=image, pixels=pixels, **CAMERA, step_px=2, max_jump=0.1))
 
 
 def _encode(generator, device, n):
-    normals = torch.nn.functional.normalize(_normal(generator, n, 3))
-    params = _normal(generator, ops.ENCODER_PARAMETERS) / 8
-    points = 0.2 * _normal(generator, n, 3)
-    return _on(device, dict(points=points, normals=normals, encoder_params=params, voxel_size=VOXEL))
+    normals = torch.nn.functional.normalize(normal(generator, n, 3))
+    params = normal(generator, ops.ENCODER_PARAMETERS) / 8
+    points = 0.2 * normal(generator, n, 3)
+    return on_device(device, dict(points=points, normals=normals, encoder_params=params, voxel_size=VOXEL))
 
 
 def _encode_frame(generator, device, n):
@@ -203,139 +186,24 @@ def _encode_frame(generator, device, n):
 def _unproject(generator, device, n):
     records = torch.randint(0, 2**30, (n, 3), generator=generator, dtype=torch.int32)
     pose = torch.tensor([1.0, 0, 0, 0, 0.5, 0, 0])
-    return _on(device, dict(records=records, normals=_normal(generator, n, 3), pose=pose, **CAMERA))
+    return on_device(device, dict(records=records, normals=normal(generator, n, 3), pose=pose, **CAMERA))
 
 
 def _fuse(generator, device, n):
     ids = torch.randperm(n + 5, generator=generator)[:n].int()
-    volume = dict(embeddings=_normal(generator, n + 5, 8), weights=_uniform(generator, n + 5))
-    added = dict(voxel_ids=ids, features=_normal(generator, n, 8), feature_weights=_uniform(generator, n))
-    return _on(device, volume | added | dict(max_weight=2.0))
+    volume = dict(embeddings=normal(generator, n + 5, 8), weights=uniform(generator, n + 5))
+    added = dict(voxel_ids=ids, features=normal(generator, n, 8), feature_weights=uniform(generator, n))
+    return on_device(device, volume | added | dict(max_weight=2.0))
 
 
 def _random_embeddings(generator, device, n):
-    return _on(device, dict(voxel_coords=_coords(generator, n), seed=5))
+    return on_device(device, dict(voxel_coords=random_coords(generator, n), seed=5))
 
 
 def _marching_cubes(generator, device, n):
     side = torch.arange(max(n, 1), dtype=torch.int32)
     coords = torch.stack([side, side // 2, side // 3], 1)[:n]
-    return _on(device, dict(cell_coords=coords, values=_normal(generator, n, 4, 4, 4)))
-
-
-def _scene_points(generator, device, n):
-    scene = make_scene(generator, random_decoder=True, device=device)
-    return dict(scene=scene, points=(_uniform(generator, n, 3) * 1.2).to(device))
-
-
-def _records(generator, *shape):
-    """Packed pixels of a 64 x 48 camera, 0.5 to 1.5 m away."""
-    u = torch.randint(0, 64, shape, generator=generator, dtype=torch.int32)
-    v = torch.randint(0, 48, shape, generator=generator, dtype=torch.int32)
-    depth = (0.5 + _uniform(generator, *shape)).view(torch.int32)
-    return torch.stack([u | v << 16, depth, torch.full_like(u, 0x40402010)], -1)
-
-
-POSE = torch.tensor([1.0, 0, 0, 0, 0.02, -0.1, 0.05])
-
-
-def _render_step(generator, device, n):
-    scene = make_scene(generator, random_decoder=True, device=device)
-    rays = ops.RayBatch(
-        pixels=_records(generator, n).to(device),
-        ray_frames=(torch.arange(n, dtype=torch.int32) * 2 // max(n, 1)).to(device),
-        poses=torch.stack([POSE, POSE]).to(device),
-        intrinsics=INTRINSICS,
-    )
-    weights = dict(weight_rgb=5.0, weight_depth=0.1, weight_free_space=10.0, weight_sdf=200.0)
-    options = ops.RenderOptions(16, 5, near=0.2, far=1.02, truncation=TRUNCATION, cosine_targets=True, **weights, **KEY)
-    gradients = ops.SceneGradients(
-        torch.zeros_like(scene.embeddings),
-        torch.zeros(len(scene.embeddings), dtype=torch.int32, device=device),
-        torch.zeros_like(scene.texels),
-        torch.zeros(len(scene.texels), dtype=torch.int32, device=device),
-        stamp=1,
-    )
-    return dict(scene=scene, rays=rays, options=options, gradients=gradients)
-
-
-def _track(generator, device, n):
-    scene = make_scene(generator, random_decoder=True, device=device)
-    steps = dict(num_pixels=32, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4)
-    return dict(
-        scene=scene,
-        pixels=_records(generator, max(n, 1)).to(device),
-        pose=POSE.to(device),
-        intrinsics=INTRINSICS,
-        truncation=TRUNCATION,
-        **steps,
-        **{name: value for name, value in KEY.items() if name != "iteration"},
-    )
-
-
-def _frame_equations(generator, device, n):
-    scene = make_scene(generator, random_decoder=True, device=device)
-    poses = torch.stack([POSE, POSE]).to(device)
-    frames = dict(pixels=_records(generator, 2, n).to(device), poses=poses, intrinsics=INTRINSICS)
-    return dict(scene=scene, **frames, truncation=TRUNCATION, kernel=0.05)
-
-
-def _track_adam(generator, device, n):
-    call = _track(generator, device, n)
-    options = _render_step(generator, device, 1)["options"]
-    steps = dict(num_pixels=32, iterations=2, rotation_rate=1e-3, translation_rate=1e-3)
-    return dict(
-        scene=call["scene"],
-        records=call["pixels"],
-        pose=call["pose"],
-        intrinsics=INTRINSICS,
-        options=options,
-        **steps,
-    )
-
-
-def _optimize_map(generator, device, n):
-    call = _frame_equations(generator, device, max(n, 1))
-    params = call["scene"].geometry_params
-    decoder = ops.AdamMoments(torch.zeros_like(params), torch.zeros_like(params), rate=1e-3)
-    steps = dict(num_pixels=32, iterations=2, fixed_frame=0, first_step=1, first_stamp=1)
-    return dict(
-        scene=call["scene"],
-        records=call["pixels"],
-        poses=call["poses"],
-        frames=torch.tensor([0, 1]),
-        intrinsics=INTRINSICS,
-        options=_render_step(generator, device, 1)["options"],
-        moments=ops.MapMoments(geometry_params=decoder),
-        **steps,
-    )
-
-
-def _predict(generator, device, n):
-    return dict(before=POSE.to(device), last=(POSE + torch.tensor([0, 0, 0, 0, 0.1, 0, 0])).to(device))
-
-
-def _icp(generator, device, n):
-    vertices = _uniform(generator, 6, 8, 3) + torch.tensor([-0.5, -0.5, 1.0])
-    normals = torch.nn.functional.normalize(_normal(generator, 6, 8, 3), dim=-1)
-    points = _uniform(generator, n, 3) + torch.tensor([-0.5, -0.5, 1.0])
-    tensors = dict(points=points, vertices=vertices, normals=normals, pose=POSE)
-    return _on(device, tensors) | dict(intrinsics=ops.Intrinsics(8.0, 8.0, 3.5, 2.5), iterations=3)
-
-
-def _views(generator, device, n):
-    lattices = (1 + _uniform(generator, n, 3, 4)).half()
-    return _on(device, dict(poses=POSE.repeat(n, 1), lattices=lattices)) | dict(intrinsics=INTRINSICS, lattice_step=16)
-
-
-def _overlap(generator, device, n):
-    return dict(points=_normal(generator, n, 3).to(device)) | _views(generator, device, n)
-
-
-def _select(generator, device, n):
-    counts = dict(num_points=20, num_covisible=5, count=9, threshold=0.1, seed=7, frame=3)
-    tensors = _on(device, dict(records=_records(generator, max(n, 1)), candidates=torch.arange(n)))
-    return tensors | dict(current=0) | _views(generator, device, max(n, 1)) | counts
+    return on_device(device, dict(cell_coords=coords, values=normal(generator, n, 4, 4, 4)))
 
 
 CASES = {
@@ -368,16 +236,16 @@ CASES = {
     "fuse_prior_": Case(_fuse),
     "random_embeddings": Case(_random_embeddings, rows=("voxel_coords",)),
     "marching_cubes": Case(_marching_cubes),
-    "query_sdf": Case(_scene_points),
-    "query_sdf_gradient": Case(_scene_points),
-    "query_color": Case(_scene_points),
-    "render_step": Case(_render_step),
-    "track_gauss_newton": Case(_track),
-    "gauss_newton_poses": Case(_frame_equations),
-    "track_adam": Case(_track_adam),
-    "optimize_map_": Case(_optimize_map),
-    "predict_pose": Case(_predict),
-    "projective_icp": Case(_icp),
-    "frame_overlap": Case(_overlap),
-    "select_covisible_frames": Case(_select),
+    "query_sdf": Case(scene_cases.scene_points),
+    "query_sdf_gradient": Case(scene_cases.scene_points),
+    "query_color": Case(scene_cases.scene_points),
+    "render_step": Case(scene_cases.render_step),
+    "track_gauss_newton": Case(scene_cases.track),
+    "gauss_newton_poses": Case(scene_cases.frame_equations),
+    "track_adam": Case(scene_cases.track_adam),
+    "optimize_map_": Case(scene_cases.optimize_map),
+    "predict_pose": Case(scene_cases.predict),
+    "projective_icp": Case(scene_cases.icp),
+    "frame_overlap": Case(scene_cases.overlap),
+    "select_covisible_frames": Case(scene_cases.select),
 }

@@ -1,0 +1,123 @@
+"""Valid calls of the ops that take a whole scene, or frames; see `cases`."""
+
+import torch
+
+from spslam import ops
+from tests.ops.case_inputs import KEY, normal, on_device, uniform
+from tests.ops.scenes import INTRINSICS, TRUNCATION, make_scene
+
+POSE = torch.tensor([1.0, 0, 0, 0, 0.02, -0.1, 0.05])
+
+
+def scene_points(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    return dict(scene=scene, points=(uniform(generator, n, 3) * 1.2).to(device))
+
+
+def pixel_records(generator, *shape):
+    """Packed pixels of a 64 x 48 camera, 0.5 to 1.5 m away."""
+    u = torch.randint(0, 64, shape, generator=generator, dtype=torch.int32)
+    v = torch.randint(0, 48, shape, generator=generator, dtype=torch.int32)
+    depth = (0.5 + uniform(generator, *shape)).view(torch.int32)
+    return torch.stack([u | v << 16, depth, torch.full_like(u, 0x40402010)], -1)
+
+
+def render_step(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = ops.RayBatch(
+        pixels=pixel_records(generator, n).to(device),
+        ray_frames=(torch.arange(n, dtype=torch.int32) * 2 // max(n, 1)).to(device),
+        poses=torch.stack([POSE, POSE]).to(device),
+        intrinsics=INTRINSICS,
+    )
+    weights = dict(weight_rgb=5.0, weight_depth=0.1, weight_free_space=10.0, weight_sdf=200.0)
+    options = ops.RenderOptions(16, 5, near=0.2, far=1.02, truncation=TRUNCATION, cosine_targets=True, **weights, **KEY)
+    gradients = ops.SceneGradients(
+        torch.zeros_like(scene.embeddings),
+        torch.zeros(len(scene.embeddings), dtype=torch.int32, device=device),
+        torch.zeros_like(scene.texels),
+        torch.zeros(len(scene.texels), dtype=torch.int32, device=device),
+        stamp=1,
+    )
+    return dict(scene=scene, rays=rays, options=options, gradients=gradients)
+
+
+def track(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    steps = dict(num_pixels=32, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4)
+    return dict(
+        scene=scene,
+        pixels=pixel_records(generator, max(n, 1)).to(device),
+        pose=POSE.to(device),
+        intrinsics=INTRINSICS,
+        truncation=TRUNCATION,
+        **steps,
+        **{name: value for name, value in KEY.items() if name != "iteration"},
+    )
+
+
+def frame_equations(generator, device, n):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    poses = torch.stack([POSE, POSE]).to(device)
+    frames = dict(pixels=pixel_records(generator, 2, n).to(device), poses=poses, intrinsics=INTRINSICS)
+    return dict(scene=scene, **frames, truncation=TRUNCATION, kernel=0.05)
+
+
+def track_adam(generator, device, n):
+    call = track(generator, device, n)
+    options = render_step(generator, device, 1)["options"]
+    steps = dict(num_pixels=32, iterations=2, rotation_rate=1e-3, translation_rate=1e-3)
+    return dict(
+        scene=call["scene"],
+        records=call["pixels"],
+        pose=call["pose"],
+        intrinsics=INTRINSICS,
+        options=options,
+        **steps,
+    )
+
+
+def optimize_map(generator, device, n):
+    call = frame_equations(generator, device, max(n, 1))
+    params = call["scene"].geometry_params
+    decoder = ops.AdamMoments(torch.zeros_like(params), torch.zeros_like(params), rate=1e-3)
+    steps = dict(num_pixels=32, iterations=2, fixed_frame=0, first_step=1, first_stamp=1)
+    return dict(
+        scene=call["scene"],
+        records=call["pixels"],
+        poses=call["poses"],
+        frames=torch.tensor([0, 1]),
+        intrinsics=INTRINSICS,
+        options=render_step(generator, device, 1)["options"],
+        moments=ops.MapMoments(geometry_params=decoder),
+        **steps,
+    )
+
+
+def predict(generator, device, n):
+    return dict(before=POSE.to(device), last=(POSE + torch.tensor([0, 0, 0, 0, 0.1, 0, 0])).to(device))
+
+
+def icp(generator, device, n):
+    vertices = uniform(generator, 6, 8, 3) + torch.tensor([-0.5, -0.5, 1.0])
+    normals = torch.nn.functional.normalize(normal(generator, 6, 8, 3), dim=-1)
+    points = uniform(generator, n, 3) + torch.tensor([-0.5, -0.5, 1.0])
+    tensors = dict(points=points, vertices=vertices, normals=normals, pose=POSE)
+    return on_device(device, tensors) | dict(intrinsics=ops.Intrinsics(8.0, 8.0, 3.5, 2.5), iterations=3)
+
+
+def views(generator, device, n):
+    lattices = (1 + uniform(generator, n, 3, 4)).half()
+    return on_device(device, dict(poses=POSE.repeat(n, 1), lattices=lattices)) | dict(
+        intrinsics=INTRINSICS, lattice_step=16
+    )
+
+
+def overlap(generator, device, n):
+    return dict(points=normal(generator, n, 3).to(device)) | views(generator, device, n)
+
+
+def select(generator, device, n):
+    counts = dict(num_points=20, num_covisible=5, count=9, threshold=0.1, seed=7, frame=3)
+    tensors = on_device(device, dict(records=pixel_records(generator, max(n, 1)), candidates=torch.arange(n)))
+    return tensors | dict(current=0) | views(generator, device, max(n, 1)) | counts
