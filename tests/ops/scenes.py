@@ -13,6 +13,23 @@ VOXEL = 0.04
 TRUNCATION = 0.08
 INTRINSICS = ops.Intrinsics(60.0, 60.0, 31.5, 23.5)
 WIDTH, HEIGHT = 64, 48
+# The paper's samples and weights.
+OPTIONS = ops.RenderOptions(
+    num_uniform=32,
+    num_surface=11,
+    near=0.2,
+    far=1.02,
+    truncation=TRUNCATION,
+    cosine_targets=True,
+    weight_rgb=10.0,
+    weight_depth=0.1,
+    weight_free_space=20.0,
+    weight_sdf=1000.0,
+    seed=2**33 + 5,
+    stream=ops.Stream.MAPPING_RAYS,
+    frame=3,
+    iteration=7,
+)
 
 
 class Backend(NamedTuple):

@@ -8,25 +8,9 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7, quaternion_to_matrix
-from tests.ops.scenes import BACKENDS, INTRINSICS, POSES, TRUNCATION, Backend, corner_pixels, make_scene
+from tests.ops.scenes import BACKENDS, INTRINSICS, OPTIONS, POSES, TRUNCATION, Backend, corner_pixels, make_scene
 from tests.reference.render_step import PARAMETERS, render_step
 
-OPTIONS = ops.RenderOptions(
-    num_uniform=32,
-    num_surface=11,
-    near=0.2,
-    far=1.02,
-    truncation=TRUNCATION,
-    cosine_targets=True,
-    weight_rgb=10.0,
-    weight_depth=0.1,
-    weight_free_space=20.0,
-    weight_sdf=1000.0,
-    seed=2**33 + 5,
-    stream=ops.Stream.MAPPING_RAYS,
-    frame=3,
-    iteration=7,
-)
 GRADIENTS = dict(
     zip(("poses", *PARAMETERS), ("grad_poses", "embeddings", "grad_geometry", "texels", "grad_color"), strict=True)
 )

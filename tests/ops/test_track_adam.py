@@ -8,24 +8,9 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7
-from tests.ops.scenes import BACKENDS, INTRINSICS, POSES, TRUNCATION, Backend, corner_pixels, make_scene
+from tests.ops.scenes import BACKENDS, INTRINSICS, OPTIONS, POSES, Backend, corner_pixels, make_scene
 
-OPTIONS = ops.RenderOptions(
-    num_uniform=32,
-    num_surface=11,
-    near=0.2,
-    far=1.02,
-    truncation=TRUNCATION,
-    cosine_targets=False,
-    weight_rgb=10.0,
-    weight_depth=0.1,
-    weight_free_space=20.0,
-    weight_sdf=1000.0,
-    seed=77,
-    stream=ops.Stream.TRACKING_RAYS,
-    frame=9,
-    iteration=0,
-)
+RENDER_OPTIONS = replace(OPTIONS, cosine_targets=False, seed=77, stream=ops.Stream.TRACKING_RAYS, frame=9, iteration=0)
 NUM_PIXELS, ITERATIONS = 200, 6
 RATES = dict(rotation_rate=1e-3, translation_rate=2e-3)
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
@@ -46,7 +31,7 @@ def device(backend) -> torch.device:
 
 @pytest.fixture
 def options(backend) -> ops.RenderOptions:
-    return replace(OPTIONS, precision=backend.precision)
+    return replace(RENDER_OPTIONS, precision=backend.precision)
 
 
 def make_problem(device, generator, random_decoder):
@@ -171,4 +156,4 @@ def test_errors(generator, change, error, message):
     scene, records, start = make_problem(torch.device("cpu"), generator, random_decoder=False)
     problem = scene, change.pop("records", records), change.pop("start", start)
     with pytest.raises(error, match="^track_adam: " + message):
-        track(problem, OPTIONS, **change)
+        track(problem, RENDER_OPTIONS, **change)
