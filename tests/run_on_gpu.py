@@ -49,7 +49,7 @@ def _folder_beside_the_package() -> Iterator[Path]:
 
 
 def _files_with_gpu_tests(folder: Path) -> list[str]:
-    command = [sys.executable, "-m", "pytest", "-m", "cuda", "--collect-only", "-q", "tests"]
+    command = [sys.executable, "-m", "pytest", "-m", "cuda", "--collect-only", "-o", "addopts=-q", "tests"]
     listed = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if listed.returncode:
         # A file that can't be imported must not go unseen.

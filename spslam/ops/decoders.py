@@ -68,7 +68,7 @@ def mlp(
     check_tensor("mlp", "input", input, ["N", "I"], FLOATING)
     check(hidden >= 1, "mlp", "hidden", "be at least 1", hidden)
     check(output >= 1, "mlp", "output", "be at least 1", output)
-    check(activation in tuple(Activation), "mlp", "activation", "be 0, 1 or 2", activation)
+    check(int(activation) in (0, 1, 2), "mlp", "activation", "be 0, 1 or 2", activation)
     check_tensor("mlp", "params", params, [mlp_num_params(input.shape[1], hidden, output)], input.dtype, like=input)
     return torch.ops.spslam.mlp(input, params, hidden, output, int(activation))
 

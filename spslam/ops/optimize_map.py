@@ -81,13 +81,16 @@ class MapMoments:
     def check(self, function: str, scene: SceneView, poses: torch.Tensor) -> None:
         """Raises TypeError or ValueError, naming `function`, where a tensor does not fit."""
         params = (scene.embeddings, scene.texels, scene.geometry_params, scene.color_params, poses)
-        for name, moments, param in zip(vars(self), self.all(), params, strict=True):
+        for name, moments, param in zip(_PARAMETERS, self.all(), params, strict=True):
             if moments is not None:
                 moments.check(function, name, param)
 
     def all(self) -> tuple[AdamMoments | None, ...]:
         """In the order of the attributes."""
         return self.embeddings, self.texels, self.geometry_params, self.color_params, self.poses
+
+
+_PARAMETERS = ("embeddings", "texels", "geometry_params", "color_params", "poses")
 
 
 def new_gradient_sums(param: torch.Tensor) -> torch.Tensor:
