@@ -17,13 +17,13 @@ namespace spslam {
 class PackedEncoder {
  public:
   explicit PackedEncoder(const float* params) {
-    const float* p = params;
-    p = transpose(p, kEncoderHidden, kEncoderInputs, kEncoderHidden, w1);
-    p = copy(p, kEncoderHidden, b1);
-    p = transpose(p, kEncoderHidden, kEncoderHidden, kEncoderHidden, w2);
-    p = copy(p, kEncoderHidden, b2);
-    p = transpose(p, kPriorFeatures, kEncoderHidden, kOutputStride, w3);
-    copy(p, kPriorFeatures, b3);
+    constexpr MlpOffsets kAt = kEncoder.offsets();
+    transpose(params + kAt.w1, kEncoderHidden, kEncoderInputs, kEncoderHidden, w1);
+    transpose(params + kAt.w2, kEncoderHidden, kEncoderHidden, kEncoderHidden, w2);
+    transpose(params + kAt.w3, kPriorFeatures, kEncoderHidden, kOutputStride, w3);
+    std::memcpy(b1, params + kAt.b1, sizeof b1);
+    std::memcpy(b2, params + kAt.b2, sizeof b2);
+    std::memcpy(b3, params + kAt.b3, sizeof b3);
   }
 
   static constexpr int kOutputStride = kPriorFeatures > kLanes<float> ? kPriorFeatures : kLanes<float>;
@@ -35,15 +35,10 @@ class PackedEncoder {
   float b3[kPriorFeatures];
 
  private:
-  static const float* copy(const float* from, int count, float* to) {
-    std::memcpy(to, from, count * sizeof(float));
-    return from + count;
-  }
-  static const float* transpose(const float* from, int outputs, int inputs, int stride, float* to) {
+  static void transpose(const float* from, int outputs, int inputs, int stride, float* to) {
     for (int o = 0; o < outputs; ++o) {
       for (int i = 0; i < inputs; ++i) to[i * stride + o] = from[o * inputs + i];
     }
-    return from + outputs * inputs;
   }
 };
 

@@ -13,20 +13,6 @@ std::int64_t gradient_chunk(std::int64_t n) {
   return share > kMinGradientChunk ? share : kMinGradientChunk;
 }
 
-// Where the matrices lie in the flat parameters.
-template <class P>
-struct Parameters {
-  P *w1, *b1, *w2, *b2, *w3, *b3;
-
-  __host__ __device__ Parameters(const MlpShape& s, P* params)
-      : w1(params),
-        b1(w1 + s.hidden * s.input),
-        w2(b1 + s.hidden),
-        b2(w2 + s.hidden * s.hidden),
-        w3(b2 + s.hidden),
-        b3(w3 + s.output * s.hidden) {}
-};
-
 // out[n, o] = relu or activation of w[o] . x[n] + b[o]
 template <class T>
 void layer(Cuda device, std::int64_t n, const T* x, std::int64_t inputs, const T* w, const T* b, std::int64_t outputs,
@@ -79,33 +65,34 @@ std::int64_t mlp_backward_workspace_size(Cuda, const MlpShape& shape, std::int64
 
 template <class Device, class T>
 void mlp(Device device, const MlpShape& shape, const T* input, std::int64_t n, const T* params, T* workspace, T* out) {
-  const Parameters<const T> p(shape, params);
+  const MlpOffsets at = shape.offsets();
   T *h1 = workspace, *h2 = h1 + n * shape.hidden;
-  layer(device, n, input, shape.input, p.w1, p.b1, shape.hidden, true, shape.activation, h1);
-  layer(device, n, h1, shape.hidden, p.w2, p.b2, shape.hidden, true, shape.activation, h2);
-  layer(device, n, h2, shape.hidden, p.w3, p.b3, shape.output, false, shape.activation, out);
+  layer(device, n, input, shape.input, params + at.w1, params + at.b1, shape.hidden, true, shape.activation, h1);
+  layer(device, n, h1, shape.hidden, params + at.w2, params + at.b2, shape.hidden, true, shape.activation, h2);
+  layer(device, n, h2, shape.hidden, params + at.w3, params + at.b3, shape.output, false, shape.activation, out);
 }
 
 template <class Device, class T>
 void mlp_backward(Device device, const MlpShape& shape, const T* grad, const T* input, std::int64_t n, const T* params,
                   T* workspace, T* grad_input, T* grad_params) {
-  const Parameters<const T> p(shape, params);
+  const MlpOffsets at = shape.offsets();
   const std::int64_t units = n * shape.hidden, num_params = shape.num_params();
   T *h1 = workspace, *h2 = h1 + units, *g1 = h2 + units, *g2 = g1 + units, *g3 = g2 + units,
     *partials = g3 + n * shape.output;
   mlp(device, shape, input, n, params, workspace, g3);
   for_each(device, n * shape.output,
            [=] __device__(std::int64_t i) { g3[i] = grad[i] * activation_slope(shape.activation, g3[i]); });
-  layer_backward(device, n, g3, shape.output, p.w3, shape.hidden, h2, g2);
-  layer_backward(device, n, g2, shape.hidden, p.w2, shape.hidden, h1, g1);
+  layer_backward(device, n, g3, shape.output, params + at.w3, shape.hidden, h2, g2);
+  layer_backward(device, n, g2, shape.hidden, params + at.w2, shape.hidden, h1, g1);
   if (grad_input) {
-    layer_backward(device, n, g1, shape.hidden, p.w1, shape.input, static_cast<const T*>(nullptr), grad_input);
+    layer_backward(device, n, g1, shape.hidden, params + at.w1, shape.input, static_cast<const T*>(nullptr),
+                   grad_input);
   }
   if (!grad_params) return;
-  const Parameters<T> partial(shape, partials);
-  layer_weight_gradients(device, n, g1, shape.hidden, input, shape.input, num_params, partial.w1, partial.b1);
-  layer_weight_gradients(device, n, g2, shape.hidden, h1, shape.hidden, num_params, partial.w2, partial.b2);
-  layer_weight_gradients(device, n, g3, shape.output, h2, shape.hidden, num_params, partial.w3, partial.b3);
+  layer_weight_gradients(device, n, g1, shape.hidden, input, shape.input, num_params, partials + at.w1,
+                         partials + at.b1);
+  layer_weight_gradients(device, n, g2, shape.hidden, h1, shape.hidden, num_params, partials + at.w2, partials + at.b2);
+  layer_weight_gradients(device, n, g3, shape.output, h2, shape.hidden, num_params, partials + at.w3, partials + at.b3);
   const std::int64_t chunks = chunk_count(n, gradient_chunk(n));
   for_each(device, num_params, [=] __device__(std::int64_t i) {
     T sum = 0;

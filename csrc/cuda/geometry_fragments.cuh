@@ -18,8 +18,9 @@ class GeometryNetwork {
   // By all threads of a block, which must synchronise before the first use.
   __device__ void load(const float* params) {
     constexpr int kHidden = kDecoderHidden, kInputs = kGeometryDecoder.input;
-    const float *w1 = params, *b1 = w1 + kHidden * kInputs, *w2 = b1 + kHidden, *b2 = w2 + kHidden * kHidden,
-                *w3 = b2 + kHidden;
+    constexpr MlpOffsets kAt = kGeometryDecoder.offsets();
+    const float *w1 = params + kAt.w1, *b1 = params + kAt.b1, *w2 = params + kAt.w2, *b2 = params + kAt.b2,
+                *w3 = params + kAt.w3;
     for (int i = threadIdx.x; i < kPaddedInputs * kHidden; i += blockDim.x) {
       const int k = i / kHidden, n = i % kHidden;
       const float w = k < 8 ? w1[n * kInputs + 3 + k] : k < 11 ? w1[n * kInputs + k - 8] : k == 11 ? b1[n] : 0.0f;
@@ -32,7 +33,7 @@ class GeometryNetwork {
       put(w2_transposed_, n, k, kHidden, kHidden, w2[i]);
     }
     for (int i = threadIdx.x; i < kHidden; i += blockDim.x) b2_[i] = b2[i], w3_[i] = w3[i];
-    if (threadIdx.x == 0) b3_ = w3[kHidden];
+    if (threadIdx.x == 0) b3_ = params[kAt.b3];
   }
 
   // sdf[r] of the lane's samples g and g + 8, all four lanes of a sample alike; keeps in `active` which units fired.

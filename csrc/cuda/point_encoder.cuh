@@ -88,12 +88,9 @@ struct EncoderWeights {
 
   // By the whole block, which must synchronise afterwards.
   __device__ void load(const float* params) {
-    const float* w1 = params;
-    const float* b1 = w1 + kEncoderHidden * kEncoderInputs;
-    const float* w2 = b1 + kEncoderHidden;
-    const float* b2 = w2 + kEncoderHidden * kEncoderHidden;
-    const float* w3 = b2 + kEncoderHidden;
-    const float* b3 = w3 + kPriorFeatures * kEncoderHidden;
+    constexpr MlpOffsets kAt = kEncoder.offsets();
+    const float *w1 = params + kAt.w1, *w2 = params + kAt.w2, *w3 = params + kAt.w3;
+    const float *b1 = params + kAt.b1, *b2 = params + kAt.b2, *b3 = params + kAt.b3;
     for (int i = threadIdx.x; i < kBlocks * kBlock; i += blockDim.x) {
       const int block = i / kBlock, row = i / 2 % kWarpSize / 4, column = i / 2 % 4, half = i % 2;
       // The inputs of the first layer lie in their order; hidden units as an accumulator has them.

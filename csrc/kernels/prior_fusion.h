@@ -90,30 +90,6 @@ SPS_INLINE float fusion_share(float weight, float kappa) {
   return share < 1.0f ? share : 1.0f;
 }
 
-// The encoder's features of one pair: relative position and normal -> 64 -> 64 -> 8, ReLU inside.
-SPS_INLINE void encode_pair(const float* params, const float (&input)[kEncoderInputs],
-                            float (&features)[kPriorFeatures]) {
-  const float* w1 = params;
-  const float* b1 = w1 + kEncoderHidden * kEncoderInputs;
-  const float* w2 = b1 + kEncoderHidden;
-  const float* b2 = w2 + kEncoderHidden * kEncoderHidden;
-  const float* w3 = b2 + kEncoderHidden;
-  const float* b3 = w3 + kPriorFeatures * kEncoderHidden;
-  float hidden[kEncoderHidden];
-  for (int o = 0; o < kEncoderHidden; ++o) {
-    float sum = b1[o];
-    for (int i = 0; i < kEncoderInputs; ++i) sum += w1[o * kEncoderInputs + i] * input[i];
-    hidden[o] = sum < 0.0f ? 0.0f : sum;
-  }
-  for (int c = 0; c < kPriorFeatures; ++c) features[c] = b3[c];
-  for (int o = 0; o < kEncoderHidden; ++o) {
-    float sum = b2[o];
-    for (int i = 0; i < kEncoderHidden; ++i) sum += w2[o * kEncoderHidden + i] * hidden[i];
-    const float unit = sum < 0.0f ? 0.0f : sum;
-    for (int c = 0; c < kPriorFeatures; ++c) features[c] += w3[c * kEncoderHidden + o] * unit;
-  }
-}
-
 // Equation (1) for one number of an embedding: (weight * embedding + share * feature) / (weight + share).
 SPS_INLINE float fused_feature(float embedding, float weight, float feature, float share) {
   return embedding + share / (weight + share) * (feature - embedding);

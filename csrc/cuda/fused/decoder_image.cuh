@@ -18,12 +18,12 @@ constexpr int kPositions = 3, kColors = 3;
 struct FlatDecoder {
   int b1, w2, b2, w3, b3, size;
 };
-constexpr FlatDecoder flat_decoder(int inputs, int outputs) {
-  const int b1 = kHidden * inputs, w2 = b1 + kHidden, b2 = w2 + kHidden * kHidden, w3 = b2 + kHidden;
-  return {b1, w2, b2, w3, w3 + outputs * kHidden, w3 + outputs * kHidden + outputs};
+constexpr FlatDecoder flat_decoder(const MlpShape& shape) {
+  const MlpOffsets at = shape.offsets();
+  return {static_cast<int>(at.b1), static_cast<int>(at.w2), static_cast<int>(at.b2),
+          static_cast<int>(at.w3), static_cast<int>(at.b3), static_cast<int>(at.size)};
 }
-constexpr FlatDecoder kFlatGeometry = flat_decoder(kGeometryInputs, 1), kFlatColor = flat_decoder(kPlaneSlots, kColors);
-static_assert(kFlatGeometry.size == kGeometryDecoder.num_params() && kFlatColor.size == kColorDecoder.num_params());
+constexpr FlatDecoder kFlatGeometry = flat_decoder(kGeometryDecoder), kFlatColor = flat_decoder(kColorDecoder);
 
 // Offsets in the image, in floats.
 struct Image {

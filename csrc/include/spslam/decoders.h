@@ -12,13 +12,21 @@ namespace spslam {
 
 enum class MlpActivation : std::int32_t { kNone = 0, kTanh = 1, kSigmoid = 2 };
 
+// Where the matrices and biases begin in the flat parameters.
+struct MlpOffsets {
+  std::int64_t w1, b1, w2, b2, w3, b3, size;
+};
+
 struct MlpShape {
   std::int64_t input, hidden, output;
   MlpActivation activation;
 
-  constexpr std::int64_t num_params() const {
-    return hidden * (input + 1) + hidden * (hidden + 1) + output * (hidden + 1);
+  constexpr MlpOffsets offsets() const {
+    const std::int64_t b1 = hidden * input, w2 = b1 + hidden;
+    const std::int64_t b2 = w2 + hidden * hidden, w3 = b2 + hidden, b3 = w3 + output * hidden;
+    return {0, b1, w2, b2, w3, b3, b3 + output};
   }
+  constexpr std::int64_t num_params() const { return offsets().size; }
 };
 
 // Elements of T of scratch that the launches below need for n samples.

@@ -5,16 +5,15 @@
 #include <functional>
 
 #include "core/device.h"
+#include "spslam/decoders.h"
 
 namespace spslam {
 
 constexpr int kPriorFeatures = 8;
 constexpr int kEncoderInputs = 6;
 constexpr int kEncoderHidden = 64;
-// W1 [64, 6], b1, W2 [64, 64], b2, W3 [8, 64], b3; row-major, in this order.
-constexpr std::int64_t kEncoderParameters = kEncoderHidden * (kEncoderInputs + 1) +
-                                            kEncoderHidden * (kEncoderHidden + 1) +
-                                            kPriorFeatures * (kEncoderHidden + 1);
+constexpr MlpShape kEncoder{kEncoderInputs, kEncoderHidden, kPriorFeatures, MlpActivation::kNone};
+constexpr std::int64_t kEncoderParameters = kEncoder.num_params();
 
 // A pinhole camera, px.
 struct DepthCamera {
