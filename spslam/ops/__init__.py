@@ -5,7 +5,7 @@ from spslam.ops.covisibility import frame_overlap, select_covisible_frames
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
 from spslam.ops.gauss_newton import gauss_newton_poses, predict_pose, track_gauss_newton
-from spslam.ops.hash_table import VoxelHash
+from spslam.ops.hash_table import VoxelHash, VoxelLimitError
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.marching_cubes import marching_cubes
@@ -49,6 +49,7 @@ __all__ = [
     "SceneView",
     "Stream",
     "VoxelHash",
+    "VoxelLimitError",
     "VolumeBuffers",
     "bilinear_interpolate",
     "depth_normals",

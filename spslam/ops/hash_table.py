@@ -2,7 +2,7 @@
 
 import torch
 
-from spslam.ops._checks import check
+from spslam.ops._checks import check, check_tensor
 from spslam.ops.voxel_hash import (
     new_voxel_hash,
     voxel_hash_build_,
@@ -12,19 +12,46 @@ from spslam.ops.voxel_hash import (
     voxel_hash_update_corner_ids,
 )
 
+_CORNERS = 8
+_NO_VOXEL = -1
+
+
+class VoxelLimitError(RuntimeError):
+    """A `VoxelHash` would hold more voxels than it may.
+
+    Attributes:
+        wanted: voxels there would be.
+        max_voxels: the most there may be.
+    """
+
+    def __init__(self, wanted: int, max_voxels: int):
+        super().__init__(f"VoxelHash: voxels must stay within max_voxels = {max_voxels}, got {wanted}")
+        self.wanted = wanted
+        self.max_voxels = max_voxels
+
 
 class VoxelHash:
     """A set of V voxel vertices, each with an id that it keeps; tables of features have a row for each id.
 
     It holds what the functions `voxel_hash_*` work on, and makes room as the set grows: buffers double, so that growth
-    is amortised. `spslam.scene.SparseVolume` is this with embeddings and fusion weights beside it.
+    is amortised, and a view's memory stays where it is until `capacity` changes. `spslam.scene.SparseVolume` is this
+    with embeddings and fusion weights beside it.
 
     Args:
-        capacity: vertices to make room for at first.
+        capacity: vertices to make room for at first; rounded up to a power of two.
         device: where it lives.
+        max_voxels: most vertices allowed; None for as many as memory holds.
 
     Raises:
-        ValueError: `capacity` below 1.
+        ValueError: `capacity` or `max_voxels` below 1.
+
+    Attributes:
+        num_voxels: V. An op that enters voxels in the buffers itself, as `encode_frame_` does, leaves it to its caller
+            to set.
+        max_voxels: as given.
+        hash_keys, hash_values: the table, with 2 `capacity` slots.
+        coords_buffer: int32 [capacity, 3], the coordinates of all rows, those not yet in use too.
+        corners_buffer: int32 [capacity, 8], the corner ids of all rows, -1 in those not yet in use.
 
     Example:
         >>> cells = VoxelHash()
@@ -36,26 +63,33 @@ class VoxelHash:
         tensor([[0.2500]])
     """
 
-    def __init__(self, capacity: int = 1024, device: torch.device | str = "cpu"):
+    def __init__(self, capacity: int = 1024, device: torch.device | str = "cpu", max_voxels: int | None = None):
         check(capacity >= 1, "VoxelHash", "capacity", "be at least 1", capacity)
+        check(max_voxels is None or max_voxels >= 1, "VoxelHash", "max_voxels", "be at least 1", max_voxels)
         self.num_voxels = 0
-        self.hash_keys, self.hash_values = new_voxel_hash(2 * _power_of_two(capacity), device)
-        self._voxel_coords = torch.empty((0, 3), dtype=torch.int32, device=device)
-        self._corner_ids = torch.empty((0, 8), dtype=torch.int32, device=device)
-        self._reserve(_power_of_two(capacity))
+        self.max_voxels = max_voxels
+        rows = _power_of_two(capacity)
+        self.hash_keys, self.hash_values = new_voxel_hash(2 * rows, device)
+        self.coords_buffer = torch.zeros((rows, 3), dtype=torch.int32, device=device)
+        self.corners_buffer = torch.full((rows, _CORNERS), _NO_VOXEL, dtype=torch.int32, device=device)
 
     def __len__(self) -> int:
         return self.num_voxels
 
     @property
+    def capacity(self) -> int:
+        """Vertices there is room for; tables of as many rows stay valid until it changes."""
+        return self.coords_buffer.shape[0]
+
+    @property
     def voxel_coords(self) -> torch.Tensor:
         """int32 [V, 3], row i the coordinates of id i."""
-        return self._voxel_coords[: self.num_voxels]
+        return self.coords_buffer[: self.num_voxels]
 
     @property
     def corner_ids(self) -> torch.Tensor:
         """int32 [V, 8], the ids of the corners of the cell above each vertex, all -1 where one is missing."""
-        return self._corner_ids[: self.num_voxels]
+        return self.corners_buffer[: self.num_voxels]
 
     def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor:
         """Enters the coordinates that are missing.
@@ -68,18 +102,48 @@ class VoxelHash:
 
         Raises:
             ValueError, TypeError: another shape, dtype or device.
+            VoxelLimitError: more than `max_voxels` would exist. The set is then as before.
             RuntimeError: a coordinate out of range. The set is then as before.
         """
         voxel_ids = self.find(voxel_coords)
         absent = voxel_coords[voxel_ids < 0]
         if absent.shape[0] == 0:
             return voxel_ids
-        self._reserve(self.num_voxels + absent.shape[0])
+        self.reserve(self._voxels_with(absent))
         new = voxel_hash_insert(self.hash_keys, self.hash_values, absent, self.num_voxels)
         first_new, self.num_voxels = self.num_voxels, self.num_voxels + new.shape[0]
-        self._voxel_coords[first_new : self.num_voxels] = new
+        self.coords_buffer[first_new : self.num_voxels] = new
         voxel_hash_update_corner_ids(self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, first_new)
         return self.find(voxel_coords)
+
+    def build(self, voxel_coords: torch.Tensor) -> None:
+        """Replaces the content, as on loading a map: row i of `voxel_coords` becomes id i.
+
+        Args:
+            voxel_coords: int32 [V, 3] in [-2^20, 2^20 - 1], distinct; V = 0 empties the set.
+
+        Raises:
+            ValueError: another shape or device, a coordinate out of range, or one that occurs twice.
+            TypeError: another dtype.
+            VoxelLimitError: more than `max_voxels`.
+
+        On an error the set is as before.
+        """
+        check_tensor("VoxelHash.build", "voxel_coords", voxel_coords, ["V", 3], torch.int32, like=self.hash_keys)
+        rows = voxel_coords.shape[0]
+        self._check_limit(rows)
+        table = new_voxel_hash(2 * max(self.capacity, _power_of_two(rows)), voxel_coords.device)
+        voxel_hash_build_(*table, voxel_coords)
+        ids = torch.arange(rows, dtype=torch.int32, device=voxel_coords.device)
+        distinct = torch.equal(voxel_hash_find(*table, voxel_coords), ids)
+        check(distinct, "VoxelHash.build", "voxel_coords", "be distinct", "a repeated row")
+        self._clear()
+        self.reserve(rows)
+        self.hash_keys.copy_(table[0])
+        self.hash_values.copy_(table[1])
+        self.coords_buffer[:rows] = voxel_coords
+        self.num_voxels = rows
+        voxel_hash_update_corner_ids(self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, 0)
 
     def find(self, voxel_coords: torch.Tensor) -> torch.Tensor:
         """Ids int32 [N] of coordinates int32 [N, 3], -1 where absent; see `voxel_hash_find`."""
@@ -89,18 +153,41 @@ class VoxelHash:
         """Corner ids int32 [N, 8] and local coordinates [N, 3] of points [N, 3] (m); see `voxel_hash_lookup`."""
         return voxel_hash_lookup(self.hash_keys, self.hash_values, self.corner_ids, points, voxel_size)
 
-    def _reserve(self, rows: int) -> None:
-        if rows <= self._voxel_coords.shape[0]:
+    def reserve(self, rows: int) -> None:
+        """Makes room for `rows` vertices, the next power of two of them; the ids and their rows stay.
+
+        Raises:
+            VoxelLimitError: `rows` is above `max_voxels`.
+        """
+        self._check_limit(rows)
+        if rows <= self.capacity:
             return
+        coords, corners = self.voxel_coords, self.corner_ids
         capacity = _power_of_two(rows)
-        coords = self._voxel_coords.new_zeros((capacity, 3))
-        corners = self._corner_ids.new_full((capacity, 8), -1)
-        coords[: self.num_voxels] = self.voxel_coords
-        corners[: self.num_voxels] = self.corner_ids
-        if 2 * capacity > self.hash_keys.shape[0]:
-            self.hash_keys, self.hash_values = new_voxel_hash(2 * capacity, coords.device)
-            voxel_hash_build_(self.hash_keys, self.hash_values, coords[: self.num_voxels])
-        self._voxel_coords, self._corner_ids = coords, corners
+        self.hash_keys, self.hash_values = new_voxel_hash(2 * capacity, coords.device)
+        voxel_hash_build_(self.hash_keys, self.hash_values, coords)
+        self.coords_buffer = coords.new_zeros((capacity, 3))
+        self.corners_buffer = corners.new_full((capacity, _CORNERS), _NO_VOXEL)
+        self.voxel_coords[:] = coords
+        self.corner_ids[:] = corners
+
+    def _check_limit(self, rows: int) -> None:
+        if self.max_voxels is not None and rows > self.max_voxels:
+            raise VoxelLimitError(rows, self.max_voxels)
+
+    def _voxels_with(self, absent: torch.Tensor) -> int:
+        """Voxels after an insertion, or a bound of it that needs no more room: repetitions are counted once only where
+        it matters."""
+        bound = self.num_voxels + absent.shape[0]
+        if bound <= self.capacity and (self.max_voxels is None or bound <= self.max_voxels):
+            return bound
+        return self.num_voxels + torch.unique(absent, dim=0).shape[0]
+
+    def _clear(self) -> None:
+        self.num_voxels = 0
+        self.hash_keys.fill_(-1)
+        self.coords_buffer.zero_()
+        self.corners_buffer.fill_(_NO_VOXEL)
 
 
 def _power_of_two(rows: int) -> int:

@@ -20,7 +20,9 @@ class FeatureVolume(Protocol):
     """What is asked of `spslam.scene.SparseVolume`."""
 
     voxel_size_m: float
-    num_voxels: int
+
+    @property
+    def num_voxels(self) -> int: ...
 
     @property
     def voxel_coords(self) -> torch.Tensor: ...

@@ -1,13 +1,14 @@
 """The sparse feature volume: voxel vertices with an embedding each, growing as the camera moves."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 
 from spslam import ops
 from spslam.errors import SpslamError
 
 FEATURES = 8
-_CORNERS = 8
-_NO_VOXEL = -1
 
 
 def resize_rows(tensor: torch.Tensor, rows: int) -> torch.Tensor:
@@ -31,8 +32,8 @@ def resize_rows(tensor: torch.Tensor, rows: int) -> torch.Tensor:
 class SparseVolume:
     """Voxel vertices at integer coordinates, `world = coords * voxel_size_m`, each with an 8-d embedding.
 
-    Tensors of V = `num_voxels` rows are views of buffers of `capacity` rows that double when they are full, so growth
-    is amortised and a view's memory stays where it is until `capacity` changes.
+    An `ops.VoxelHash`, `cells`, with an embedding and a weight for each of its vertices. Tensors of V = `num_voxels`
+    rows are views of buffers of `capacity` rows: a view's memory stays where it is until `capacity` changes.
 
     Args:
         voxel_size_m: edge of a voxel, metres.
@@ -55,30 +56,40 @@ class SparseVolume:
         if capacity < 1:
             raise ValueError(f"SparseVolume: capacity must be at least 1, got {capacity}")
         self.voxel_size_m = float(voxel_size_m)
-        self.max_voxels = max_voxels
         self.device = torch.device(device)
-        self.num_voxels = 0
-        capacity = _power_of_two(capacity)
-        self.hash_keys, self.hash_values = ops.new_voxel_hash(2 * capacity, self.device)
-        self._voxel_coords = torch.zeros((capacity, 3), dtype=torch.int32, device=self.device)
-        self._corner_ids = torch.full((capacity, _CORNERS), _NO_VOXEL, dtype=torch.int32, device=self.device)
-        self._embeddings = torch.zeros((capacity, FEATURES), device=self.device)
-        self._weights = torch.zeros(capacity, device=self.device)
+        self.cells = ops.VoxelHash(capacity, self.device, max_voxels)
+        self._embeddings = torch.zeros((self.capacity, FEATURES), device=self.device)
+        self._weights = torch.zeros(self.capacity, device=self.device)
+
+    @property
+    def num_voxels(self) -> int:
+        """V, the vertices there are."""
+        return self.cells.num_voxels
 
     @property
     def capacity(self) -> int:
         """Rows reserved; optimiser buffers of as many rows stay valid until it changes."""
-        return self._voxel_coords.shape[0]
+        return self.cells.capacity
+
+    @property
+    def hash_keys(self) -> torch.Tensor:
+        """int64 [2 capacity], see `spslam.ops.voxel_hash`."""
+        return self.cells.hash_keys
+
+    @property
+    def hash_values(self) -> torch.Tensor:
+        """int32 [2 capacity]."""
+        return self.cells.hash_values
 
     @property
     def voxel_coords(self) -> torch.Tensor:
         """int32 [V, 3], row i the coordinates of voxel id i."""
-        return self._voxel_coords[: self.num_voxels]
+        return self.cells.voxel_coords
 
     @property
     def corner_ids(self) -> torch.Tensor:
         """int32 [V, 8], the ids of the cell above each vertex, all -1 where one is missing."""
-        return self._corner_ids[: self.num_voxels]
+        return self.cells.corner_ids
 
     @property
     def embeddings(self) -> torch.Tensor:
@@ -89,6 +100,19 @@ class SparseVolume:
     def weights(self) -> torch.Tensor:
         """float32 [V], the fusion weight gathered so far (W of equation 1), a view."""
         return self._weights[: self.num_voxels]
+
+    @property
+    def buffers(self) -> ops.VolumeBuffers:
+        """All rows, those not yet in use too, as `ops.encode_frame_` takes them."""
+        cells = self.cells
+        return ops.VolumeBuffers(
+            cells.hash_keys,
+            cells.hash_values,
+            cells.coords_buffer,
+            cells.corners_buffer,
+            self._embeddings,
+            self._weights,
+        )
 
     def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor:
         """Allocates the vertices that are missing; their embeddings and weights start at 0.
@@ -102,19 +126,8 @@ class SparseVolume:
         Raises:
             SpslamError: more than `max_voxels` would exist. The volume is then as before.
         """
-        voxel_ids = ops.voxel_hash_find(self.hash_keys, self.hash_values, voxel_coords)
-        absent = voxel_coords[voxel_ids < 0]
-        if absent.shape[0] == 0:
-            return voxel_ids
-        self._make_room(absent)
-        first_new = self.num_voxels
-        new_coords = ops.voxel_hash_insert(self.hash_keys, self.hash_values, absent, first_new)
-        self.num_voxels = first_new + new_coords.shape[0]
-        self._voxel_coords[first_new : self.num_voxels] = new_coords
-        ops.voxel_hash_update_corner_ids(
-            self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, first_new
-        )
-        return ops.voxel_hash_find(self.hash_keys, self.hash_values, voxel_coords)
+        with self._growth("insert"):
+            return self.cells.insert(voxel_coords)
 
     def fuse(
         self, voxel_coords: torch.Tensor, features: torch.Tensor, feature_weights: torch.Tensor, max_weight: float
@@ -158,17 +171,14 @@ class SparseVolume:
             SpslamError: more than `max_voxels` would exist. The volume is then as before.
         """
         while True:
-            buffers = ops.VolumeBuffers(
-                self.hash_keys, self.hash_values, self._voxel_coords, self._corner_ids, self._embeddings, self._weights
-            )
-            room = self.capacity if self.max_voxels is None else min(self.capacity, self.max_voxels)
-            encoded = ops.encode_frame_(buffers, self.num_voxels, room, points, normals, encoder_params, fusion, tf32)
-            wanted = self.num_voxels + encoded.new_voxels
+            known, limit = self.num_voxels, self.cells.max_voxels
+            room = self.capacity if limit is None else min(self.capacity, limit)
+            encoded = ops.encode_frame_(self.buffers, known, room, points, normals, encoder_params, fusion, tf32)
             if encoded.fits:
-                self.num_voxels = wanted
+                self.cells.num_voxels = known + encoded.new_voxels
                 return encoded
-            self._check_limit("encode", wanted)
-            self._reserve(wanted)
+            with self._growth("encode"):
+                self.cells.reserve(known + encoded.new_voxels)
 
     def lookup(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The cell around each point.
@@ -179,9 +189,7 @@ class SparseVolume:
         Returns:
             corner_ids int32 [N, 8], local_coords [N, 3] in [0, 1], and valid bool [N]: all eight corners exist.
         """
-        corner_ids, local_coords = ops.voxel_hash_lookup(
-            self.hash_keys, self.hash_values, self.corner_ids, points, self.voxel_size_m
-        )
+        corner_ids, local_coords = self.cells.lookup(points, self.voxel_size_m)
         return corner_ids, local_coords, corner_ids[:, 0] >= 0
 
     def interpolate(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -208,59 +216,34 @@ class SparseVolume:
             weights: float32 [V].
 
         Raises:
-            ValueError: shapes that don't fit each other, or a coordinate out of range.
-            SpslamError: a coordinate occurs twice, or V is above `max_voxels`.
+            ValueError: shapes that don't fit each other, or a coordinate that is out of range or occurs twice.
+            SpslamError: V is above `max_voxels`.
+
+        On an error the volume is as before.
         """
         rows = voxel_coords.shape[0]
         _check_rows("voxel_coords", voxel_coords, (rows, 3))
         _check_rows("embeddings", embeddings, (rows, FEATURES))
         _check_rows("weights", weights, (rows,))
-        self._check_limit("restore", rows)
-        self.num_voxels = 0
-        self._reserve(rows)
-        self._voxel_coords[:rows] = voxel_coords
-        ops.voxel_hash_build_(self.hash_keys, self.hash_values, self._voxel_coords[:rows])
-        found = ops.voxel_hash_find(self.hash_keys, self.hash_values, self._voxel_coords[:rows])
-        if not torch.equal(found, torch.arange(rows, dtype=torch.int32, device=self.device)):
-            self.hash_keys.fill_(-1)
-            raise SpslamError("SparseVolume.restore: voxel_coords must be distinct, got a repeated row")
-        self.num_voxels = rows
+        with self._growth("restore"):
+            self.cells.build(voxel_coords.to(self.device))
         for buffer, values in ((self._embeddings, embeddings), (self._weights, weights)):
             buffer[:rows] = values
             buffer[rows:] = 0
-        self._corner_ids.fill_(_NO_VOXEL)
-        ops.voxel_hash_update_corner_ids(self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, 0)
 
-    def _make_room(self, absent: torch.Tensor) -> None:
-        """Reserves rows for the distinct ones of `absent`, counted only where the simple bound is not enough."""
-        wanted = self.num_voxels + absent.shape[0]
-        if wanted > self.capacity or (self.max_voxels is not None and wanted > self.max_voxels):
-            wanted = self.num_voxels + torch.unique(absent, dim=0).shape[0]
-        self._check_limit("insert", wanted)
-        self._reserve(wanted)
-
-    def _check_limit(self, function: str, wanted: int) -> None:
-        if self.max_voxels is not None and wanted > self.max_voxels:
+    @contextmanager
+    def _growth(self, function: str) -> Iterator[None]:
+        """Gives embeddings and weights the room that the cells make; says of a limit met where a user sets it."""
+        try:
+            yield
+        except ops.VoxelLimitError as error:
             raise SpslamError(
-                f"SparseVolume.{function}: voxels must stay within scene.max_voxels = {self.max_voxels}, "
-                f"got {wanted}; raise it or choose a larger scene.voxel_size_m"
-            )
-
-    def _reserve(self, rows: int) -> None:
-        if rows <= self.capacity:
-            return
-        capacity = _power_of_two(rows)
-        self._voxel_coords = resize_rows(self._voxel_coords, capacity)
-        self._embeddings = resize_rows(self._embeddings, capacity)
-        self._weights = resize_rows(self._weights, capacity)
-        self._corner_ids = resize_rows(self._corner_ids, capacity)
-        self._corner_ids[self.num_voxels :] = _NO_VOXEL
-        self.hash_keys, self.hash_values = ops.new_voxel_hash(2 * capacity, self.device)
-        ops.voxel_hash_build_(self.hash_keys, self.hash_values, self.voxel_coords)
-
-
-def _power_of_two(rows: int) -> int:
-    return 1 << max(rows - 1, 0).bit_length()
+                f"SparseVolume.{function}: voxels must stay within scene.max_voxels = {error.max_voxels}, "
+                f"got {error.wanted}; raise it or choose a larger scene.voxel_size_m"
+            ) from None
+        finally:
+            self._embeddings = resize_rows(self._embeddings, self.capacity)
+            self._weights = resize_rows(self._weights, self.capacity)
 
 
 def _check_rows(argument: str, tensor: torch.Tensor, shape: tuple[int, ...]) -> None:

@@ -35,20 +35,13 @@ def wall(count, generator, extent=3.0):
 def encode(volume, points, normals, params, fusion=FUSION, tf32=False):
     """One call, with room made as needed; tf32 where asked."""
     while True:
-        buffers = ops.VolumeBuffers(
-            volume.hash_keys,
-            volume.hash_values,
-            volume._voxel_coords,
-            volume._corner_ids,
-            volume._embeddings,
-            volume._weights,
-        )
         arguments = (x.to(volume.device) for x in (points, normals, params))
-        encoded = ops.encode_frame_(buffers, volume.num_voxels, volume.capacity, *arguments, fusion, tf32)
+        encoded = ops.encode_frame_(volume.buffers, volume.num_voxels, volume.capacity, *arguments, fusion, tf32)
         if encoded.fits:
-            volume.num_voxels += encoded.new_voxels
+            volume.cells.num_voxels += encoded.new_voxels
             return encoded
-        volume._reserve(volume.num_voxels + encoded.new_voxels)
+        with volume._growth("encode"):
+            volume.cells.reserve(volume.num_voxels + encoded.new_voxels)
 
 
 def compose(volume, points, normals, params, fusion=FUSION):
@@ -211,16 +204,14 @@ def test_without_room_nothing_changes(device, generator):
     encode(volume, *wall(3000, generator), params)
     before = content(volume)
     keys, values = volume.hash_keys.clone(), volume.hash_values.clone()
-    buffers = ops.VolumeBuffers(
-        keys, values, *(volume._voxel_coords, volume._corner_ids, volume._embeddings, volume._weights)
-    )
+    buffers = dataclasses.replace(volume.buffers, hash_keys=keys, hash_values=values)
     points, normals = (x.to(device) for x in wall(3000, generator))
     full = ops.encode_frame_(
         buffers, volume.num_voxels, volume.num_voxels, points + 1, normals, params.to(device), FUSION
     )
     assert not full.fits
     assert full.new_voxels > 1000
-    volume.max_voxels = volume.num_voxels + 10
+    volume.cells.max_voxels = volume.num_voxels + 10
     with pytest.raises(SpslamError, match=r"SparseVolume.encode: voxels must stay within scene.max_voxels = \d+, got"):
         volume.encode(points + 1, normals, params.to(device), FUSION)
     assert torch.equal(keys, volume.hash_keys)
@@ -243,14 +234,7 @@ def test_a_broken_network_gives_nan_on_cuda(generator):
 def test_wrong_arguments_are_named(generator):
     params, (points, normals) = random_encoder(generator), wall(4, generator)
     volume = SparseVolume(0.04, capacity=64)
-    buffers = ops.VolumeBuffers(
-        volume.hash_keys,
-        volume.hash_values,
-        volume._voxel_coords,
-        volume._corner_ids,
-        volume._embeddings,
-        volume._weights,
-    )
+    buffers = volume.buffers
 
     def call(buffers=buffers, used=0, limit=64, points=points, normals=normals, params=params, **change):
         ops.encode_frame_(buffers, used, limit, points, normals, params, dataclasses.replace(FUSION, **change))
@@ -268,11 +252,11 @@ def test_wrong_arguments_are_named(generator):
         ({"kappa": 0}, "kappa must be positive, got 0"),
         ({"max_weight": 0}, "max_weight must be positive, got 0"),
         (
-            {"buffers": dataclasses.replace(buffers, corner_ids=volume._corner_ids[1:])},
+            {"buffers": dataclasses.replace(buffers, corner_ids=buffers.corner_ids[1:])},
             r"corner_ids must have shape \[64, 8\], got \[63, 8\]",
         ),
         (
-            {"buffers": dataclasses.replace(buffers, hash_keys=volume.hash_keys[1:])},
+            {"buffers": dataclasses.replace(buffers, hash_keys=buffers.hash_keys[1:])},
             "hash_keys must have a power of two of slots, got 127",
         ),
     ):
@@ -284,12 +268,11 @@ def test_wrong_arguments_are_named(generator):
 
 def test_opcheck(device, generator):
     volume = SparseVolume(0.04, device=device)
-    tensors = volume.hash_keys, volume.hash_values, volume._voxel_coords, volume._corner_ids
+    tensors = [getattr(volume.buffers, field.name) for field in dataclasses.fields(volume.buffers)]
     points, normals = (x.to(device) for x in wall(50, generator))
     numbers = (0.04, 64, 1e-4, 8000, 0.006, 2.5, 20.0, True, True)
     torch.library.opcheck(
         torch.ops.spslam.encode_frame_,
-        (*tensors, volume._embeddings, volume._weights, 0, 1 << 16, points, normals)
-        + (random_encoder(generator).to(device), *numbers, torch.empty(2, 3)),
+        (*tensors, 0, 1 << 16, points, normals) + (random_encoder(generator).to(device), *numbers, torch.empty(2, 3)),
         test_utils=("test_schema", "test_autograd_registration"),
     )

@@ -56,3 +56,54 @@ def test_out_of_range_leaves_it_as_it_was(device):
 def test_capacity_is_checked():
     with pytest.raises(ValueError, match="VoxelHash: capacity must be at least 1, got 0"):
         ops.VoxelHash(capacity=0)
+
+
+def test_the_limit_leaves_it_as_it_was(device):
+    cells = ops.VoxelHash(capacity=2, device=device, max_voxels=10)
+    cells.insert(cube(0, 2).to(device))
+    cells.insert(cube(0, 2).repeat(3, 1).to(device))
+    message = "VoxelHash: voxels must stay within max_voxels = 10, got 27"
+    with pytest.raises(ops.VoxelLimitError, match=message) as error:
+        cells.insert(cube(0, 3).repeat(2, 1).to(device))
+    assert (error.value.wanted, error.value.max_voxels) == (27, 10)
+    with pytest.raises(ops.VoxelLimitError, match=message):
+        cells.build(cube(0, 3).to(device))
+    assert cells.find(cube(0, 2).to(device)).tolist() == list(range(8))
+    assert cells.capacity == 8
+    with pytest.raises(ValueError, match="VoxelHash: max_voxels must be at least 1, got 0"):
+        ops.VoxelHash(max_voxels=0)
+
+
+def test_built_it_is_the_same_as_grown(device, generator):
+    grown, built = ops.VoxelHash(capacity=4, device=device), ops.VoxelHash(capacity=4, device=device)
+    for part in torch.randint(-9, 9, (900, 3), generator=generator, dtype=torch.int32).to(device).split(300):
+        grown.insert(part)
+    built.insert(cube(30, 33).to(device))
+    where = built.corners_buffer.data_ptr()
+    built.build(cube(40, 42).to(device))
+    assert built.corners_buffer.data_ptr() == where
+    built.build(grown.voxel_coords)
+    for name in ("num_voxels", "capacity"):
+        assert getattr(built, name) == getattr(grown, name)
+    for name in ("voxel_coords", "corner_ids"):
+        assert torch.equal(getattr(built, name), getattr(grown, name))
+    assert torch.equal(built.insert(cube(-12, 12).to(device)), grown.insert(cube(-12, 12).to(device)))
+    built.build(cube(0, 0).to(device))
+    assert len(built) == 0
+    assert (built.find(cube(40, 42).to(device)) == -1).all()
+
+
+@pytest.mark.parametrize(
+    "rows, message",
+    [
+        ([[1, 1, 1], [2, 2, 2], [1, 1, 1]], "VoxelHash.build: voxel_coords must be distinct, got a repeated row"),
+        ([[1, 1, 1], [0, 2**20, 0]], r"voxel_coords must lie in \[-2\^20, 2\^20 - 1\]"),
+    ],
+)
+def test_what_cannot_be_built_leaves_it_as_it_was(device, rows, message):
+    cells = ops.VoxelHash(capacity=2, device=device)
+    cells.insert(cube(0, 2).to(device))
+    with pytest.raises(ValueError, match=message):
+        cells.build(torch.tensor(rows, dtype=torch.int32, device=device))
+    assert cells.find(cube(0, 2).to(device)).tolist() == list(range(8))
+    assert cells.corner_ids[0].tolist() == [0, 4, 2, 6, 1, 5, 3, 7]

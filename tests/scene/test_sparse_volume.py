@@ -99,7 +99,7 @@ def test_restore_keeps_the_ids_of_a_grown_volume(device, generator):
 def test_restore_refuses_what_does_not_fit(device):
     volume = SparseVolume(0.04, device=device, max_voxels=2)
     twice = torch.zeros(2, 3, dtype=torch.int32)
-    with pytest.raises(SpslamError, match=r"restore: voxel_coords must be distinct, got a repeated row"):
+    with pytest.raises(ValueError, match=r"voxel_coords must be distinct, got a repeated row"):
         volume.restore(twice, torch.zeros(2, 8), torch.zeros(2))
     with pytest.raises(ValueError, match=r"restore: embeddings must have shape \[2, 8\], got \[3, 8\]"):
         volume.restore(twice, torch.zeros(3, 8), torch.zeros(2))
@@ -146,3 +146,15 @@ def test_resize_rows(generator):
 def test_wrong_sizes_are_named(arguments, message):
     with pytest.raises(ValueError, match=f"SparseVolume: {message}"):
         SparseVolume(**arguments)
+
+
+def test_a_failed_insertion_leaves_a_volume_that_works(device, generator):
+    """Room may have been made by then: all rows must have it."""
+    volume = SparseVolume(0.04, device=device, capacity=4)
+    coords = random_coords(300, 6, generator, device)
+    with pytest.raises(RuntimeError, match="rows outside"):
+        volume.insert(torch.cat([coords, torch.full_like(coords[:1], 2**20)]))
+    assert volume.num_voxels == 0
+    assert volume.buffers.rows == volume.capacity
+    volume.fuse(coords[:1], torch.ones(1, 8, device=device), torch.ones(1, device=device), 2.0)
+    assert volume.embeddings.tolist() == [[1.0] * 8]
