@@ -48,6 +48,8 @@ function(spslam_op_library name)
   add_library(${name} MODULE ${SPSLAM_BINDING_SOURCES})
   target_include_directories(${name} SYSTEM PRIVATE ${SPSLAM_TORCH_DIR}/include)
   target_compile_definitions(${name} PRIVATE TORCH_TARGET_VERSION=${SPSLAM_TORCH_TARGET})
+  # Messages name files from here on, not the folders of the machine that built them.
+  target_compile_options(${name} PRIVATE -fmacro-prefix-map=${CMAKE_CURRENT_SOURCE_DIR}/=)
   target_link_options(${name} PRIVATE -Wl,--exclude-libs,ALL)
   if(NOT SPSLAM_SANITIZE)  # the sanitizers' own functions come from the process
     target_link_options(${name} PRIVATE -Wl,-z,defs)

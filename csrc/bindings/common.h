@@ -17,6 +17,8 @@
 #include <cstdint>
 #include <exception>
 #include <optional>
+#include <sstream>
+#include <stdexcept>
 #include <tuple>
 #include <vector>
 
@@ -28,6 +30,20 @@ namespace spslam::bindings {
 using torch::headeronly::ScalarType;
 using torch::stable::contiguous;
 using torch::stable::Tensor;
+
+template <class... Words>
+[[noreturn]] void fail(const Words&... words) {
+  std::ostringstream text;
+  (text << ... << words);
+  throw std::runtime_error(text.str());
+}
+
+// Unless `condition` holds, a RuntimeError of these words alone: torch's own check begins with a file of the machine
+// that built it.
+#define SPS_CHECK(condition, ...)                          \
+  do {                                                     \
+    if (!(condition)) spslam::bindings::fail(__VA_ARGS__); \
+  } while (false)
 
 #ifdef SPS_CUDA
 #define SPS_DISPATCH_KEY CUDA
@@ -89,17 +105,15 @@ struct ScalarTypeOf<std::uint8_t> {
 // Read access. The tensor must be contiguous: take it through contiguous() first.
 template <class T>
 const T* data(const Tensor& tensor) {
-  STD_TORCH_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value,
-                  "spslam: tensor of another dtype than the kernel reads");
+  SPS_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value, "spslam: tensor of another dtype than the kernel reads");
   return static_cast<const T*>(tensor.const_data_ptr());
 }
 
 // Write access to an output or an in-place argument.
 template <class T>
 T* mutable_data(const Tensor& tensor) {
-  STD_TORCH_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value,
-                  "spslam: tensor of another dtype than the kernel writes");
-  STD_TORCH_CHECK(tensor.is_contiguous(), "spslam: an in-place argument must be contiguous");
+  SPS_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value, "spslam: tensor of another dtype than the kernel writes");
+  SPS_CHECK(tensor.is_contiguous(), "spslam: an in-place argument must be contiguous");
   return static_cast<T*>(tensor.mutable_data_ptr());
 }
 
@@ -119,7 +133,7 @@ void dispatch_floating(const char* function, const Tensor& tensor, F&& f) {
   } else if (tensor.scalar_type() == ScalarType::Double) {
     f(double{});
   } else {
-    STD_TORCH_CHECK(false, function, ": tensors must be float32 or float64");
+    SPS_CHECK(false, function, ": tensors must be float32 or float64");
   }
 }
 

@@ -11,11 +11,10 @@ class ViewsArgument {
   ViewsArgument(const char* function, const Tensor& poses, const Tensor& lattices,
                 const std::vector<double>& intrinsics, std::int64_t step)
       : poses_(torch::stable::contiguous(poses)), lattices_(torch::stable::contiguous(lattices)) {
-    STD_TORCH_CHECK(poses.dim() == 2 && poses.size(1) == kPoseSize, function, ": poses must have shape [F, 7]");
-    STD_TORCH_CHECK(
-        lattices.dim() == 3 && lattices.size(0) == poses.size(0) && lattices.scalar_type() == ScalarType::Half,
-        function, ": lattices must be float16 of shape [F, h, w]");
-    STD_TORCH_CHECK(step >= 1, function, ": lattice_step must be >= 1");
+    SPS_CHECK(poses.dim() == 2 && poses.size(1) == kPoseSize, function, ": poses must have shape [F, 7]");
+    SPS_CHECK(lattices.dim() == 3 && lattices.size(0) == poses.size(0) && lattices.scalar_type() == ScalarType::Half,
+              function, ": lattices must be float16 of shape [F, h, w]");
+    SPS_CHECK(step >= 1, function, ": lattice_step must be >= 1");
     views = {data<float>(poses_),
              static_cast<const std::uint16_t*>(lattices_.const_data_ptr()),
              poses.size(0),
@@ -33,7 +32,7 @@ class ViewsArgument {
 
 Tensor frame_overlap(Tensor points, Tensor poses, Tensor lattices, std::vector<double> intrinsics,
                      std::int64_t lattice_step) {
-  STD_TORCH_CHECK(points.dim() == 2 && points.size(1) == 3, "frame_overlap: points must have shape [N, 3]");
+  SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "frame_overlap: points must have shape [N, 3]");
   DeviceScope scope(points);
   const ViewsArgument argument("frame_overlap", poses, lattices, intrinsics, lattice_step);
   points = torch::stable::contiguous(points);
@@ -46,9 +45,9 @@ Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor pose
                                std::vector<double> intrinsics, std::int64_t lattice_step, std::int64_t num_points,
                                std::int64_t num_covisible, std::int64_t count, double threshold, std::int64_t seed,
                                std::int64_t stream, std::int64_t frame) {
-  STD_TORCH_CHECK(records.dim() == 2 && records.size(1) == 3 && records.size(0) > 0,
-                  "select_covisible_frames: records must have shape [P, 3] with P >= 1");
-  STD_TORCH_CHECK(current >= 0 && current < poses.size(0), "select_covisible_frames: current must be a row of poses");
+  SPS_CHECK(records.dim() == 2 && records.size(1) == 3 && records.size(0) > 0,
+            "select_covisible_frames: records must have shape [P, 3] with P >= 1");
+  SPS_CHECK(current >= 0 && current < poses.size(0), "select_covisible_frames: current must be a row of poses");
   DeviceScope scope(poses);
   const ViewsArgument argument("select_covisible_frames", poses, lattices, intrinsics, lattice_step);
   records = torch::stable::contiguous(records);

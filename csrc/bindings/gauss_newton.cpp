@@ -6,8 +6,8 @@ namespace spslam::bindings {
 namespace {
 
 Tensor predict_pose(Tensor before, Tensor last) {
-  STD_TORCH_CHECK(before.numel() == kPoseSize && last.numel() == kPoseSize,
-                  "predict_pose: before and last must have 7 elements");
+  SPS_CHECK(before.numel() == kPoseSize && last.numel() == kPoseSize,
+            "predict_pose: before and last must have 7 elements");
   DeviceScope scope(last);
   before = torch::stable::contiguous(before);
   last = torch::stable::contiguous(last);
@@ -22,10 +22,10 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> tensor
                                                       std::int64_t iterations, double truncation, double kernel_start,
                                                       double kernel_end, double damping, std::int64_t seed,
                                                       std::int64_t stream, std::int64_t frame, bool tf32) {
-  STD_TORCH_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
-                  "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
-  STD_TORCH_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
-  STD_TORCH_CHECK(num_pixels >= 1 && iterations >= 1, "track_gauss_newton: num_pixels and iterations must be >= 1");
+  SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
+            "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
+  SPS_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
+  SPS_CHECK(num_pixels >= 1 && iterations >= 1, "track_gauss_newton: num_pixels and iterations must be >= 1");
   DeviceScope scope(pixels);
   const SceneArgument scene(tensors, scalars, layout);
   pixels = torch::stable::contiguous(pixels);
@@ -52,9 +52,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
                                                               std::vector<std::int64_t> layout, Tensor pixels,
                                                               Tensor poses, std::vector<double> intrinsics,
                                                               double truncation, double kernel) {
-  STD_TORCH_CHECK(pixels.dim() == 3 && pixels.size(2) == 3, "gauss_newton_poses: pixels must have shape [F, N, 3]");
-  STD_TORCH_CHECK(poses.dim() == 2 && poses.size(0) == pixels.size(0) && poses.size(1) == kPoseSize,
-                  "gauss_newton_poses: poses must have shape [F, 7]");
+  SPS_CHECK(pixels.dim() == 3 && pixels.size(2) == 3, "gauss_newton_poses: pixels must have shape [F, N, 3]");
+  SPS_CHECK(poses.dim() == 2 && poses.size(0) == pixels.size(0) && poses.size(1) == kPoseSize,
+            "gauss_newton_poses: poses must have shape [F, 7]");
   DeviceScope scope(pixels);
   const SceneArgument scene(tensors, scalars, layout);
   pixels = torch::stable::contiguous(pixels);

@@ -26,10 +26,9 @@ T* data_or_null(const Tensor& tensor, bool wanted) {
 }
 
 void check_trilinear(const Tensor& embeddings, const Tensor& corner_ids, const Tensor& local_coords) {
-  STD_TORCH_CHECK(embeddings.dim() == 2 && corner_ids.dim() == 2 && corner_ids.size(1) == 8 &&
-                      local_coords.dim() == 2 && local_coords.size(1) == 3 &&
-                      local_coords.size(0) == corner_ids.size(0),
-                  "trilinear_interpolate: shapes must be [V, C], [N, 8], [N, 3]");
+  SPS_CHECK(embeddings.dim() == 2 && corner_ids.dim() == 2 && corner_ids.size(1) == 8 && local_coords.dim() == 2 &&
+                local_coords.size(1) == 3 && local_coords.size(0) == corner_ids.size(0),
+            "trilinear_interpolate: shapes must be [V, C], [N, 8], [N, 3]");
 }
 
 Tensor trilinear_interpolate(Tensor embeddings, Tensor corner_ids, Tensor local_coords) {
@@ -58,7 +57,7 @@ std::tuple<Tensor, Tensor> trilinear_interpolate_backward(Tensor grad, Tensor em
   corner_ids = contiguous(corner_ids);
   local_coords = contiguous(local_coords);
   const std::int64_t points = corner_ids.size(0), channels = embeddings.size(1);
-  STD_TORCH_CHECK(grad.numel() == points * channels, "trilinear_interpolate_backward: grad must have shape [N, C]");
+  SPS_CHECK(grad.numel() == points * channels, "trilinear_interpolate_backward: grad must have shape [N, C]");
   Gradients out(embeddings, local_coords, need_embeddings, need_local_coords);
   dispatch_floating("trilinear_interpolate_backward", embeddings, [&](auto zero) {
     using T = decltype(zero);
@@ -71,10 +70,10 @@ std::tuple<Tensor, Tensor> trilinear_interpolate_backward(Tensor grad, Tensor em
 }
 
 void check_bilinear(const Tensor& texels, const Tensor& uv) {
-  STD_TORCH_CHECK(texels.dim() == 3 && uv.dim() == 2 && uv.size(1) == 2,
-                  "bilinear_interpolate: shapes must be [H, W, C], [N, 2]");
-  STD_TORCH_CHECK((texels.size(0) > 0 && texels.size(1) > 0) || uv.size(0) == 0,
-                  "bilinear_interpolate: texels must not be empty");
+  SPS_CHECK(texels.dim() == 3 && uv.dim() == 2 && uv.size(1) == 2,
+            "bilinear_interpolate: shapes must be [H, W, C], [N, 2]");
+  SPS_CHECK((texels.size(0) > 0 && texels.size(1) > 0) || uv.size(0) == 0,
+            "bilinear_interpolate: texels must not be empty");
 }
 
 Tensor bilinear_interpolate(Tensor texels, Tensor uv) {
@@ -100,7 +99,7 @@ std::tuple<Tensor, Tensor> bilinear_interpolate_backward(Tensor grad, Tensor tex
   texels = contiguous(texels);
   uv = contiguous(uv);
   const std::int64_t points = uv.size(0), channels = texels.size(2);
-  STD_TORCH_CHECK(grad.numel() == points * channels, "bilinear_interpolate_backward: grad must have shape [N, C]");
+  SPS_CHECK(grad.numel() == points * channels, "bilinear_interpolate_backward: grad must have shape [N, C]");
   Gradients out(texels, uv, need_texels, need_uv);
   dispatch_floating("bilinear_interpolate_backward", texels, [&](auto zero) {
     using T = decltype(zero);
@@ -113,15 +112,15 @@ std::tuple<Tensor, Tensor> bilinear_interpolate_backward(Tensor grad, Tensor tex
 }
 
 TriPlaneLayout checked_layout(const Tensor& texels, const Tensor& points, const Sizes& layout) {
-  STD_TORCH_CHECK(texels.dim() == 2 && points.dim() == 2 && points.size(1) == 3,
-                  "tri_plane_interpolate: shapes must be [P, C], [N, 3]");
-  STD_TORCH_CHECK(layout.size() == 15, "tri_plane_interpolate: layout must have 15 numbers");
+  SPS_CHECK(texels.dim() == 2 && points.dim() == 2 && points.size(1) == 3,
+            "tri_plane_interpolate: shapes must be [P, C], [N, 3]");
+  SPS_CHECK(layout.size() == 15, "tri_plane_interpolate: layout must have 15 numbers");
   TriPlaneLayout out;
   for (int plane = 0; plane < 3; ++plane) {
     const std::int64_t* p = layout.data() + 5 * plane;
-    STD_TORCH_CHECK(p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[3] < INT32_MAX && p[4] < INT32_MAX &&
-                        p[0] + p[3] * p[4] <= texels.size(0),
-                    "tri_plane_interpolate: layout must lie within the texels");
+    SPS_CHECK(p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[3] < INT32_MAX && p[4] < INT32_MAX &&
+                  p[0] + p[3] * p[4] <= texels.size(0),
+              "tri_plane_interpolate: layout must lie within the texels");
     out.planes[plane] = {p[0], static_cast<std::int32_t>(p[1]), static_cast<std::int32_t>(p[2]),
                          static_cast<std::int32_t>(p[3]), static_cast<std::int32_t>(p[4])};
   }
@@ -149,8 +148,8 @@ std::tuple<Tensor, Tensor> tri_plane_interpolate_backward(Tensor grad, Tensor te
   grad = contiguous(grad);
   texels = contiguous(texels);
   points = contiguous(points);
-  STD_TORCH_CHECK(grad.numel() == points.size(0) * texels.size(1),
-                  "tri_plane_interpolate_backward: grad must have shape [N, C]");
+  SPS_CHECK(grad.numel() == points.size(0) * texels.size(1),
+            "tri_plane_interpolate_backward: grad must have shape [N, C]");
   Gradients out(texels, points, need_texels, need_points);
   dispatch_floating("tri_plane_interpolate_backward", texels, [&](auto zero) {
     using T = decltype(zero);

@@ -7,9 +7,9 @@ namespace {
 
 // The third output says what is wrong with the coordinates: see MarchingCubesCounts.
 std::tuple<Tensor, Tensor, std::int64_t> marching_cubes(Tensor cell_coords, Tensor values, double level) {
-  STD_TORCH_CHECK(values.dim() == 4 && values.size(1) >= 2 && values.size(1) == values.size(2) &&
-                      values.size(2) == values.size(3) && cell_coords.numel() == 3 * values.size(0),
-                  "marching_cubes: cell_coords and values must have shapes [M, 3] and [M, n + 1, n + 1, n + 1]");
+  SPS_CHECK(values.dim() == 4 && values.size(1) >= 2 && values.size(1) == values.size(2) &&
+                values.size(2) == values.size(3) && cell_coords.numel() == 3 * values.size(0),
+            "marching_cubes: cell_coords and values must have shapes [M, 3] and [M, n + 1, n + 1, n + 1]");
   DeviceScope scope(values);
   cell_coords = contiguous(cell_coords);
   values = contiguous(values);

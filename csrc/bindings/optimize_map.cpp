@@ -16,15 +16,14 @@ using GradientSum = float;
 #endif
 
 void check_size(const Tensor& tensor, std::int64_t size, const char* name) {
-  STD_TORCH_CHECK(tensor.numel() >= size, kName, ": ", name, " must have at least ", size, " elements, got ",
-                  tensor.numel());
+  SPS_CHECK(tensor.numel() >= size, kName, ": ", name, " must have at least ", size, " elements, got ", tensor.numel());
 }
 
 // Moments [exp_avg, exp_avg_sq] of a tensor of parameters; none: frozen.
 AdamState load_state(const Tensor& param, const std::vector<Tensor>& moments, std::int64_t size, double rate,
                      const char* name) {
   if (moments.empty()) return {};
-  STD_TORCH_CHECK(moments.size() >= 2, kName, ": ", name, " must be exp_avg and exp_avg_sq");
+  SPS_CHECK(moments.size() >= 2, kName, ": ", name, " must be exp_avg and exp_avg_sq");
   check_size(param, size, name);
   check_size(moments[0], size, name);
   check_size(moments[1], size, name);
@@ -35,7 +34,7 @@ AdamState load_state(const Tensor& param, const std::vector<Tensor>& moments, st
 AdamTable load_table(const Tensor& param, const std::vector<Tensor>& tensors, std::int64_t rows, std::int64_t channels,
                      double rate, const char* name) {
   if (tensors.empty()) return {};
-  STD_TORCH_CHECK(tensors.size() == 4, kName, ": ", name, " must be exp_avg, exp_avg_sq, gradients and stamps");
+  SPS_CHECK(tensors.size() == 4, kName, ": ", name, " must be exp_avg, exp_avg_sq, gradients and stamps");
   check_size(tensors[2], rows * channels, name);
   check_size(tensors[3], rows, name);
   return {load_state(param, tensors, rows * channels, rate, name), mutable_data<GradientSum>(tensors[2]),
@@ -50,7 +49,7 @@ Tensor frames_on_device(const Tensor& frames, const Tensor& like, std::int64_t r
 #endif
   const std::int64_t* at = data<std::int64_t>(list);
   for (std::int64_t i = 0; i < list.numel(); ++i) {
-    STD_TORCH_CHECK(at[i] >= 0 && at[i] < rows, kName, ": frames must be in [0, ", rows, "), got ", at[i]);
+    SPS_CHECK(at[i] >= 0 && at[i] < rows, kName, ": frames must be in [0, ", rows, "), got ", at[i]);
   }
 #ifdef SPS_CUDA
   Tensor copy = empty(like, {list.numel()}, ScalarType::Long);
@@ -70,13 +69,13 @@ void optimize_map_(std::vector<Tensor> scene_tensors, std::vector<double> scene_
                    std::vector<Tensor> texels, std::vector<Tensor> geometry_params, std::vector<Tensor> color_params,
                    std::vector<Tensor> pose_moments, std::vector<double> rates, std::int64_t first_step,
                    std::int64_t first_stamp, Tensor losses, std::int64_t precision, std::int64_t graph) {
-  STD_TORCH_CHECK(records.dim() == 3 && records.size(1) >= 1 && records.size(2) == 3, kName,
-                  ": records must have shape [F, P, 3] with P >= 1");
-  STD_TORCH_CHECK(poses.dim() == 2 && poses.size(0) == records.size(0) && poses.size(1) == 7, kName,
-                  ": poses must have shape [F, 7]");
-  STD_TORCH_CHECK(frames.numel() >= 1 && num_pixels >= 1, kName, ": frames and num_pixels must not be empty");
-  STD_TORCH_CHECK(iterations >= 1 && first_step >= 1, kName, ": iterations and first_step must be at least 1");
-  STD_TORCH_CHECK(rates.size() == 5, kName, ": rates must be five numbers");
+  SPS_CHECK(records.dim() == 3 && records.size(1) >= 1 && records.size(2) == 3, kName,
+            ": records must have shape [F, P, 3] with P >= 1");
+  SPS_CHECK(poses.dim() == 2 && poses.size(0) == records.size(0) && poses.size(1) == 7, kName,
+            ": poses must have shape [F, 7]");
+  SPS_CHECK(frames.numel() >= 1 && num_pixels >= 1, kName, ": frames and num_pixels must not be empty");
+  SPS_CHECK(iterations >= 1 && first_step >= 1, kName, ": iterations and first_step must be at least 1");
+  SPS_CHECK(rates.size() == 5, kName, ": rates must be five numbers");
   check_size(losses, kLossTerms * iterations, "losses");
   DeviceScope scope(poses);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);

@@ -9,14 +9,14 @@ void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, 
                   std::int64_t stamp, double lr, double beta1, double beta2, double eps, std::int64_t step) {
   DeviceScope scope(param);
   const std::int64_t count = param.numel();
-  STD_TORCH_CHECK(grad.numel() == count && exp_avg.numel() == count && exp_avg_sq.numel() == count,
-                  "sparse_adam_: grad, exp_avg and exp_avg_sq must have as many entries as param");
-  STD_TORCH_CHECK(step >= 1, "sparse_adam_: step must be at least 1, got ", step);
+  SPS_CHECK(grad.numel() == count && exp_avg.numel() == count && exp_avg_sq.numel() == count,
+            "sparse_adam_: grad, exp_avg and exp_avg_sq must have as many entries as param");
+  SPS_CHECK(step >= 1, "sparse_adam_: step must be at least 1, got ", step);
   if (count == 0) return;
   std::optional<Tensor> flat_stamps;
   if (stamps.has_value()) flat_stamps = contiguous(*stamps);
   const std::int64_t rows = stamps.has_value() ? stamps->numel() : 1;
-  STD_TORCH_CHECK(rows >= 1 && count % rows == 0, "sparse_adam_: stamps must have one entry a row of param");
+  SPS_CHECK(rows >= 1 && count % rows == 0, "sparse_adam_: stamps must have one entry a row of param");
   dispatch_floating("sparse_adam_", param, [&](auto zero) {
     using T = decltype(zero);
     sparse_adam(scope.context, AdamStep{lr, beta1, beta2, eps, step}, rows, count / rows,
@@ -27,10 +27,10 @@ void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, 
 
 std::tuple<Tensor, Tensor, Tensor> normal_equations(Tensor residuals, Tensor jacobians, Tensor weights) {
   DeviceScope scope(residuals);
-  STD_TORCH_CHECK(residuals.dim() == 2, "normal_equations: residuals must have shape [F, N]");
+  SPS_CHECK(residuals.dim() == 2, "normal_equations: residuals must have shape [F, N]");
   const std::int64_t frames = residuals.size(0), count = residuals.size(1);
-  STD_TORCH_CHECK(jacobians.numel() == frames * count * 6 && weights.numel() == frames * count,
-                  "normal_equations: jacobians and weights must fit residuals");
+  SPS_CHECK(jacobians.numel() == frames * count * 6 && weights.numel() == frames * count,
+            "normal_equations: jacobians and weights must fit residuals");
   residuals = contiguous(residuals);
   jacobians = contiguous(jacobians);
   weights = contiguous(weights);
@@ -49,8 +49,8 @@ std::tuple<Tensor, Tensor, Tensor> normal_equations(Tensor residuals, Tensor jac
 
 Tensor solve_normal_equations(Tensor hessian, Tensor gradient, double damping, double absolute_damping) {
   DeviceScope scope(hessian);
-  STD_TORCH_CHECK(gradient.dim() == 2 && gradient.size(1) == 6 && hessian.numel() == gradient.size(0) * 36,
-                  "solve_normal_equations: hessian and gradient must have shapes [F, 6, 6] and [F, 6]");
+  SPS_CHECK(gradient.dim() == 2 && gradient.size(1) == 6 && hessian.numel() == gradient.size(0) * 36,
+            "solve_normal_equations: hessian and gradient must have shapes [F, 6, 6] and [F, 6]");
   hessian = contiguous(hessian);
   gradient = contiguous(gradient);
   Tensor delta = empty(gradient, {gradient.size(0), 6}, gradient.scalar_type());

@@ -11,8 +11,8 @@ Tensor rows_of_three(const Tensor& like) {
 
 std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tensor pose, double fx, double fy,
                                             double cx, double cy) {
-  STD_TORCH_CHECK(records.numel() == 3 * records.size(0) && normals.numel() == records.numel() && pose.numel() == 7,
-                  "unproject_pixels: records, normals and pose must have shapes [P, 3], [P, 3] and [7]");
+  SPS_CHECK(records.numel() == 3 * records.size(0) && normals.numel() == records.numel() && pose.numel() == 7,
+            "unproject_pixels: records, normals and pose must have shapes [P, 3], [P, 3] and [7]");
   records = contiguous(records);
   normals = contiguous(normals);
   pose = contiguous(pose);
@@ -32,12 +32,12 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
                                                      std::int64_t step_px, double max_jump, std::int64_t lattice_step,
                                                      std::int64_t seed, std::int64_t stream, std::int64_t frame) {
   constexpr std::int64_t kMaxSide = 65535;  // a record has 16 bits a coordinate
-  STD_TORCH_CHECK(depth.dim() == 2 && depth.size(0) <= kMaxSide && depth.size(1) <= kMaxSide &&
-                      depth.numel() < (std::int64_t{1} << 31) && color.numel() == 3 * depth.numel(),
-                  "sample_frame_pixels: depth and color must have shapes [H, W] and [H, W, 3], H and W below 2^16");
-  STD_TORCH_CHECK(count >= 0 && count <= (std::int64_t{1} << 30) && step_px >= 1 && step_px <= kMaxSide &&
-                      lattice_step >= 1 && lattice_step <= kMaxSide,
-                  "sample_frame_pixels: count, step_px and lattice_step must be at least 0, 1 and 1");
+  SPS_CHECK(depth.dim() == 2 && depth.size(0) <= kMaxSide && depth.size(1) <= kMaxSide &&
+                depth.numel() < (std::int64_t{1} << 31) && color.numel() == 3 * depth.numel(),
+            "sample_frame_pixels: depth and color must have shapes [H, W] and [H, W, 3], H and W below 2^16");
+  SPS_CHECK(count >= 0 && count <= (std::int64_t{1} << 30) && step_px >= 1 && step_px <= kMaxSide &&
+                lattice_step >= 1 && lattice_step <= kMaxSide,
+            "sample_frame_pixels: count, step_px and lattice_step must be at least 0, 1 and 1");
   depth = contiguous(depth);
   color = contiguous(color);
   const std::int32_t height = static_cast<std::int32_t>(depth.size(0)),

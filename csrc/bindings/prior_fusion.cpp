@@ -13,9 +13,9 @@ void fuse_prior_(Tensor embeddings, Tensor weights, Tensor voxel_ids, Tensor fea
   features = contiguous(features);
   feature_weights = contiguous(feature_weights);
   const std::int64_t count = voxel_ids.numel();
-  STD_TORCH_CHECK(features.numel() == 8 * count && feature_weights.numel() == count && embeddings.dim() == 2 &&
-                      embeddings.size(1) == 8 && weights.numel() == embeddings.size(0),
-                  "fuse_prior_: embeddings and features must have 8 channels and a row a weight");
+  SPS_CHECK(features.numel() == 8 * count && feature_weights.numel() == count && embeddings.dim() == 2 &&
+                embeddings.size(1) == 8 && weights.numel() == embeddings.size(0),
+            "fuse_prior_: embeddings and features must have 8 channels and a row a weight");
   DeviceScope scope(embeddings);
   fuse_prior(scope.context, data<std::int32_t>(voxel_ids), data<float>(features), data<float>(feature_weights), count,
              embeddings.size(0), static_cast<float>(max_weight), mutable_data<float>(embeddings),
@@ -40,10 +40,9 @@ Tensor depth_normals(Tensor depth, Tensor pixels, double fx, double fy, double c
 
 EncoderSettings checked_settings(const char* function, const Tensor& params, double voxel_size,
                                  std::int64_t neighborhood, double min_pair_weight, bool tf32) {
-  STD_TORCH_CHECK(params.numel() == kEncoderParameters, function, ": encoder_params must have ", kEncoderParameters,
-                  " numbers, got ", params.numel());
-  STD_TORCH_CHECK(neighborhood == 64 || neighborhood == 8, function, ": neighborhood must be 64 or 8, got ",
-                  neighborhood);
+  SPS_CHECK(params.numel() == kEncoderParameters, function, ": encoder_params must have ", kEncoderParameters,
+            " numbers, got ", params.numel());
+  SPS_CHECK(neighborhood == 64 || neighborhood == 8, function, ": neighborhood must be 64 or 8, got ", neighborhood);
   return {static_cast<float>(voxel_size), static_cast<std::int32_t>(neighborhood), static_cast<float>(min_pair_weight),
           tf32};
 }
@@ -74,13 +73,13 @@ FeatureVolume checked_volume(const Tensor& hash_keys, const Tensor& hash_values,
                              const Tensor& corner_ids, const Tensor& embeddings, const Tensor& weights,
                              std::int64_t num_voxels, std::int64_t max_voxels) {
   const std::int64_t rows = weights.numel(), slots = hash_keys.numel();
-  STD_TORCH_CHECK(voxel_coords.numel() == 3 * rows && corner_ids.numel() == 8 * rows && embeddings.numel() == 8 * rows,
-                  "encode_frame_: the volume's tensors must have as many rows each");
-  STD_TORCH_CHECK(slots >= 2 && (slots & (slots - 1)) == 0 && hash_values.numel() == slots,
-                  "encode_frame_: hash_keys must have a power of two of slots, got ", slots);
-  STD_TORCH_CHECK(0 <= num_voxels && num_voxels <= max_voxels && max_voxels <= rows && max_voxels <= slots / 2,
-                  "encode_frame_: num_voxels, max_voxels and the volume's room must not decrease in this order, got ",
-                  num_voxels, ", ", max_voxels, " and ", rows);
+  SPS_CHECK(voxel_coords.numel() == 3 * rows && corner_ids.numel() == 8 * rows && embeddings.numel() == 8 * rows,
+            "encode_frame_: the volume's tensors must have as many rows each");
+  SPS_CHECK(slots >= 2 && (slots & (slots - 1)) == 0 && hash_values.numel() == slots,
+            "encode_frame_: hash_keys must have a power of two of slots, got ", slots);
+  SPS_CHECK(0 <= num_voxels && num_voxels <= max_voxels && max_voxels <= rows && max_voxels <= slots / 2,
+            "encode_frame_: num_voxels, max_voxels and the volume's room must not decrease in this order, got ",
+            num_voxels, ", ", max_voxels, " and ", rows);
   return {mutable_data<std::int64_t>(hash_keys),
           mutable_data<std::int32_t>(hash_values),
           slots,
@@ -106,7 +105,7 @@ std::int64_t encode_frame_(Tensor hash_keys, Tensor hash_values, Tensor voxel_co
       static_cast<float>(kappa),
       static_cast<float>(max_weight),
       fuse_known};
-  STD_TORCH_CHECK(bounds.numel() == 6, "encode_frame_: bounds must have 6 numbers, got ", bounds.numel());
+  SPS_CHECK(bounds.numel() == 6, "encode_frame_: bounds must have 6 numbers, got ", bounds.numel());
   points = contiguous(points);
   normals = contiguous(normals);
   encoder_params = contiguous(encoder_params);

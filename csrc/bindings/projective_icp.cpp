@@ -9,11 +9,11 @@ std::tuple<Tensor, Tensor, Tensor> projective_icp(Tensor points, Tensor vertices
                                                   std::vector<double> intrinsics, std::int64_t iterations,
                                                   double max_distance, double kernel_start, double kernel_end,
                                                   double damping) {
-  STD_TORCH_CHECK(points.dim() == 2 && points.size(1) == 3, "projective_icp: points must have shape [N, 3]");
-  STD_TORCH_CHECK(vertices.dim() == 3 && vertices.size(2) == 3 && normals.numel() == vertices.numel(),
-                  "projective_icp: vertices and normals must have shape [H, W, 3]");
-  STD_TORCH_CHECK(pose.numel() == kPoseSize, "projective_icp: pose must have 7 elements");
-  STD_TORCH_CHECK(iterations >= 1, "projective_icp: iterations must be >= 1");
+  SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "projective_icp: points must have shape [N, 3]");
+  SPS_CHECK(vertices.dim() == 3 && vertices.size(2) == 3 && normals.numel() == vertices.numel(),
+            "projective_icp: vertices and normals must have shape [H, W, 3]");
+  SPS_CHECK(pose.numel() == kPoseSize, "projective_icp: pose must have 7 elements");
+  SPS_CHECK(iterations >= 1, "projective_icp: iterations must be >= 1");
   DeviceScope scope(points);
   points = torch::stable::contiguous(points);
   vertices = torch::stable::contiguous(vertices);

@@ -14,7 +14,7 @@ void philox_uniform(std::int64_t seed, std::int64_t stream, std::int64_t frame, 
 
 void sample_indices(std::int64_t seed, std::int64_t stream, std::int64_t frame, std::int64_t iteration,
                     std::int64_t upper, Tensor out) {
-  STD_TORCH_CHECK(upper >= 1 && upper <= (std::int64_t{1} << 32), "sample_indices: upper must be in [1, 2^32]");
+  SPS_CHECK(upper >= 1 && upper <= (std::int64_t{1} << 32), "sample_indices: upper must be in [1, 2^32]");
   DeviceScope scope(out);
   spslam::sample_indices(scope.context, philox_key(seed, stream, frame, iteration), upper, out.numel(),
                          mutable_data<std::int64_t>(out));
@@ -24,11 +24,11 @@ Tensor sample_along_rays(Tensor depth, std::int64_t num_uniform, std::int64_t nu
                          double truncation, std::int64_t seed, std::int64_t stream, std::int64_t frame,
                          std::int64_t iteration) {
   constexpr std::int64_t kMaxSamples = 1 << 20;
-  STD_TORCH_CHECK(depth.dim() == 1 && num_uniform >= 0 && num_uniform <= kMaxSamples && num_surface >= 0 &&
-                      num_surface <= kMaxSamples,
-                  "sample_along_rays: depth must have shape [R] and counts lie in [0, 2^20]");
-  STD_TORCH_CHECK(depth.numel() == 0 || num_uniform + num_surface <= (std::int64_t{1} << 32) / depth.numel(),
-                  "sample_along_rays: rays times samples must be at most 2^32");
+  SPS_CHECK(depth.dim() == 1 && num_uniform >= 0 && num_uniform <= kMaxSamples && num_surface >= 0 &&
+                num_surface <= kMaxSamples,
+            "sample_along_rays: depth must have shape [R] and counts lie in [0, 2^20]");
+  SPS_CHECK(depth.numel() == 0 || num_uniform + num_surface <= (std::int64_t{1} << 32) / depth.numel(),
+            "sample_along_rays: rays times samples must be at most 2^32");
   DeviceScope scope(depth);
   depth = contiguous(depth);
   Tensor out = empty(depth, {depth.numel(), num_uniform + num_surface}, depth.scalar_type());

@@ -16,7 +16,7 @@ namespace spslam::bindings {
       std::int64_t frame, std::int64_t iteration
 
 inline Intrinsics load_intrinsics(const char* function, const std::vector<double>& values) {
-  STD_TORCH_CHECK(values.size() == 4, function, ": intrinsics must be fx, fy, cx, cy");
+  SPS_CHECK(values.size() == 4, function, ": intrinsics must be fx, fy, cx, cy");
   return {static_cast<float>(values[0]), static_cast<float>(values[1]), static_cast<float>(values[2]),
           static_cast<float>(values[3])};
 }
@@ -25,11 +25,11 @@ inline RenderOptions load_options(const char* function, std::int64_t num_uniform
                                   double far, double truncation, bool cosine_targets,
                                   const std::vector<double>& weights, const PhiloxKey& key, std::int64_t precision) {
   constexpr std::int64_t kMaxSamples = 1 << 16;
-  STD_TORCH_CHECK(num_uniform >= 0 && num_surface >= 0 && num_uniform + num_surface >= 1 &&
-                      num_uniform + num_surface <= kMaxSamples,
-                  function, ": the samples of a ray must be from 1 to ", kMaxSamples);
-  STD_TORCH_CHECK(weights.size() == 4, function, ": weights must be rgb, depth, free_space, sdf");
-  STD_TORCH_CHECK(precision == 0 || precision == 1, function, ": precision must be 0 (tf32) or 1 (fp32)");
+  SPS_CHECK(num_uniform >= 0 && num_surface >= 0 && num_uniform + num_surface >= 1 &&
+                num_uniform + num_surface <= kMaxSamples,
+            function, ": the samples of a ray must be from 1 to ", kMaxSamples);
+  SPS_CHECK(weights.size() == 4, function, ": weights must be rgb, depth, free_space, sdf");
+  SPS_CHECK(precision == 0 || precision == 1, function, ": precision must be 0 (tf32) or 1 (fp32)");
   const auto f = [](double x) { return static_cast<float>(x); };
   return {
       {static_cast<std::int32_t>(num_uniform), static_cast<std::int32_t>(num_surface), f(near), f(far), f(truncation)},

@@ -12,8 +12,8 @@ using OptionalTensor = std::optional<Tensor>;
 template <class T>
 T* output(const OptionalTensor& tensor, std::int64_t size, const char* name) {
   if (!tensor.has_value()) return nullptr;
-  STD_TORCH_CHECK(tensor->numel() >= size, "render_step: ", name, " must have at least ", size, " elements, got ",
-                  tensor->numel());
+  SPS_CHECK(tensor->numel() >= size, "render_step: ", name, " must have at least ", size, " elements, got ",
+            tensor->numel());
   return mutable_data<T>(*tensor);
 }
 
@@ -24,8 +24,8 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
                  OptionalTensor texel_stamps, OptionalTensor grad_geometry, OptionalTensor grad_color,
                  std::int64_t stamp, std::int64_t precision) {
   const std::int64_t num_rays = ray_frames.numel();
-  STD_TORCH_CHECK(pixels.numel() == 3 * num_rays, "render_step: pixels must have shape [R, 3]");
-  STD_TORCH_CHECK(poses.dim() == 2 && poses.size(1) == 7, "render_step: poses must have shape [F, 7]");
+  SPS_CHECK(pixels.numel() == 3 * num_rays, "render_step: pixels must have shape [R, 3]");
+  SPS_CHECK(poses.dim() == 2 && poses.size(1) == 7, "render_step: poses must have shape [F, 7]");
   DeviceScope scope(losses);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   const SceneView& view = scene.view;

@@ -11,7 +11,7 @@ namespace spslam::bindings {
 namespace {
 
 void set_num_threads_op(std::int64_t count) {
-  STD_TORCH_CHECK(count >= 1, "set_num_threads: count must be at least 1, got ", count);
+  SPS_CHECK(count >= 1, "set_num_threads: count must be at least 1, got ", count);
   spslam::set_num_threads(static_cast<int>(count));
 }
 

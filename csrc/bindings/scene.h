@@ -10,7 +10,7 @@ namespace spslam::bindings {
 #define SPS_SCENE_SCHEMA "Tensor[] scene, float[] scene_scalars, int[] plane_layout"
 
 inline Intrinsics load_intrinsics(const std::vector<double>& intrinsics) {
-  STD_TORCH_CHECK(intrinsics.size() == 4, "spslam: intrinsics must be fx, fy, cx, cy");
+  SPS_CHECK(intrinsics.size() == 4, "spslam: intrinsics must be fx, fy, cx, cy");
   return {static_cast<float>(intrinsics[0]), static_cast<float>(intrinsics[1]), static_cast<float>(intrinsics[2]),
           static_cast<float>(intrinsics[3])};
 }
@@ -20,19 +20,19 @@ class SceneArgument {
  public:
   SceneArgument(const std::vector<Tensor>& tensors, const std::vector<double>& scalars,
                 const std::vector<std::int64_t>& layout) {
-    STD_TORCH_CHECK(tensors.size() == 7 && scalars.size() == 6 && layout.size() == 15,
-                    "spslam: a scene must be 7 tensors, 6 scalars and 15 integers");
+    SPS_CHECK(tensors.size() == 7 && scalars.size() == 6 && layout.size() == 15,
+              "spslam: a scene must be 7 tensors, 6 scalars and 15 integers");
     for (const Tensor& tensor : tensors) tensors_.push_back(torch::stable::contiguous(tensor));
     const Tensor &keys = tensors_[0], &values = tensors_[1], &corners = tensors_[2], &embeddings = tensors_[3],
                  &geometry = tensors_[4], &texels = tensors_[5], &color = tensors_[6];
     const std::int64_t capacity = keys.numel();
-    STD_TORCH_CHECK(capacity > 0 && (capacity & (capacity - 1)) == 0 && values.numel() == capacity,
-                    "spslam: hash_keys and hash_values must have the same power of two of elements");
+    SPS_CHECK(capacity > 0 && (capacity & (capacity - 1)) == 0 && values.numel() == capacity,
+              "spslam: hash_keys and hash_values must have the same power of two of elements");
     view.num_voxels = embeddings.numel() / kEmbeddingChannels;
-    STD_TORCH_CHECK(corners.numel() == kCellCorners * view.num_voxels,
-                    "spslam: corner_ids and embeddings must have the same rows");
-    STD_TORCH_CHECK(geometry.numel() == kGeometryDecoder.num_params() && color.numel() == kColorDecoder.num_params(),
-                    "spslam: decoder parameters of the wrong length");
+    SPS_CHECK(corners.numel() == kCellCorners * view.num_voxels,
+              "spslam: corner_ids and embeddings must have the same rows");
+    SPS_CHECK(geometry.numel() == kGeometryDecoder.num_params() && color.numel() == kColorDecoder.num_params(),
+              "spslam: decoder parameters of the wrong length");
     view.table = {data<std::int64_t>(keys), data<std::int32_t>(values), capacity - 1};
     view.corner_ids = data<std::int32_t>(corners);
     view.embeddings = data<float>(embeddings);
@@ -52,8 +52,8 @@ class SceneArgument {
   void load_layout(const std::vector<std::int64_t>& layout, std::int64_t rows) {
     for (int plane = 0; plane < 3; ++plane) {
       const std::int64_t* p = layout.data() + 5 * plane;
-      STD_TORCH_CHECK(p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[0] + p[3] * p[4] <= rows,
-                      "spslam: plane_layout must lie within texels");
+      SPS_CHECK(p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[0] + p[3] * p[4] <= rows,
+                "spslam: plane_layout must lie within texels");
       view.planes.planes[plane] = {p[0], static_cast<std::int32_t>(p[1]), static_cast<std::int32_t>(p[2]),
                                    static_cast<std::int32_t>(p[3]), static_cast<std::int32_t>(p[4])};
     }

@@ -7,7 +7,7 @@ namespace {
 
 std::tuple<Tensor, Tensor, Tensor> query_sdf(std::vector<Tensor> tensors, std::vector<double> scalars,
                                              std::vector<std::int64_t> layout, Tensor points, bool with_gradient) {
-  STD_TORCH_CHECK(points.dim() == 2 && points.size(1) == 3, "query_sdf: points must have shape [N, 3]");
+  SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "query_sdf: points must have shape [N, 3]");
   DeviceScope scope(points);
   const SceneArgument scene(tensors, scalars, layout);
   points = torch::stable::contiguous(points);
@@ -22,7 +22,7 @@ std::tuple<Tensor, Tensor, Tensor> query_sdf(std::vector<Tensor> tensors, std::v
 
 Tensor query_color(std::vector<Tensor> tensors, std::vector<double> scalars, std::vector<std::int64_t> layout,
                    Tensor points) {
-  STD_TORCH_CHECK(points.dim() == 2 && points.size(1) == 3, "query_color: points must have shape [N, 3]");
+  SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "query_color: points must have shape [N, 3]");
   DeviceScope scope(points);
   const SceneArgument scene(tensors, scalars, layout);
   points = torch::stable::contiguous(points);

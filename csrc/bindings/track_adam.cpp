@@ -14,10 +14,10 @@ std::tuple<Tensor, Tensor> track_adam(std::vector<Tensor> scene_tensors, std::ve
                                       SPS_RENDER_OPTIONS_PARAMETERS, std::int64_t pixel_stream, std::int64_t num_pixels,
                                       std::int64_t iterations, double rotation_rate, double translation_rate,
                                       std::int64_t precision, std::int64_t graph) {
-  STD_TORCH_CHECK(records.dim() == 2 && records.size(0) >= 1 && records.size(1) == 3, kName,
-                  ": records must have shape [P, 3] with P >= 1");
-  STD_TORCH_CHECK(pose.numel() == 7, kName, ": pose must have 7 elements");
-  STD_TORCH_CHECK(num_pixels >= 1 && iterations >= 1, kName, ": num_pixels and iterations must be at least 1");
+  SPS_CHECK(records.dim() == 2 && records.size(0) >= 1 && records.size(1) == 3, kName,
+            ": records must have shape [P, 3] with P >= 1");
+  SPS_CHECK(pose.numel() == 7, kName, ": pose must have 7 elements");
+  SPS_CHECK(num_pixels >= 1 && iterations >= 1, kName, ": num_pixels and iterations must be at least 1");
   DeviceScope scope(pose);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   records = contiguous(records);

@@ -11,9 +11,9 @@ struct Samples {
 
   Samples(const char* function, const Tensor& sdf_, const Tensor& t_, const Tensor& valid_)
       : sdf(contiguous(sdf_)), t(contiguous(t_)), valid(contiguous(valid_)) {
-    STD_TORCH_CHECK(sdf.dim() == 2 && t.dim() == 2 && valid.dim() == 2 && t.size(0) == sdf.size(0) &&
-                        t.size(1) == sdf.size(1) && valid.size(0) == sdf.size(0) && valid.size(1) == sdf.size(1),
-                    function, ": sdf, t and valid must have shape [R, S]");
+    SPS_CHECK(sdf.dim() == 2 && t.dim() == 2 && valid.dim() == 2 && t.size(0) == sdf.size(0) &&
+                  t.size(1) == sdf.size(1) && valid.size(0) == sdf.size(0) && valid.size(1) == sdf.size(1),
+              function, ": sdf, t and valid must have shape [R, S]");
   }
 
   std::int64_t rays() const { return sdf.size(0); }
@@ -26,7 +26,7 @@ struct Samples {
 };
 
 void check_numel(const char* function, const Tensor& tensor, std::int64_t numel) {
-  STD_TORCH_CHECK(tensor.numel() == numel, function, ": a tensor has ", tensor.numel(), " elements instead of ", numel);
+  SPS_CHECK(tensor.numel() == numel, function, ": a tensor has ", tensor.numel(), " elements instead of ", numel);
 }
 
 std::tuple<Tensor, Tensor, Tensor> volume_render(Tensor sdf, Tensor color, Tensor t, Tensor valid, double truncation) {

@@ -7,17 +7,17 @@ namespace {
 
 std::int64_t checked_capacity(const char* function, const Tensor& hash_keys, const Tensor& hash_values) {
   const std::int64_t capacity = hash_keys.numel();
-  STD_TORCH_CHECK(capacity >= 2 && (capacity & (capacity - 1)) == 0, function,
-                  ": hash_keys must have a power of two of slots, got ", capacity);
-  STD_TORCH_CHECK(hash_values.numel() == capacity, function, ": hash_values must have as many slots as hash_keys, got ",
-                  hash_values.numel());
+  SPS_CHECK(capacity >= 2 && (capacity & (capacity - 1)) == 0, function,
+            ": hash_keys must have a power of two of slots, got ", capacity);
+  SPS_CHECK(hash_values.numel() == capacity, function, ": hash_values must have as many slots as hash_keys, got ",
+            hash_values.numel());
   return capacity;
 }
 
 // A table is kept half empty at least: every probe then ends, and soon.
 void check_room(const char* function, std::int64_t capacity, std::int64_t voxels) {
-  STD_TORCH_CHECK(voxels <= capacity / 2, function, ": hash table must stay at most half full, got ", voxels,
-                  " voxels for ", capacity, " slots");
+  SPS_CHECK(voxels <= capacity / 2, function, ": hash table must stay at most half full, got ", voxels, " voxels for ",
+            capacity, " slots");
 }
 
 Tensor voxel_hash_insert(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, std::int64_t first_id) {
@@ -31,8 +31,8 @@ Tensor voxel_hash_insert(Tensor hash_keys, Tensor hash_values, Tensor voxel_coor
   const AbsentVoxels found = voxel_hash_absent(
       scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values), capacity,
       data<std::int32_t>(voxel_coords), n, mutable_data<std::uint8_t>(workspace), mutable_data<std::int64_t>(absent));
-  STD_TORCH_CHECK(found.out_of_range == 0, name, ": voxel_coords must lie in [-2^20, 2^20 - 1], got ",
-                  found.out_of_range, " rows outside");
+  SPS_CHECK(found.out_of_range == 0, name, ": voxel_coords must lie in [-2^20, 2^20 - 1], got ", found.out_of_range,
+            " rows outside");
   check_room(name, capacity, first_id + found.count);
   voxel_hash_assign(scope.context, mutable_data<std::int64_t>(hash_keys), mutable_data<std::int32_t>(hash_values),
                     capacity, data<std::int64_t>(absent), found.count, static_cast<std::int32_t>(first_id));
@@ -76,9 +76,8 @@ void voxel_hash_update_corner_ids(Tensor hash_keys, Tensor hash_values, Tensor v
   hash_values = contiguous(hash_values);
   voxel_coords = contiguous(voxel_coords);
   const std::int64_t voxels = voxel_coords.size(0);
-  STD_TORCH_CHECK(corner_ids.size(0) == voxels, name, ": corner_ids must have a row a voxel");
-  STD_TORCH_CHECK(first_new >= 0 && first_new <= voxels, name, ": first_new must be in [0, ", voxels, "], got ",
-                  first_new);
+  SPS_CHECK(corner_ids.size(0) == voxels, name, ": corner_ids must have a row a voxel");
+  SPS_CHECK(first_new >= 0 && first_new <= voxels, name, ": first_new must be in [0, ", voxels, "], got ", first_new);
   DeviceScope scope(hash_keys);
   spslam::voxel_hash_update_corner_ids(scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values),
                                        capacity, data<std::int32_t>(voxel_coords), voxels, first_new,
