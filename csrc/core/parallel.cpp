@@ -3,6 +3,7 @@
 #include <unistd.h>
 
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <mutex>
 #include <thread>
@@ -98,7 +99,7 @@ class ThreadPool {
       Loop loop;
       {
         std::unique_lock<std::mutex> lock(mutex_);
-        wake_.wait(lock, [&] { return loop_.generation != seen; });
+        wait(wake_, lock, [&] { return loop_.generation != seen; });
         if (stopping_) return;
         loop = loop_;
       }
@@ -129,7 +130,13 @@ class ThreadPool {
     for (int spin = 0; spin < kSpins && done_.load(std::memory_order_acquire) < chunks; ++spin) pause();
     if (done_.load(std::memory_order_acquire) == chunks) return;
     std::unique_lock<std::mutex> lock(mutex_);
-    finished_.wait(lock, [&] { return done_.load(std::memory_order_acquire) == chunks; });
+    wait(finished_, lock, [&] { return done_.load(std::memory_order_acquire) == chunks; });
+  }
+
+  // Without a time limit the wait is a function of libstdc++ 12: a wheel built there would not load on older systems.
+  template <class Condition>
+  static void wait(std::condition_variable& event, std::unique_lock<std::mutex>& lock, const Condition& condition) {
+    while (!event.wait_for(lock, std::chrono::hours(1), condition)) {}
   }
 
   std::uint32_t current_generation() const {
