@@ -9,7 +9,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops.ray_sampling import Stream
-from spslam.ops.scene_view import Intrinsics
+from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
 def frame_overlap(
@@ -26,7 +26,8 @@ def frame_overlap(
         lattice_step: side of a lattice cell, px.
 
     Returns:
-        float32 [F] in [0, 1]; 0 where N = 0. The same on every device.
+        float32 [F] in [0, 1]; 0 where N = 0 and for a pose that is not finite. Points and depths that are not are not
+        seen. The same on every device.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a step below 1.
@@ -39,7 +40,7 @@ def frame_overlap(
     """
     name = "frame_overlap"
     check_tensor(name, "points", points, ("N", 3), torch.float32)
-    _check_views(name, poses, lattices, lattice_step, like=points)
+    _check_views(name, poses, lattices, intrinsics, lattice_step, like=points)
     return torch.ops.spslam.frame_overlap(points, poses, lattices, list(intrinsics), lattice_step)
 
 
@@ -96,7 +97,7 @@ def select_covisible_frames(
     name = "select_covisible_frames"
     check_tensor(name, "records", records, ("P", 3), torch.int32)
     check(len(records) > 0, name, "records", "have at least one row", 0)
-    _check_views(name, poses, lattices, lattice_step, like=records)
+    _check_views(name, poses, lattices, intrinsics, lattice_step, like=records)
     check(0 <= current < len(poses), name, "current", f"be a row of the {len(poses)} poses", current)
     check_tensor(name, "candidates", candidates, ("M",), torch.int64, like=records)
     check(len(candidates) <= len(poses), name, "candidates", f"be at most {len(poses)} rows", len(candidates))
@@ -121,9 +122,12 @@ def select_covisible_frames(
     )
 
 
-def _check_views(name: str, poses: torch.Tensor, lattices: torch.Tensor, step: int, like: torch.Tensor) -> None:
+def _check_views(
+    name: str, poses: torch.Tensor, lattices: torch.Tensor, intrinsics: Intrinsics, step: int, like: torch.Tensor
+) -> None:
     check_tensor(name, "poses", poses, ("F", 7), torch.float32, like=like)
     check_tensor(name, "lattices", lattices, (len(poses), "h", "w"), torch.float16, like=like)
+    check_intrinsics(name, intrinsics)
     check(step >= 1, name, "lattice_step", "be at least 1", step)
 
 

@@ -50,7 +50,8 @@ def mlp(
         activation: what follows the last layer, an `Activation`.
 
     Returns:
-        [N, O], differentiable with respect to `input` and `params`. N = 0 gives an empty tensor and zero gradients.
+        [N, O], differentiable with respect to `input` and `params`. N = 0 gives an empty tensor and zero gradients. A
+        row of `input` with NaN gives a row of NaN.
 
         Gradients of `params` are summed over the samples in an order that depends on N alone: the same bits for any
         number of threads, and from run to run on CUDA.

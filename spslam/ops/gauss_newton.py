@@ -9,7 +9,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 
 def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
@@ -20,7 +20,7 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
         last: float32 [7] T1.
 
     Returns:
-        float32 [7], its quaternion of norm 1 with w >= 0.
+        float32 [7], its quaternion of norm 1 with w >= 0; not finite where a pose is not.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device.
@@ -58,7 +58,8 @@ def track_gauss_newton(
 
     Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the
     step to a norm of 0.15. The kernel width k goes geometrically from `kernel_start` to `kernel_end`, reached one
-    iteration before the last. Points outside the map, or where |s| >= 0.98, take no part.
+    iteration before the last. Points outside the map, or where |s| >= 0.98, take no part, and neither do pixels
+    without a positive, finite depth nor any from a pose that is not finite.
 
     Args:
         scene: the map.
@@ -98,6 +99,7 @@ def track_gauss_newton(
     check_tensor(name, "pixels", pixels, ("P", 3), torch.int32, like=scene.embeddings)
     check(len(pixels) > 0, name, "pixels", "have at least one row", 0)
     check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
+    check_intrinsics(name, intrinsics)
     check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
     check(iterations >= 1, name, "iterations", "be at least 1", iterations)
     check(truncation > 0, name, "truncation", "be positive", truncation)
@@ -136,7 +138,7 @@ def gauss_newton_poses(
     truncation: float,
     kernel: float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Normal equations of many frames' poses against a frozen scene, all given pixels used.
+    """Normal equations of many frames' poses against a frozen scene, all given pixels used that have a depth.
 
     Args:
         scene: the map.
@@ -148,7 +150,7 @@ def gauss_newton_poses(
 
     Returns:
         H float32 [F, 6, 6], gradient float32 [F, 6], weighted mean squared residual float32 [F] (m^2), share of pixels
-        on mapped surface float32 [F]. F = 0 or N = 0 gives empty tensors or zeros.
+        on mapped surface float32 [F]. F = 0 or N = 0 gives empty tensors or zeros, a pose that is not finite zeros.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -165,6 +167,7 @@ def gauss_newton_poses(
     scene.check(name)
     check_tensor(name, "pixels", pixels, ("F", "N", 3), torch.int32, like=scene.embeddings)
     check_tensor(name, "poses", poses, (len(pixels), 7), torch.float32, like=scene.embeddings)
+    check_intrinsics(name, intrinsics)
     check(truncation > 0, name, "truncation", "be positive", truncation)
     check(kernel > 0, name, "kernel", "be positive", kernel)
     return torch.ops.spslam.gauss_newton_poses(*scene.arguments(), pixels, poses, list(intrinsics), truncation, kernel)

@@ -26,7 +26,8 @@ def trilinear_interpolate(
         corner_ids: int32 [N, 8], rows of `embeddings` at the corners of each point's cell; corner k lies at offset
             (k & 1, k >> 1 & 1, k >> 2 & 1) from the lowest one. A point with an id outside [0, V), such as the -1 of a
             missing vertex, gets the value 0 and no gradient.
-        local_coords: [N, 3] of the dtype of `embeddings`, position inside the cell in [0, 1], as x, y, z.
+        local_coords: [N, 3] of the dtype of `embeddings`, position inside the cell in [0, 1], as x, y, z. What is not
+            finite gives NaN for its point.
 
     Returns:
         [N, C]. Differentiable by `embeddings` and `local_coords`. N = 0 gives an empty tensor.
@@ -54,7 +55,8 @@ def bilinear_interpolate(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor
     Args:
         texels: [H, W, C] float32 or float64; H and W at least 1 unless N is 0.
         uv: [N, 2] of the same dtype, positions in texels, u along W and v along H: (0, 0) is the centre of the first
-            texel, (W - 1, H - 1) that of the last. Positions outside are clamped to the border, with zero gradient.
+            texel, (W - 1, H - 1) that of the last. Positions outside are clamped to the border, with zero gradient, and
+            so is infinity; NaN gives NaN for its point.
 
     Returns:
         [N, C]. Differentiable by `texels` and `uv`. N = 0 gives an empty tensor.
@@ -82,7 +84,7 @@ def tri_plane_interpolate(
 
     Args:
         texels: [P, C] float32 or float64, the texels of all planes as rows of one table.
-        points: [N, 3] of the same dtype, metres.
+        points: [N, 3] of the same dtype, metres. NaN gives NaN for its point.
         cell_size: distance between texels, metres; texel (iu, iv) lies at (iu, iv) * cell_size.
         layout: 15 integers, (offset, origin_u, origin_v, size_u, size_v) for each of the planes with axes (u, v) =
             (x, y), (x, z), (y, z). Texel (iu, iv) is row offset + (iu - origin_u) * size_v + (iv - origin_v).

@@ -9,7 +9,7 @@ from spslam.ops._checks import check, check_tensor
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import Stream
 from spslam.ops.render_step import RenderOptions
-from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def optimize_map_(
     on_cpu = isinstance(frames, torch.Tensor) and frames.device.type == "cpu"
     check_tensor(name, "frames", frames, ("n",), torch.int64, like=None if on_cpu else poses)
     check(len(frames) >= 1, name, "frames", "name at least one frame", len(frames))
-    check(len(intrinsics) == 4, name, "intrinsics", "be (fx, fy, cx, cy)", tuple(intrinsics))
+    check_intrinsics(name, intrinsics)
     moments.check(name, scene, poses)
     check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
     check(iterations >= 1, name, "iterations", "be at least 1", iterations)

@@ -43,7 +43,8 @@ def sparse_adam_(
         TypeError: a tensor of another dtype.
         ValueError: shapes or devices that do not fit, a tensor that is not contiguous, a rate out of range.
 
-    V = 0 changes nothing. The result does not depend on the number of threads.
+    V = 0 changes nothing. The result does not depend on the number of threads. A gradient that is not finite spoils its
+    own entry alone.
 
     Example:
         >>> param, grad, exp_avg, exp_avg_sq = torch.zeros(2, 1), torch.ones(2, 1), torch.zeros(2, 1), torch.zeros(2, 1)
@@ -80,7 +81,8 @@ def normal_equations(
     Args:
         residuals: float32 or float64 [F, N], r.
         jacobians: [F, N, 6], J = dr/dx.
-        weights: [F, N], w. Where w = 0 the entry is skipped, even if its residual or jacobian is not finite.
+        weights: [F, N], w. Where w = 0 the entry is skipped, even if its residual or jacobian is not finite; else NaN
+            makes the sums of its problem NaN.
 
     Returns:
         hessian [F, 6, 6] = sum_n w J J^T, gradient [F, 6] = sum_n w r J, cost [F] = sum_n w r^2, in the inputs' dtype.

@@ -124,8 +124,8 @@ def unproject_pixels(
         fx, fy, cx, cy: pinhole camera, px.
 
     Returns:
-        points float32 [P, 3], m, and normals float32 [P, 3]; devices differ by rounding. P = 0 gives empty tensors.
-        Not differentiable.
+        points float32 [P, 3], m, and normals float32 [P, 3]; devices differ by rounding. P = 0 gives empty tensors, NaN
+        in a depth, a normal or the pose NaN. Not differentiable.
 
     Raises:
         ValueError: wrong shapes or devices, `fx` or `fy` not positive.

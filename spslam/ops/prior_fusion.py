@@ -122,8 +122,9 @@ def fuse_prior_(
 ) -> None:
     """Fuses encoded features into the sparse volume, in place; equation (1) of SP-SLAM.
 
-    E <- (W E + w f) / (W + w), then W <- min(W + w, max_weight). A feature of weight 0 changes nothing. Each voxel has
-    one writer: the same result on every run and for every thread count.
+    E <- (W E + w f) / (W + w), then W <- min(W + w, max_weight). A weight w that is 0, negative or NaN changes nothing;
+    a feature that is NaN makes its voxel NaN. Each voxel has one writer: the same result on every run and for every
+    thread count.
 
     Args:
         embeddings: float32 [V, 8], contiguous; changed.
@@ -158,7 +159,7 @@ def random_embeddings(voxel_coords: torch.Tensor, seed: int, scale: float = 0.01
     """Embeddings to start from without a prior: numbers from N(0, scale^2) that voxel and seed alone decide on.
 
     Args:
-        voxel_coords: int32 [M, 3].
+        voxel_coords: int32 [M, 3], any integers.
         seed: 64-bit seed.
         scale: standard deviation, at least 0.
 

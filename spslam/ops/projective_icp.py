@@ -9,7 +9,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops.scene_view import Intrinsics
+from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
 def projective_icp(
@@ -48,7 +48,8 @@ def projective_icp(
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of points
         with a partner, the norms of the step in translation (m) and rotation (rad), and the mean weight over all
         points, each before the iteration's step; float32 [6, 6] H of the last iteration. The same to the bit every time
-        on one device, and for any number of CPU threads. N = 0 or an empty map leaves the pose as it is.
+        on one device, and for any number of CPU threads. N = 0 or an empty map leaves the pose as it is. Points,
+        vertices and normals that are not finite take no part, and none does where the pose is not.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -67,6 +68,7 @@ def projective_icp(
     check_tensor(name, "vertices", vertices, ("H", "W", 3), torch.float32, like=points)
     check_tensor(name, "normals", normals, tuple(vertices.shape), torch.float32, like=points)
     check_tensor(name, "pose", pose, (7,), torch.float32, like=points)
+    check_intrinsics(name, intrinsics)
     check(iterations >= 1, name, "iterations", "be at least 1", iterations)
     check(max_distance > 0, name, "max_distance", "be positive", max_distance)
     kernels = (kernel_start, kernel_end)

@@ -11,7 +11,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops.scene_view import COLOR_PARAMS, GEOMETRY_PARAMS, Intrinsics, SceneView
+from spslam.ops.scene_view import COLOR_PARAMS, GEOMETRY_PARAMS, Intrinsics, SceneView, check_intrinsics
 
 PRECISIONS = ("tf32", "fp32")
 
@@ -38,7 +38,7 @@ class RayBatch:
         check_tensor(function, "ray_frames", self.ray_frames, ("R",), torch.int32, like=like)
         check_tensor(function, "pixels", self.pixels, (len(self.ray_frames), 3), torch.int32, like=like)
         check_tensor(function, "poses", self.poses, ("F", 7), torch.float32, like=like)
-        check(len(self.intrinsics) == 4, function, "intrinsics", "be (fx, fy, cx, cy)", tuple(self.intrinsics))
+        check_intrinsics(function, self.intrinsics)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,8 @@ def render_step(
     """Renders rays, compares them with what was measured, and differentiates.
 
     Total = weight_rgb (8) + weight_depth (9) + weight_sdf (10) + weight_free_space (11) of the paper, all averaged over
-    the R rays; a ray without depth adds nothing but counts. Samples along a ray and the terms are those of
+    the R rays; a ray without a positive, finite depth adds nothing but counts, and so does one from a pose that is not
+    finite. Samples along a ray and the terms are those of
     `sample_along_rays`, `volume_render` and `rendering_losses`, of which this is the fusion. Points outside complete
     cells have SDF 1, weight 0 and no gradient.
 

@@ -33,7 +33,7 @@ def query_sdf_gradient(scene: SceneView, points: torch.Tensor) -> tuple[torch.Te
 
     Args:
         scene: the map.
-        points: float32 [N, 3], m.
+        points: float32 [N, 3], m. NaN counts as outside.
 
     Returns:
         sdf, valid, and float32 [N, 3] d sdf / d point (1/m), 0 outside. N = 0 gives empty tensors.
@@ -53,7 +53,7 @@ def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
 
     Args:
         scene: the map; points beyond its planes take the border's colour.
-        points: float32 [N, 3], m.
+        points: float32 [N, 3], m. NaN gives NaN.
 
     Returns:
         float32 [N, 3] in [0, 1]. The same bits for any number of threads. N = 0 gives an empty tensor.

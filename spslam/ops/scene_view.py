@@ -21,6 +21,11 @@ class Intrinsics(NamedTuple):
     cy: float
 
 
+def check_intrinsics(function: str, intrinsics: Sequence[float]) -> None:
+    """Raises ValueError unless a camera has its four numbers."""
+    check(len(intrinsics) == 4, function, "intrinsics", "be (fx, fy, cx, cy)", tuple(intrinsics))
+
+
 @dataclass(frozen=True)
 class SceneView:
     """A map with V vertices and P texels, all tensors on one device.

@@ -7,7 +7,7 @@ from spslam.ops._checks import check, check_tensor
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import Stream
 from spslam.ops.render_step import RenderOptions
-from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 
 def track_adam(
@@ -70,7 +70,7 @@ def track_adam(
     check_tensor(name, "records", records, ("P", 3), torch.int32, like=scene.embeddings)
     check(len(records) >= 1, name, "records", "hold at least one pixel", len(records))
     check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
-    check(len(intrinsics) == 4, name, "intrinsics", "be (fx, fy, cx, cy)", tuple(intrinsics))
+    check_intrinsics(name, intrinsics)
     check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
     check(iterations >= 1, name, "iterations", "be at least 1", iterations)
     check(rotation_rate >= 0, name, "rotation_rate", "be at least 0", rotation_rate)

@@ -32,7 +32,8 @@ def volume_render(
 
     Returns:
         color [R, 3], depth [R] in metres, weights [R, S]. All three are differentiable by `sdf`, `color` and `t`; which
-        samples take part is not differentiated. R = 0 gives empty tensors, S = 0 zeros.
+        samples take part is not differentiated. R = 0 gives empty tensors, S = 0 zeros. NaN makes what it enters NaN,
+        in its own ray alone.
 
     Raises:
         TypeError: a dtype is wrong.
@@ -78,7 +79,8 @@ def rendering_losses(
     - sdf: mean over a ray's near samples of (sdf * truncation - e)^2, m^2.
 
     A ray adds 0 to a term for which it has no sample, and to all of them if its target depth is not positive and
-    finite.
+    finite. A sample whose t is not finite is left out, and a cosine that is NaN is unknown; any other NaN of a ray that
+    takes part makes the terms it enters NaN.
 
     Args:
         color: [R, 3] float32 or float64, rendered.

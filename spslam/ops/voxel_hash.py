@@ -153,7 +153,7 @@ def voxel_hash_update_corner_ids(
 
     Args:
         hash_keys, hash_values: the table, with all V voxels in it.
-        voxel_coords: int32 [V, 3], in the order of the ids.
+        voxel_coords: int32 [V, 3], in the order of the ids. One out of range has no cell: its row is -1.
         corner_ids: int32 [V, 8], contiguous; rows below `first_new` must be up to date with the voxels before.
         first_new: id of the first new voxel. V means there is none: nothing happens.
 

@@ -1,52 +1,47 @@
-"""What every op does with arguments that are wrong, empty or extreme: a clear error, or a documented result."""
+"""What every op does with arguments that are wrong, empty or extreme: a clear error, or a documented result.
+
+What it makes of one bad row among good ones stands in `test_bad_rows`.
+"""
 
 import copy
-from dataclasses import fields, is_dataclass, replace
+import inspect
+import math
 
 import pytest
 import torch
 
 from spslam import ops
+from tests.ops.arguments import cameras, changed, get, numbers, outputs, tensors
 from tests.ops.cases import CASES, arguments
 
 each_op = pytest.mark.parametrize("name", CASES)
+# What takes no tensor to work on: their own tests are enough.
+WITHOUT_TENSORS = {"get_num_threads", "set_num_threads", "mlp_num_params", "new_gradient_sums", "new_voxel_hash"}
 CPU_ONLY = {"sample_frame_pixels", "encode_frame_"}
 # Integers that name rows or places. None may lead outside of a table, whatever its value.
 EXTREME_INTEGERS = (-(2**31), -1, 2**31 - 1)
 # Made by the voxel_hash functions alone; to look through them for sense would cost more than to use them.
 TABLES = ("hash_keys", "hash_values", "corner_ids")
-EXTREME_FLOATS = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 1e-38)
-
-
-def tensors(call):
-    """Paths of all tensors among the arguments, those inside of dataclasses too."""
-    for name, value in call.items():
-        if isinstance(value, torch.Tensor):
-            yield (name,)
-        elif is_dataclass(value):
-            yield from ((name, f.name) for f in fields(value) if isinstance(getattr(value, f.name), torch.Tensor))
-
-
-def get(call, path):
-    value = call[path[0]]
-    return getattr(value, path[1]) if len(path) == 2 else value
-
-
-def changed(call, path, tensor):
-    value = replace(call[path[0]], **{path[1]: tensor}) if len(path) == 2 else tensor
-    return call | {path[0]: value}
+EXTREME_FLOATS = (math.nan, math.inf, -math.inf, 1e30, -1e30, 1e-38)
+# Numbers, not tensors: no counts, which say how long a call runs.
+EXTREME_NUMBERS = {float: (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e30), int: (-(2**63), -(2**31), -1, 0)}
 
 
 def run(name, call):
     return getattr(ops, name)(**call)
 
 
-def outputs(result):
-    if isinstance(result, torch.Tensor):
-        return [result]
-    if is_dataclass(result):
-        return outputs(tuple(getattr(result, f.name) for f in fields(result)))
-    return [tensor for part in result for tensor in outputs(part)] if isinstance(result, tuple) else []
+def result_or_named_error(name, call):
+    """A result, or an error in the house's wording."""
+    try:
+        run(name, copy.deepcopy(call))
+    except (ValueError, TypeError, RuntimeError) as error:
+        assert str(error).startswith(f"{name}: "), error
+
+
+def test_every_op_is_tested():
+    public = {name for name in ops.__all__ if inspect.isfunction(getattr(ops, name))}
+    assert public == set(CASES) | WITHOUT_TENSORS
 
 
 @each_op
@@ -55,38 +50,38 @@ def test_case_is_valid(name, device, generator):
 
 
 @each_op
-def test_another_dtype_is_refused(name, generator):
-    call = arguments(name, generator)
+def test_another_dtype_is_refused(name, device, generator):
+    call = arguments(name, generator, device)
     for path in tensors(call):
         with pytest.raises(TypeError, match=f"{name}: .*{path[-1]} must be .*, got bfloat16"):
             run(name, changed(call, path, get(call, path).to(torch.bfloat16)))
 
 
 @each_op
-def test_what_is_no_tensor_is_refused(name, generator):
-    call = arguments(name, generator)
+def test_what_is_no_tensor_is_refused(name, device, generator):
+    call = arguments(name, generator, device)
     for path in tensors(call):
-        if (name, path[-1]) not in {("sparse_adam_", "stamps")}:
-            with pytest.raises(TypeError, match=f"{name}: .*{path[-1]} must be a torch.Tensor, got list"):
-                run(name, changed(call, path, get(call, path).tolist()))
+        with pytest.raises(TypeError, match=f"{name}: .*{path[-1]} must be a torch.Tensor, got list"):
+            run(name, changed(call, path, get(call, path).tolist()))
 
 
 @each_op
-def test_another_number_of_axes_is_refused(name, generator):
-    call = arguments(name, generator)
+def test_another_number_of_axes_is_refused(name, device, generator):
+    call = arguments(name, generator, device)
     for path in tensors(call):
-        with pytest.raises(ValueError, match=f"{name}: .* must "):
-            run(name, changed(call, path, get(call, path)[None]))
+        for other in (get(call, path)[None], get(call, path).flatten()[0]):
+            with pytest.raises(ValueError, match=f"{name}: .* must "):
+                run(name, changed(call, path, other))
 
 
 @each_op
-def test_another_device_is_refused(name, generator):
-    call = arguments(name, generator)
-    paths = list(tensors(call))
-    if len(paths) > 1:
-        for path in paths:
-            with pytest.raises(ValueError, match=f"{name}: .* must be on "):
-                run(name, changed(call, path, get(call, path).to("meta")))
+@pytest.mark.parametrize("other", ["meta", pytest.param("cpu", marks=pytest.mark.cuda)])
+def test_another_device_is_refused(name, other, device, generator):
+    call = arguments(name, generator, device)
+    paths = [path for path in tensors(call) if get(call, path).device.type != other]
+    for path in paths if len(paths) > 1 else ():
+        with pytest.raises(ValueError, match=f"{name}: .* must be on "):
+            run(name, changed(call, path, get(call, path).to(other)))
 
 
 @each_op
@@ -97,7 +92,7 @@ def test_no_rows_are_legal(name, device, generator):
 
 
 @each_op
-def test_extreme_numbers_do_no_harm(name, device, generator):
+def test_extreme_tensors_do_no_harm(name, device, generator):
     """NaN, infinity and the largest floats, in one argument at a time: no error, nothing outside of the arrays."""
     call = arguments(name, generator, device)
     for path in tensors(call):
@@ -115,8 +110,22 @@ def test_extreme_integers_do_no_harm(name, device, generator):
         own_table = path[-1] in TABLES and name != "trilinear_interpolate"
         if get(call, path).dtype in (torch.int32, torch.int64) and not own_table:
             for value in EXTREME_INTEGERS:
-                extreme = copy.deepcopy(changed(call, path, torch.full_like(get(call, path), value)))
-                try:
-                    run(name, extreme)
-                except (ValueError, RuntimeError) as error:
-                    assert f"{name}: " in str(error)
+                result_or_named_error(name, changed(call, path, torch.full_like(get(call, path), value)))
+
+
+@each_op
+def test_extreme_numbers_do_no_harm(name, device, generator):
+    """Sizes, rates, weights, intrinsics, keys of draws: a result or an error that names the argument."""
+    call = arguments(name, generator, device)
+    for path in numbers(call):
+        for value in EXTREME_NUMBERS[float if isinstance(get(call, path), float) else int]:
+            result_or_named_error(name, changed(call, path, value))
+
+
+@each_op
+def test_a_camera_has_four_numbers(name, device, generator):
+    call = arguments(name, generator, device)
+    for path in cameras(call):
+        for wrong in (get(call, path)[:3], (*get(call, path), 1.0)):
+            with pytest.raises(ValueError, match=rf"{name}: intrinsics must be \(fx, fy, cx, cy\), got \("):
+                run(name, changed(call, path, wrong))

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from spslam import ops
+from tests.ops.arguments import outputs
 from tests.ops.cases import CASES, arguments
-from tests.ops.test_limits import outputs
 
 BATCH = 3
 
