@@ -21,7 +21,6 @@ from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
 from spslam.geometry import pose7_to_matrix, rotation_angle
 from spslam.slam.pixels import sample_frame
-from spslam.slam.rescue import EarlierFrame
 from spslam.slam.state import pose_tensor
 from spslam.slam.system import SlamSystem
 
@@ -78,8 +77,7 @@ def try_start(system: SlamSystem, pixels, number: int, offset: tuple[int, int], 
     tracker, frames, scene = system.tracker, system.state.frames, system.state.scene
     wanted = matrix(tracker.track(scene, pixels, tracker.predict(frames), number).pose)
     start = pose_tensor(moved(wanted, offset, random), frames.poses.device)
-    earlier = EarlierFrame(system.state.pixels.records[-1], frames.poses[-1])
-    for name, help_ in (("tracking", None), ("with rescue", earlier)):
+    for name, help_ in (("tracking", None), ("with rescue", system.past)):
         found = matrix(tracker.track(scene, pixels, start, number, help_).pose)
         distance = np.linalg.norm(found[:3, 3] - wanted[:3, 3])
         back[name].append(distance < BACK_M and rotation_angle(found[:3, :3].T @ wanted[:3, :3]) < BACK_RAD)

@@ -125,6 +125,13 @@ class TrackingOptions(Section):
     damping: float = _option("gauss_newton: share of its diagonal added to the normal matrix", ge=0)
     rescue: bool = _option("gauss_newton: start anew from projective ICP where a frame fits the map badly")
     rescue_below: float = _option("rescue where the mean robust weight of the pixels is below this", ge=0, le=1)
+    doubtful_above: float = _option(
+        "verify a pose, and try others, where the doubt about it is above this (docs/loss.md)", ge=0, le=1
+    )
+    lost_above: float = _option("a frame is lost where the doubt about its pose stays above this", ge=0, le=1)
+    relocalise_frames: int = _option(
+        "stored frames that a lost frame is laid onto, the likest ones; 0 looks for none", "frames", ge=0
+    )
     min_inlier_share: float = _option("a frame with a smaller share of pixels on mapped surface is lost", ge=0, le=1)
     min_valid_share: float = _option("a frame with depth in a smaller share of its image is lost", ge=0, le=1)
 

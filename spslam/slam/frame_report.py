@@ -24,8 +24,13 @@ class FrameReport:
         tracking_iterations: of this frame; 0 for the first.
         residual_cm: weighted RMS distance of its pixels to the map; None where it was not tracked.
         inliers: share of its pixels on mapped surface; None where it was not tracked.
-        support: mean robust weight of its pixels on the map, from 0 to 1; None where it was not tracked, or by Adam.
+        support: mean robust weight of its pixels on the map, from 0 to 1; None where it was not tracked.
+        information: smallest eigenvalue of its normal equations a pixel; None where it was not tracked.
+        jump_cm, jump_deg: from the motion model's pose to the one found; None where that was not asked.
+        conflict: share of its surface that other frames saw to be free space; None where there was no doubt.
+        doubt: probability from these that its pose is wrong; None where it was not tracked.
         rescued: whether its pose comes from a start that projective ICP found.
+        relocalised: whether that start was a stored frame that looks alike.
         mapping_iterations: of the joint optimisation after this frame.
         loss: total loss of the last mapping iteration; None where there was none.
         voxels: allocated vertices.
@@ -47,7 +52,13 @@ class FrameReport:
     residual_cm: float | None
     inliers: float | None
     support: float | None
+    information: float | None
+    jump_cm: float | None
+    jump_deg: float | None
+    conflict: float | None
+    doubt: float | None
     rescued: bool
+    relocalised: bool
     mapping_iterations: int
     loss: float | None
     voxels: int

@@ -1,6 +1,4 @@
-"""A second start for tracking: the frame is laid onto an earlier one by projective ICP, which needs no map."""
-
-from dataclasses import dataclass
+"""Further starts for tracking: the frame is laid onto earlier ones by projective ICP, which needs no map."""
 
 import numpy as np
 import torch
@@ -8,40 +6,27 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix
+from spslam.slam.past import EarlierFrame
 from spslam.slam.pixels import FramePixels, unpack_points
 
 MAP_COLUMNS = 80  # of the frame's surface maps: about three pixel records a cell
 POINTS = 4096  # of the earlier frame
 
 
-@dataclass(frozen=True)
-class EarlierFrame:
-    """A frame whose pose is known.
+class IcpAlignment:
+    """Poses of one frame by ICP against earlier ones, from any number of starts."""
 
-    Attributes:
-        records: int32 [P, 3] its packed pixels in random order.
-        pose: float32 [7] T_world_camera.
-    """
-
-    records: torch.Tensor
-    pose: torch.Tensor
-
-
-class IcpRescue:
-    """Poses of one frame by ICP against an earlier one, from any number of starts."""
-
-    def __init__(self, pixels: FramePixels, earlier: EarlierFrame, camera: Camera):
+    def __init__(self, pixels: FramePixels, camera: Camera):
+        self._camera = camera
         self._maps = surface_maps(pixels, camera)
-        self._points = unpack_points(earlier.records[:POINTS], camera)
-        self._earlier = earlier
 
-    def pose(self, start: torch.Tensor) -> torch.Tensor:
+    def pose(self, earlier: EarlierFrame, start: torch.Tensor) -> torch.Tensor:
         """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
-        earlier = _matrix(self._earlier.pose)
-        between = _pose(compose(inverse(_matrix(start)), earlier), start.device)
-        vertices, normals, intrinsics = self._maps
-        between, _, _ = ops.projective_icp(self._points, vertices, normals, between, intrinsics)
-        return _pose(compose(earlier, inverse(_matrix(between))), start.device)
+        origin = _matrix(earlier.pose)
+        between = _pose(compose(inverse(_matrix(start)), origin), start.device)
+        points = unpack_points(earlier.records[:POINTS], self._camera)
+        between, _, _ = ops.projective_icp(points, *self._maps[:2], between, self._maps[2])
+        return _pose(compose(origin, inverse(_matrix(between))), start.device)
 
 
 def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:

@@ -12,14 +12,16 @@ from spslam.errors import DatasetError
 from spslam.prior import load_prior
 from spslam.slam.frame_feed import PreparedFrame, Upload
 from spslam.slam.frame_report import FrameMarks, FrameReport, PendingReport
+from spslam.slam.loss_decision import Fit
 from spslam.slam.mapper import Mapper
+from spslam.slam.past import Past
 from spslam.slam.pixels import FramePixels, sample_frame
-from spslam.slam.rescue import EarlierFrame
 from spslam.slam.state import SlamState, pose_tensor
 from spslam.slam.timeline import marker
 from spslam.slam.tracker import Tracker, TrackingResult
 from spslam.trajectory import Trajectory
 
+SETTLED_FRAMES = 3  # known one after another, before what follows a loss is trusted with the map
 MAX_DISTANCE_M = 10_000.0  # a float32 still tells a millimetre there
 
 
@@ -58,6 +60,7 @@ class SlamSystem:
         self.first_pose = np.eye(4) if first_pose is None else np.asarray(first_pose, np.float64)
         _check_first_pose(self.first_pose)
         self.state = SlamState.start(config, camera, self.first_pose, decoder, self.device)
+        self.past = Past(self.state, camera)
         self.tracker = Tracker(config, camera)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
 
@@ -84,8 +87,7 @@ class SlamSystem:
         tracked = self._track(pixels, number, marks)
         self.state.frames.append(tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice)
         self.state.pixels.add(pixels.records)
-        # A lost frame must not touch the map.
-        mapped = not tracked.lost and self._is_mapping_frame(number)
+        mapped = self._is_mapping_frame(number)
         self.state.unmapped = not mapped
         iterations, losses = self._map(pixels, marks) if mapped else (0, None)
         loss = None if losses is None else _fetch(losses[0])
@@ -97,10 +99,16 @@ class SlamSystem:
             "lost": bool(self.state.frames.lost[-1]),
             "valid_depth": pixels.valid_share,
             "tracking_iterations": tracked.iterations,
-            "residual_cm": _known(tracked.residual_cm),
-            "inliers": _known(tracked.inlier_share),
-            "support": _known(tracked.support),
+            "residual_cm": _known(tracked.fit.residual_cm),
+            "inliers": _known(tracked.fit.inlier_share),
+            "support": _known(tracked.fit.support),
+            "information": _known(tracked.fit.information),
+            "jump_cm": _known(tracked.fit.jump_cm),
+            "jump_deg": _known(tracked.fit.jump_deg),
+            "conflict": _known(tracked.fit.conflict),
+            "doubt": _known(tracked.fit.doubt),
             "rescued": tracked.rescued,
+            "relocalised": tracked.relocalised,
             "mapping_iterations": iterations,
             "voxels": self.state.scene.volume.num_voxels,
             "decode_ms": frame.decode_ms,
@@ -127,25 +135,20 @@ class SlamSystem:
     def _track(self, pixels: FramePixels, number: int, marks: FrameMarks) -> TrackingResult:
         if self.state.scene.volume.num_voxels == 0:
             pose = pose_tensor(self.first_pose, self.device)
-            return TrackingResult(pose, 0, math.nan, math.nan, lost=self.tracker.is_blind(pixels))
+            return TrackingResult(pose, 0, Fit(), lost=self.tracker.is_blind(pixels))
         begin = self._mark()
         start = self.tracker.predict(self.state.frames)
-        tracked = self.tracker.track(self.state.scene, pixels, start, number, self._earlier())
+        tracked = self.tracker.track(self.state.scene, pixels, start, number, self.past)
         marks.tracking = (begin, self._mark())
         return tracked
 
-    def _earlier(self) -> EarlierFrame | None:
-        """The last frame with pixels and a pose to be trusted."""
-        row, has_pixels, lost = -1, self.state.pixels.has_pixels, self.state.frames.lost
-        if lost[row] or not has_pixels[row]:
-            rows = self.state.usable.nonzero()[:, 0]
-            if len(rows) == 0:
-                return None
-            row = int(rows[-1])
-        return EarlierFrame(self.state.pixels.records[row], self.state.frames.poses[row])
-
     def _is_mapping_frame(self, number: int) -> bool:
-        return number % self.config.mapping.every == 0 or self.state.scene.volume.num_voxels == 0
+        """Whether the newest frame is to be mapped: a lost one never, one soon after loss not yet."""
+        if self.state.scene.volume.num_voxels == 0:
+            return not bool(self.state.frames.lost[-1])
+        if number % self.config.mapping.every:
+            return False
+        return not bool(self.state.frames.lost[-SETTLED_FRAMES:].any())
 
     def _map(self, pixels: FramePixels, marks: FrameMarks) -> tuple[int, torch.Tensor | None]:
         """Encodes and optimises; returns the number of iterations and the last one's losses."""

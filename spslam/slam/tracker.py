@@ -9,9 +9,11 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
+from spslam.slam.loss_decision import Fit, information, jump
 from spslam.slam.optimization import render_options
+from spslam.slam.past import Past
 from spslam.slam.pixels import FramePixels
-from spslam.slam.rescue import EarlierFrame, IcpRescue
+from spslam.slam.rescue import IcpAlignment
 from spslam.slam.state import FrameTable
 
 RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
@@ -24,20 +26,18 @@ class TrackingResult:
     Attributes:
         pose: float32 [7].
         iterations: how many were made.
-        residual_cm: weighted root mean squared distance of the pixels to the mapped surface; NaN if not tracked.
-        inlier_share: share of pixels that fall on mapped surface; NaN if not tracked.
+        fit: of the pose found, also where it is not taken.
         lost: whether the pose is not to be trusted.
-        support: mean robust weight of all pixels, from 0 (none fits the map) to 1 (all do); NaN where not known.
         rescued: whether the pose comes from a start that ICP found.
+        relocalised: whether that start was another frame than the last.
     """
 
     pose: torch.Tensor
     iterations: int
-    residual_cm: float
-    inlier_share: float
+    fit: Fit
     lost: bool
-    support: float = math.nan
     rescued: bool = False
+    relocalised: bool = False
 
 
 class Tracker:
@@ -61,25 +61,28 @@ class Tracker:
         pixels: FramePixels,
         start: torch.Tensor,
         frame: int,
-        earlier: EarlierFrame | None = None,
+        past: Past | None = None,
     ) -> TrackingResult:
-        """Optimises the pose from `start`; where that fits badly, tries again from where ICP leads.
+        """Optimises the pose from `start`; where that is doubtful, tries again from where ICP leads.
 
         Args:
             scene: the map, not changed.
             pixels: of the frame.
-            start: float32 [7].
+            start: float32 [7] where the motion model puts the camera.
             frame: number of the frame, keys the random draws.
-            earlier: the last frame whose pose is trusted; without it there is no second try.
+            past: the frames before; without it there is no second try.
+
+        Returns:
+            The best supported pose; `start` where the frame is lost.
         """
         if self.is_blind(pixels):
-            return TrackingResult(start.clone(), 0, math.nan, math.nan, lost=True)
-        if self.config.tracking.optimizer == "adam":
-            return self._track_adam(scene, pixels.records, start, frame)
-        result = self._track_gauss_newton(scene, pixels.records, start, frame)
-        if earlier is None or not self._is_doubtful(result):
-            return result
-        return self._rescue(scene, pixels, start, frame, earlier, result)
+            return TrackingResult(start.clone(), 0, Fit(), lost=True)
+        adam = self.config.tracking.optimizer == "adam"
+        find = self._track_adam if adam else self._track_gauss_newton
+        result = find(scene, pixels.records, start, frame, self._iterations(frame))
+        if past is not None and (past.is_lost or self._is_doubtful(result)):
+            result = self._look_again(scene, pixels, start, frame, past, result)
+        return replace(result, pose=start.clone()) if result.lost else result
 
     def is_blind(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to tell a pose from."""
@@ -90,59 +93,14 @@ class Tracker:
         return tracking.first_iterations if frame <= tracking.first_frames else tracking.iterations
 
     def _track_gauss_newton(
-        self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int
+        self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int, iterations: int
+    ) -> TrackingResult:
+        return self._fitted(scene, records, start, start, frame, iterations, self.config.tracking.kernel_start_m)
+
+    def _track_adam(
+        self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int, iterations: int
     ) -> TrackingResult:
         tracking = self.config.tracking
-        pose, stats, _ = ops.track_gauss_newton(
-            scene.view(),
-            records,
-            start,
-            self.intrinsics,
-            num_pixels=tracking.pixels,
-            iterations=self._iterations(frame),
-            truncation=scene.settings.truncation_m,
-            kernel_start=tracking.kernel_start_m,
-            kernel_end=tracking.kernel_end_m,
-            damping=tracking.damping,
-            seed=self.config.seed,
-            stream=ops.Stream.TRACKING_PIXELS,
-            frame=frame,
-        )
-        cost, inlier_share, _, _, support = stats[-1].tolist()  # the frame's one wait for the device
-        return self._judged(start, pose, len(stats), cost, inlier_share, support)
-
-    def _is_doubtful(self, result: TrackingResult) -> bool:
-        """Whether so little of the frame fits the map that the pose may be a wrong one."""
-        return self.config.tracking.rescue and (result.lost or result.support < self.config.tracking.rescue_below)
-
-    def _rescue(
-        self,
-        scene: Scene,
-        pixels: FramePixels,
-        start: torch.Tensor,
-        frame: int,
-        earlier: EarlierFrame,
-        first: TrackingResult,
-    ) -> TrackingResult:
-        """The best supported of the first result and those from ICP's poses, begun at `start` and at the last pose."""
-        icp, best = IcpRescue(pixels, earlier, self.camera), first
-        iterations = first.iterations
-        for guess in (start, earlier.pose):
-            again = self._track_gauss_newton(scene, pixels.records, icp.pose(guess), frame)
-            iterations += again.iterations
-            if self._is_better(again, best):
-                best = replace(again, rescued=True)
-        pose = start.clone() if best.lost else best.pose
-        return replace(best, pose=pose, iterations=iterations)
-
-    def _is_better(self, result: TrackingResult, than: TrackingResult) -> bool:
-        """Whether a second result replaces the first; in place of a lost one only what needs no rescue itself."""
-        if than.lost:
-            return not self._is_doubtful(result)
-        return not result.lost and result.support > than.support + RESCUE_GAIN
-
-    def _track_adam(self, scene: Scene, records: torch.Tensor, start: torch.Tensor, frame: int) -> TrackingResult:
-        tracking, iterations = self.config.tracking, self._iterations(frame)
         best, _ = ops.track_adam(
             scene.view(),
             records,
@@ -156,29 +114,109 @@ class Tracker:
             graph=self._graph,
         )
         # A pose that looks away from the map has no loss either, so its fit to the surface decides.
-        _, _, cost, inlier_share = ops.gauss_newton_poses(
-            scene.view(),
-            records[None, : tracking.pixels],
-            best[None],
-            self.intrinsics,
-            truncation=scene.settings.truncation_m,
-            kernel=tracking.kernel_end_m,
-        )
-        fit = torch.cat([cost, inlier_share]).tolist()
-        return self._judged(start, best, iterations, *fit)
+        fitted = self._fitted(scene, records, start, best, frame, 1, tracking.kernel_end_m)
+        return replace(fitted, pose=best, iterations=iterations)
 
-    def _judged(
+    def _fitted(
         self,
+        scene: Scene,
+        records: torch.Tensor,
+        expected: torch.Tensor,
         start: torch.Tensor,
-        pose: torch.Tensor,
+        frame: int,
         iterations: int,
-        cost: float,
-        inlier_share: float,
-        support: float = math.nan,
+        kernel_start_m: float,
     ) -> TrackingResult:
-        """The result with `pose`, or with `start` where that is lost; `cost` in m^2. A pose of NaN has no inliers."""
-        found = inlier_share >= self.config.tracking.min_inlier_share
-        residual_cm = 100 * math.sqrt(max(cost, 0.0))
-        return TrackingResult(
-            pose if found else start.clone(), iterations, residual_cm, inlier_share, not found, support
+        """Gauss-Newton from `start`, and how its pose fits; the jump is the way from the expected pose."""
+        tracking = self.config.tracking
+        pose, stats, hessian = ops.track_gauss_newton(
+            scene.view(),
+            records,
+            start,
+            self.intrinsics,
+            num_pixels=tracking.pixels,
+            iterations=iterations,
+            truncation=scene.settings.truncation_m,
+            kernel_start=kernel_start_m,
+            kernel_end=tracking.kernel_end_m,
+            damping=tracking.damping,
+            seed=self.config.seed,
+            stream=ops.Stream.TRACKING_PIXELS,
+            frame=frame,
         )
+        # The frame's one wait for the device.
+        numbers = torch.cat([expected, pose, stats[-1], hessian.view(-1)]).tolist()
+        cost, inlier_share, _, _, support = numbers[14:19]
+        fit = Fit(
+            100 * math.sqrt(max(cost, 0.0)),
+            inlier_share,
+            support,
+            information(numbers[19:], tracking.pixels),
+            *jump(numbers[:7], numbers[7:14]),
+        )
+        return TrackingResult(pose, iterations, fit, self._is_lost(fit))
+
+    def _is_lost(self, fit: Fit) -> bool:
+        """Whether the pose is to be given up; one of NaN has no inliers."""
+        tracking = self.config.tracking
+        return not (fit.inlier_share >= tracking.min_inlier_share and fit.doubt <= tracking.lost_above)
+
+    def _is_doubtful(self, result: TrackingResult) -> bool:
+        """Whether so little speaks for the pose that it may be a wrong one."""
+        tracking = self.config.tracking
+        return result.lost or result.fit.doubt > tracking.doubtful_above or result.fit.support < tracking.rescue_below
+
+    def _look_again(
+        self,
+        scene: Scene,
+        pixels: FramePixels,
+        start: torch.Tensor,
+        frame: int,
+        past: Past,
+        first: TrackingResult,
+    ) -> TrackingResult:
+        """The best supported of the first result and those that ICP leads to, held against what other frames saw.
+
+        It begins at the last trusted frame, and where that is no good at the stored frames that look most alike.
+        """
+        tracking, alignment, best = self.config.tracking, IcpAlignment(pixels, self.camera), first
+        last = past.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
+        starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
+        best = self._best(scene, pixels, starts, start, frame, best)
+        best = self._verified(pixels, past, best)
+        if not best.lost:
+            return best
+        alike = past.similar(pixels, tracking.relocalise_frames)
+        starts = [alignment.pose(other, other.pose) for other in alike]
+        found = self._best(scene, pixels, starts, start, frame, best)
+        # Where a camera may be that looks like a frame of long ago, the motion model doesn't know.
+        found = self._verified(pixels, past, found, has_motion=False)
+        return replace(found, relocalised=found.pose is not best.pose and not found.lost)
+
+    def _best(
+        self,
+        scene: Scene,
+        pixels: FramePixels,
+        starts: list[torch.Tensor],
+        expected: torch.Tensor,
+        frame: int,
+        best: TrackingResult,
+    ) -> TrackingResult:
+        """The best supported of a result and those from other starts; its iterations are those of all."""
+        iterations = best.iterations
+        kernel_m, tracking = self.config.tracking.kernel_start_m, self.config.tracking
+        for guess in starts:
+            again = self._fitted(scene, pixels.records, expected, guess, frame, tracking.iterations, kernel_m)
+            iterations += again.iterations
+            if again.fit.support > best.fit.support + RESCUE_GAIN:
+                best = replace(again, rescued=True)
+        return replace(best, iterations=iterations)
+
+    def _verified(
+        self, pixels: FramePixels, past: Past, result: TrackingResult, has_motion: bool = True
+    ) -> TrackingResult:
+        """The result, judged anew with what other frames saw to be free; after loss the motion model has no say."""
+        fit = replace(result.fit, conflict=past.conflict(pixels, result.pose))
+        if past.is_lost or not has_motion:
+            fit = replace(fit, jump_cm=math.nan, jump_deg=math.nan)
+        return replace(result, fit=fit, lost=self._is_lost(fit))

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from spslam.geometry import pose7_to_matrix, rotation_angle
+from spslam.slam.past import EarlierFrame, Past
 from spslam.slam.pixels import sample_frame, unpack_points
-from spslam.slam.rescue import EarlierFrame, IcpRescue, surface_maps
+from spslam.slam.rescue import IcpAlignment, surface_maps
 from spslam.slam.state import pose_tensor
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
@@ -82,8 +83,8 @@ def test_a_frame_without_normals_has_empty_maps(dataset, pixels):
 @pytest.mark.parametrize(("shift_m", "angle_deg"), [(0.0, 0.0), (0.05, 5.0), (0.1, 10.0)])
 def test_icp_leads_to_where_tracking_finds_the_pose(dataset, system, pixels, shift_m, angle_deg):
     truth = dataset.poses()[10]
-    icp = IcpRescue(pixels, earlier(system), dataset.camera)
-    assert_near(icp.pose(moved(truth, shift_m, angle_deg)), truth, distance_m=0.02, angle_deg=2.0)
+    found = IcpAlignment(pixels, dataset.camera).pose(earlier(system), moved(truth, shift_m, angle_deg))
+    assert_near(found, truth, distance_m=0.02, angle_deg=2.0)
 
 
 @pytest.mark.parametrize(("shift_m", "angle_deg"), [(0.15, 12.0), (50.0, 90.0)])
@@ -91,30 +92,38 @@ def test_a_wrong_start_is_rescued(dataset, system, pixels, shift_m, angle_deg):
     truth = dataset.poses()[10]
     start = moved(truth, shift_m, angle_deg)
     alone = system.tracker.track(system.state.scene, pixels, start, 10)
-    result = system.tracker.track(system.state.scene, pixels, start, 10, earlier(system))
-    assert alone.lost or alone.support < system.config.tracking.rescue_below
+    result = system.tracker.track(system.state.scene, pixels, start, 10, system.past)
+    assert alone.lost or alone.fit.support < system.config.tracking.rescue_below
     assert result.rescued and not result.lost
-    assert result.support > alone.support
-    assert result.iterations == 3 * alone.iterations
+    assert result.fit.support > alone.fit.support
+    assert result.iterations > alone.iterations
     assert_near(result.pose, truth)
+
+
+class Elsewhere(Past):
+    """Frames that were seen in another place."""
+
+    def _frame(self, row):
+        return EarlierFrame(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
 
 
 def test_what_cannot_be_rescued_stays_lost(dataset, system, pixels):
     """The view of another place: no start helps."""
-    elsewhere = EarlierFrame(system.state.pixels.records[0], moved(dataset.poses()[0], 50.0, 90.0))
     start = moved(dataset.poses()[10], 50.0, 90.0)
-    result = system.tracker.track(system.state.scene, pixels, start, 10, elsewhere)
-    assert result.lost and not result.rescued
+    result = system.tracker.track(system.state.scene, pixels, start, 10, Elsewhere(system.state, dataset.camera))
+    assert result.lost and not result.relocalised
     assert torch.equal(result.pose, start)
 
 
 def test_rescue_can_be_turned_off(dataset, pixels):
-    plain = SlamSystem(settings("tracking.rescue=false"), dataset.camera, dataset.poses()[0])
+    off = ("tracking.rescue=false", "tracking.relocalise_frames=0")
+    plain = SlamSystem(settings(*off), dataset.camera, dataset.poses()[0])
     plain.process(dataset[0])
-    result = plain.tracker.track(plain.state.scene, pixels, moved(dataset.poses()[10], 50.0, 90.0), 10, earlier(plain))
+    result = plain.tracker.track(plain.state.scene, pixels, moved(dataset.poses()[10], 50.0, 90.0), 10, plain.past)
     assert result.lost and not result.rescued
 
 
 def test_a_clean_run_needs_no_rescue(system):
-    assert not any(report.rescued for report in system.reports)
+    assert not any(report.rescued or report.lost for report in system.reports)
     assert min(report.support for report in system.reports[1:]) > system.config.tracking.rescue_below
+    assert max(report.doubt for report in system.reports[1:]) < system.config.tracking.doubtful_above

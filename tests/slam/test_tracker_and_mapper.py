@@ -67,7 +67,7 @@ def test_a_view_off_the_map_is_lost_and_keeps_its_start(dataset, preset):
     start = pose_tensor(away, CPU)
     result = system.tracker.track(system.state.scene, pixels, start, 1)
     assert result.lost
-    assert result.inlier_share < 0.1
+    assert result.fit.inlier_share < 0.1
     torch.testing.assert_close(result.pose, start)
 
 
@@ -77,8 +77,8 @@ def test_a_frame_near_the_map_is_found(dataset, preset):
     pixels = sample_frame(dataset[1], dataset.camera, system.config)
     result = system.tracker.track(system.state.scene, pixels, pose_tensor(dataset.poses()[1], CPU), 1)
     assert not result.lost
-    assert result.inlier_share > 0.5
-    assert result.residual_cm < 2
+    assert result.fit.inlier_share > 0.5
+    assert result.fit.residual_cm < 2
     assert np.linalg.norm(result.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
 
 
@@ -90,7 +90,7 @@ def test_little_depth_is_lost_without_a_try(dataset):
     result = system.tracker.track(system.state.scene, pixels, pose_tensor(frame.pose, CPU), 1)
     assert result.lost
     assert result.iterations == 0
-    assert np.isnan(result.residual_cm)
+    assert np.isnan(result.fit.residual_cm)
 
 
 def test_tracking_leaves_the_map_alone(dataset):

@@ -1,0 +1,80 @@
+"""Whether a pose is to be trusted: the odds that it is wrong, from all that its fit to the map says.
+
+A logistic model of four measures, fitted to right poses of clean runs and to what tracking makes of wrong starts
+(docs/loss.md has the figures and the command):
+
+    ln odds = -6.9 - 10 support - 2.1 lg(information) + 3.6 jump + 23 conflict
+
+support is the mean robust weight of the frame's pixels, information the smallest eigenvalue of the normal equations a
+pixel (how well the worst direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5
+degrees) from where the motion model put the camera, conflict the share of its surface that lies where other frames saw
+free space. What is not known takes part as a number between right and wrong.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+CONSTANT, PER_SUPPORT, PER_INFORMATION, PER_JUMP, PER_CONFLICT = -6.9, -10.0, -2.1, 3.6, 23.0
+JUMP_CM, JUMP_DEG = 5.0, 2.5
+LEAST_INFORMATION = 1e-6
+MOST_CONFLICT = 0.3  # beyond it one wrong pose is as wrong as another
+UNKNOWN_JUMP, UNKNOWN_CONFLICT = 1.3, 0.11
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a pose fits; NaN where something was not measured.
+
+    Attributes:
+        residual_cm: weighted root mean squared distance of the pixels to the mapped surface.
+        inlier_share: share of the pixels that fall on mapped surface.
+        support: mean robust weight of all pixels, from 0 (none fits the map) to 1 (all do).
+        information: smallest eigenvalue of the normal equations a pixel, 1.
+        jump_cm, jump_deg: distance and angle to the pose that was expected.
+        conflict: share of the pixels on surface known to be elsewhere, of those whose surface is known.
+    """
+
+    residual_cm: float = math.nan
+    inlier_share: float = math.nan
+    support: float = math.nan
+    information: float = math.nan
+    jump_cm: float = math.nan
+    jump_deg: float = math.nan
+    conflict: float = math.nan
+
+    @property
+    def doubt(self) -> float:
+        """Probability in [0, 1] that the pose is wrong; NaN where nothing was measured."""
+        if math.isnan(self.support) or math.isnan(self.information):
+            return math.nan
+        jump = math.log1p(self.jump_cm / JUMP_CM + self.jump_deg / JUMP_DEG)
+        odds = (
+            CONSTANT
+            + PER_SUPPORT * self.support
+            + PER_INFORMATION * math.log10(max(self.information, LEAST_INFORMATION))
+            + PER_JUMP * (UNKNOWN_JUMP if math.isnan(jump) else jump)
+            + PER_CONFLICT * (UNKNOWN_CONFLICT if math.isnan(self.conflict) else min(self.conflict, MOST_CONFLICT))
+        )
+        return 1 / (1 + math.exp(-odds))
+
+
+def jump(start: list[float], pose: list[float]) -> tuple[float, float]:
+    """Distance (cm) and angle (degrees) between two poses, each seven numbers; NaN where one of them is."""
+    near, far = (math.dist(start[:4], [sign * number for number in pose[:4]]) for sign in (1, -1))
+    chord = min(near, far, 2.0) if near == near else math.nan  # 2 sin(angle / 4), exact for small angles too
+    return 100 * math.dist(start[4:], pose[4:]), math.degrees(4 * math.asin(chord / 2))
+
+
+def information(hessian: list[float], pixels: int) -> float:
+    """Smallest eigenvalue of the normal equations a pixel; NaN where they hold no number.
+
+    Args:
+        hessian: 36 numbers, symmetric.
+        pixels: that they are a sum over.
+    """
+    matrix = np.array(hessian).reshape(6, 6)
+    if not np.isfinite(matrix).all():
+        return math.nan
+    return max(float(np.linalg.eigvalsh(matrix)[0]), 0.0) / pixels
