@@ -1,5 +1,6 @@
 #include <algorithm>
 
+#include "cpu/key_sort.h"
 #include "kernels/voxel_hash_launch.h"
 
 namespace spslam {
@@ -26,7 +27,7 @@ AbsentVoxels voxel_hash_absent<Cpu>(Cpu device, const std::int64_t* hash_keys, c
   });
   const std::int64_t out_of_range = std::count(absent_keys, absent_keys + n, kOutOfRange);
   std::int64_t* end = std::remove_if(absent_keys, absent_keys + n, [](std::int64_t key) { return key < 0; });
-  if (!std::is_sorted(absent_keys, end)) std::sort(absent_keys, end);
+  if (!std::is_sorted(absent_keys, end)) sort_keys(absent_keys, end - absent_keys);
   end = std::unique(absent_keys, end);
   return {end - absent_keys, out_of_range};
 }

@@ -39,6 +39,16 @@ def test_insert_numbers_absent_voxels_in_sorted_order(device, generator):
     assert ops.voxel_hash_find(keys, values, probe.to(device)).tolist() == reference.find(probe.tolist())
 
 
+@pytest.mark.parametrize("extent", [1, 30, LIMIT])
+def test_many_are_numbered_in_sorted_order(extent, device, generator):
+    """So many that they are not sorted by comparisons; every digit of a packed coordinate counts, or only some."""
+    batch = random_coords(50_000, extent, generator)
+    batch[:, 0] = batch[:, 0].clamp(min=0) if extent == 30 else batch[:, 0]
+    keys, values = ops.new_voxel_hash(1 << 17, device)
+    got = ops.voxel_hash_insert(keys, values, batch.to(device), 0)
+    assert torch.equal(got.cpu(), batch.unique(dim=0))
+
+
 COORD = st.one_of(st.integers(-3, 3), st.sampled_from([-LIMIT, -LIMIT + 1, LIMIT - 2, LIMIT - 1]))
 BATCH = st.lists(st.tuples(COORD, COORD, COORD), max_size=40)
 
