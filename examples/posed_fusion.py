@@ -2,6 +2,7 @@
 
 python examples/posed_fusion.py mesh.ply                     the generated room
 python examples/posed_fusion.py mesh.ply --data recording    a folder with color/, depth/, intrinsics.txt, poses.txt
+python examples/posed_fusion.py mesh.ply --device cuda       on a GPU
 """
 
 import argparse
@@ -19,25 +20,28 @@ POINTS = 8000  # a frame
 MIN_WEIGHT, FULL_WEIGHT, MAX_WEIGHT = 0.006, 2.5, 20.0  # of what the points give to a vertex; of a vertex in all
 
 
-def surface_points(frame, camera):
+def surface_points(frame, camera, device):
     """World points and unit normals [N, 3] of randomly drawn pixels."""
-    depth = torch.from_numpy(frame.depth)
+    depth = torch.from_numpy(frame.depth).to(device)
     measured = depth.flatten().nonzero()[:, 0]
-    drawn = measured[ops.sample_indices(0, ops.Stream.ENCODER_POINTS, frame.index, 0, POINTS, max(len(measured), 1))]
+    key = 0, ops.Stream.ENCODER_POINTS, frame.index, 0
+    drawn = measured[ops.sample_indices(*key, POINTS, max(len(measured), 1), device)]
     u, v, z = drawn % camera.width, drawn // camera.width, depth.flatten()[drawn]
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     normals = ops.depth_normals(depth, torch.stack([u, v], 1).int(), *intrinsics, step_px=4, max_jump=0.05)
     points = torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
-    T_world_camera = torch.from_numpy(frame.pose).float()
+    T_world_camera = torch.from_numpy(frame.pose).float().to(device)
     known, rotation = (normals != 0).any(1), T_world_camera[:3, :3]
     return points[known] @ rotation.T + T_world_camera[:3, 3], normals[known] @ rotation.T
 
 
-def fuse(frames, camera, prior):
+def fuse(frames, camera, prior, device):
     """Encodes every frame's points and averages the features at the vertices around them (equation 1)."""
-    cells, embeddings, weights = ops.VoxelHash(), torch.zeros(0, 8), torch.zeros(0)
+    cells = ops.VoxelHash(device=device)
+    embeddings, weights = torch.zeros(0, 8, device=device), torch.zeros(0, device=device)
     for frame in frames:
-        encoded = ops.encode_points(*surface_points(frame, camera), prior.encoder_params, VOXEL_M, prior.neighborhood)
+        points, normals = surface_points(frame, camera, device)
+        encoded = ops.encode_points(points, normals, prior.encoder_params, VOXEL_M, prior.neighborhood)
         keep = encoded[2] > MIN_WEIGHT
         coords, features, share = (part[keep] for part in encoded)
         ids = cells.insert(coords)
@@ -51,7 +55,7 @@ def extract_mesh(cells, embeddings, prior):
     """Decodes the distance on a grid in every cell (equation 2) and cuts it at zero."""
     complete = cells.corner_ids[:, 0] >= 0
     coords, corners = cells.voxel_coords[complete], cells.corner_ids[complete]
-    local = torch.cartesian_prod(*[torch.linspace(0, 1, CUBES + 1)] * 3)
+    local = torch.cartesian_prod(*[torch.linspace(0, 1, CUBES + 1, device=coords.device)] * 3)
     per_cell = (len(coords), len(local))
     features = ops.trilinear_interpolate(
         embeddings, corners[:, None].expand(*per_cell, 8).reshape(-1, 8), local.expand(*per_cell, 3).reshape(-1, 3)
@@ -68,16 +72,17 @@ def main():
     parser.add_argument("mesh", help="file to write, .ply, .obj or .glb")
     parser.add_argument("--data", help="folder with color/, depth/, intrinsics.txt and poses.txt")
     parser.add_argument("--frames", type=int, default=60, help="of the generated room")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     args = parser.parse_args()
     config = load_config(
         "folder" if args.data else "demo", overrides=[] if args.data else [f"dataset.frames={args.frames}"]
     )
-    dataset, prior = open_dataset(config.dataset, args.data), load_prior()
+    dataset, prior = open_dataset(config.dataset, args.data), load_prior().to(torch.device(args.device))
     if dataset.poses() is None:
         parser.error(f"{args.data}: poses.txt is needed here")
-    cells, embeddings = fuse(dataset, dataset.camera, prior)
+    cells, embeddings = fuse(dataset, dataset.camera, prior, args.device)
     vertices, faces = extract_mesh(cells, embeddings, prior)
-    trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False).export(args.mesh)
+    trimesh.Trimesh(vertices.cpu().numpy(), faces.cpu().numpy(), process=False).export(args.mesh)
     print(f"{len(dataset)} frames, {len(cells)} voxels, {len(vertices)} vertices, {len(faces)} faces: {args.mesh}")
 
 
