@@ -2,6 +2,7 @@
 
 python -m benchmarks.alternatives --device cpu --threads 2
 python -m benchmarks.alternatives --cpu-time     on a machine that others use: the CPU time of one thread
+python -m benchmarks.alternatives --device cuda  by the wall clock, launches included, and by the GPU's clock
 """
 
 import functools
@@ -103,7 +104,21 @@ def suites(generator: torch.Generator, device: torch.device) -> list[Suite]:
     return found
 
 
-def row(name: str, direction: str, times: dict[str, float], own: str = "spslam") -> dict[str, object]:
+Clocks = dict[str, Callable[[dict[str, Callable]], dict[str, float]]]
+
+
+def rows_of(name: str, direction: str, contenders: dict[str, Callable], clocks: Clocks) -> list[dict[str, object]]:
+    """A row by each clock, for each way of ours."""
+    measured = {clock: compare(contenders) for clock, compare in clocks.items()}
+    return [
+        row(name + own.removeprefix("spslam"), f"{direction}{clock}", times, own)
+        for clock, times in measured.items()
+        for own in times
+        if own.startswith("spslam")
+    ]
+
+
+def row(name: str, direction: str, times: dict[str, float], own: str) -> dict[str, object]:
     """Our time, the best alternative and its time as a multiple of ours."""
     others = {key: value for key, value in times.items() if not key.startswith("spslam")}
     best = min(others, key=others.__getitem__)
@@ -117,6 +132,14 @@ def row(name: str, direction: str, times: dict[str, float], own: str = "spslam")
     }
 
 
+def clocks_of(device: torch.device, rounds: int, clock: Callable[[], float]) -> Clocks:
+    """The clocks to measure by: on a GPU its own too."""
+    clocks: Clocks = {"": functools.partial(timing.compare, rounds=rounds, device=device, clock=clock)}
+    if device.type == "cuda":
+        clocks[", GPU clock"] = functools.partial(timing.compare_on_gpu, rounds=rounds, device=device)
+    return clocks
+
+
 def main() -> None:
     parser = timing.arguments("ops against their best alternatives")
     parser.add_argument(
@@ -125,16 +148,15 @@ def main() -> None:
     args = parser.parse_args()
     device = torch.device(args.device)
     timing.use_threads(1 if args.cpu_time else args.threads)
-    clock = time.process_time if args.cpu_time else time.perf_counter
-    compare = functools.partial(timing.compare, rounds=args.rounds, device=device, clock=clock)
+    clocks = clocks_of(device, args.rounds, time.process_time if args.cpu_time else time.perf_counter)
     generator = torch.Generator().manual_seed(0)
     rows: list[dict[str, object]] = []
     for name, contenders, differentiable in suites(generator, device):
         forward = {key: composable.forward(*pair) for key, pair in contenders.items()}
-        rows.append(row(name, "forward", compare(forward)))
+        rows += rows_of(name, "forward", forward, clocks)
         if differentiable:
             both = {key: composable.forward_and_backward(*pair, differentiable) for key, pair in contenders.items()}
-            rows.append(row(name, "forward + backward", compare(both)))
+            rows += rows_of(name, "forward + backward", both, clocks)
     named = {
         f"sparse_adam_, {map_ops.TOUCHED} of {map_ops.ROWS} rows": map_ops.adam(generator, device),
         "normal equations and solution": map_ops.gauss_newton_step(generator, device),
@@ -142,9 +164,7 @@ def main() -> None:
         "marching_cubes, sphere in 256^3": map_ops.marching_cubes(device),
     }
     for name, functions in named.items():
-        times = compare(functions)
-        for own in (key for key in times if key.startswith("spslam")):
-            rows.append(row(name + own.removeprefix("spslam"), "forward", times, own))
+        rows += rows_of(name, "forward", functions, clocks)
     timing.report(f"{room.FRAMES} frames, {composable.RAYS} rays", rows, device, args.json)
 
 

@@ -76,7 +76,7 @@ def packed(coords: torch.Tensor) -> torch.Tensor:
 
 
 def hash_contenders(generator: torch.Generator, device: torch.device) -> dict[str, Contenders]:
-    """Finding the distinct ones among many voxels, and looking many up, against sorting and bisection."""
+    """The distinct ones of many voxels, looking many up, and both, against sorting and bisection."""
     distinct = torch.randint(-200, 200, (DISTINCT, 3), generator=generator, dtype=torch.int32)
     coords = distinct[torch.randint(0, DISTINCT, (POINTS,), generator=generator)].to(device)
     capacity = 1 << (4 * DISTINCT).bit_length()
@@ -88,8 +88,18 @@ def hash_contenders(generator: torch.Generator, device: torch.device) -> dict[st
 
     keys, values = insert()
     ordered = packed(coords).unique()
+
+    def sort_and_bisect():
+        words = packed(coords)
+        return torch.searchsorted(words.unique(), words)
+
     return {
         "voxel_hash_insert": {"spslam": insert, "torch": lambda: packed(coords).unique()},
+        "voxel_hash_insert + find": {
+            "spslam": lambda: ops.voxel_hash_find(*insert(), coords),
+            "torch": sort_and_bisect,
+            "torch, inverse": lambda: packed(coords).unique(return_inverse=True),
+        },
         "voxel_hash_find": {
             "spslam": lambda: ops.voxel_hash_find(keys, values, coords),
             "torch": lambda: torch.searchsorted(ordered, packed(coords)),

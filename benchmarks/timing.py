@@ -12,6 +12,9 @@ import torch
 from spslam import ops
 from spslam.benchmark.environment import describe_environment
 
+TURN_MS, MAX_CALLS = 5.0, 20  # of a turn on a GPU
+IDLE_CYCLES = 30_000_000  # 15 to 20 ms, in which Python launches a turn
+
 
 def compare(
     contenders: dict[str, Callable[[], object]],
@@ -19,20 +22,63 @@ def compare(
     device: torch.device,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Median milliseconds of each contender.
+    """Median milliseconds of a call of each contender, its launches from Python included.
 
-    They take turns, so that a machine that others use slows all of them alike. Two warm-up turns are not counted.
+    They take turns, so that a machine that others use slows all of them alike; warm-up is not counted. On a GPU a turn
+    is as many calls one after the other as fill some milliseconds, and one wait at its end.
     """
+    return _in_turns(contenders, rounds, device, lambda function, calls: _wall_ms(function, calls, device, clock))
+
+
+def compare_on_gpu(contenders: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
+    """The same by the GPU's clock: launches wait behind an idle kernel, so what Python takes for them doesn't count.
+
+    A contender that waits for the GPU itself, or works on the CPU, is charged for it here too.
+    """
+    return _in_turns(contenders, rounds, device, _gpu_ms)
+
+
+def _in_turns(
+    contenders: dict[str, Callable[[], object]],
+    rounds: int,
+    device: torch.device,
+    milliseconds: Callable[[Callable[[], object], int], float],
+) -> dict[str, float]:
+    """Medians of `milliseconds(contender, calls)`."""
+    calls = {name: _calls_a_turn(function, device) for name, function in contenders.items()}
     times: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(rounds + 2):
+    for _ in range(rounds):
         for name, function in contenders.items():
-            _synchronize(device)
-            start = clock()
-            function()
-            _synchronize(device)
-            if turn >= 2:
-                times[name].append((clock() - start) * 1e3)
+            times[name].append(milliseconds(function, calls[name]))
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+def _calls_a_turn(function: Callable[[], object], device: torch.device) -> int:
+    """One on the CPU; warms up on both."""
+    for _ in range(2):
+        once = _wall_ms(function, 1, device, time.perf_counter)
+    return max(1, min(MAX_CALLS, int(TURN_MS / max(once, 1e-3)))) if device.type == "cuda" else 1
+
+
+def _wall_ms(function: Callable[[], object], calls: int, device: torch.device, clock: Callable[[], float]) -> float:
+    _synchronize(device)
+    start = clock()
+    for _ in range(calls):
+        function()
+    _synchronize(device)
+    return (clock() - start) * 1e3 / calls
+
+
+def _gpu_ms(function: Callable[[], object], calls: int) -> float:
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    torch.cuda.synchronize()
+    torch.cuda._sleep(IDLE_CYCLES)
+    start.record()
+    for _ in range(calls):
+        function()
+    end.record()
+    torch.cuda.synchronize()
+    return start.elapsed_time(end) / calls
 
 
 def _synchronize(device: torch.device) -> None:

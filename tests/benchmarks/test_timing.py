@@ -1,7 +1,9 @@
 """What a benchmark writes down, and that the room it runs in is one."""
 
 import json
+import time
 
+import pytest
 import torch
 
 from benchmarks import room, timing
@@ -16,6 +18,17 @@ def test_report_holds_rows_and_environment(tmp_path, capsys):
     assert written["rows"] == [{"op": "sum", "ms": times["sum"]}]
     assert written["environment"]["torch"] == torch.__version__
     assert capsys.readouterr().out.startswith("title\nop")
+
+
+@pytest.mark.cuda
+def test_the_clock_of_the_gpu_leaves_out_what_python_takes():
+    def slow_to_launch():
+        time.sleep(2e-3)
+        return torch.ones(10, device="cuda").sum()
+
+    device = torch.device("cuda")
+    wall = timing.compare({"sum": slow_to_launch}, rounds=3, device=device)["sum"]
+    assert 0 < timing.compare_on_gpu({"sum": slow_to_launch}, rounds=3, device=device)["sum"] < 0.5 < wall
 
 
 def test_rays_end_at_the_walls(generator):
