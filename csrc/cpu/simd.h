@@ -80,7 +80,9 @@ class ScratchBuffer {
   ScratchBuffer& operator=(const ScratchBuffer&) = delete;
   ~ScratchBuffer() { std::free(data_); }
 
+  // Never null, so that filling nothing is defined too.
   T* reserve(std::int64_t count) {
+    if (count < 1) count = 1;
     if (count > capacity_) {
       std::free(data_);
       data_ = nullptr;
