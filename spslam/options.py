@@ -123,6 +123,16 @@ class TrackingOptions(Section):
     kernel_start_m: float = _option("gauss_newton: width of the robust kernel in the first iteration", "m", gt=0)
     kernel_end_m: float = _option("gauss_newton: width of the robust kernel in the last iteration", "m", gt=0)
     damping: float = _option("gauss_newton: share of its diagonal added to the normal matrix", ge=0)
+    noise_depth_m: float = _option(
+        "gauss_newton: depth at which noise that grows with its square equals the map's; 0 weighs all alike", "m", ge=0
+    )
+    color_weight_m: float = _option(
+        "gauss_newton: what a difference in brightness from black to white to the last mapped frame counts as; 0 "
+        "compares no colours",
+        "m",
+        ge=0,
+    )
+    color_kernel: float = _option("gauss_newton: width of the robust kernel of brightness, of which white is 1", gt=0)
     rescue: bool = _option("gauss_newton: start anew from projective ICP where a frame fits the map badly")
     rescue_below: float = _option("rescue where the mean robust weight of the pixels is below this", ge=0, le=1)
     doubtful_above: float = _option(

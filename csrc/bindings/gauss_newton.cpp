@@ -16,12 +16,27 @@ Tensor predict_pose(Tensor before, Tensor last) {
   return next;
 }
 
-std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> tensors, std::vector<double> scalars,
-                                                      std::vector<std::int64_t> layout, Tensor pixels, Tensor pose,
-                                                      std::vector<double> intrinsics, std::int64_t num_pixels,
-                                                      std::int64_t iterations, double truncation, double kernel_start,
-                                                      double kernel_end, double damping, std::int64_t seed,
-                                                      std::int64_t stream, std::int64_t frame, bool tf32) {
+// None without cells. The tensors must outlive the launch.
+ReferenceImage load_reference(const std::optional<Tensor>& cells, const std::optional<Tensor>& pose,
+                              const std::vector<double>& intrinsics, double weight, double kernel) {
+  if (!cells || !pose) return {};
+  SPS_CHECK(cells->dim() == 3 && cells->size(2) == 2 && pose->numel() == kPoseSize,
+            "track_gauss_newton: reference must have shape [H, W, 2], its pose [7]");
+  return {data<float>(*cells),
+          data<float>(*pose),
+          cells->size(0),
+          cells->size(1),
+          load_intrinsics(intrinsics),
+          static_cast<float>(weight),
+          static_cast<float>(kernel)};
+}
+
+std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
+    std::vector<Tensor> tensors, std::vector<double> scalars, std::vector<std::int64_t> layout, Tensor pixels,
+    Tensor pose, std::vector<double> intrinsics, std::int64_t num_pixels, std::int64_t iterations, double truncation,
+    double kernel_start, double kernel_end, double damping, std::int64_t seed, std::int64_t stream, std::int64_t frame,
+    double noise_depth, std::optional<Tensor> reference, std::optional<Tensor> reference_pose,
+    std::vector<double> reference_intrinsics, double intensity_weight, double intensity_kernel, bool tf32) {
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
             "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
@@ -29,19 +44,24 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> tensor
   DeviceScope scope(pixels);
   const SceneArgument scene(tensors, scalars, layout);
   pixels = torch::stable::contiguous(pixels);
+  if (reference) reference = torch::stable::contiguous(*reference);
+  if (reference_pose) reference_pose = torch::stable::contiguous(*reference_pose);
   Tensor result = torch::stable::clone(torch::stable::contiguous(pose));
   Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
   Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, 1, num_pixels)}, ScalarType::Byte);
-  const TrackingOptions options{load_intrinsics(intrinsics),
-                                num_pixels,
-                                iterations,
-                                static_cast<float>(truncation),
-                                static_cast<float>(kernel_start),
-                                static_cast<float>(kernel_end),
-                                damping,
-                                philox_key(seed, stream, frame, 0),
-                                tf32};
+  const TrackingOptions options{
+      load_intrinsics(intrinsics),
+      num_pixels,
+      iterations,
+      static_cast<float>(truncation),
+      static_cast<float>(kernel_start),
+      static_cast<float>(kernel_end),
+      damping,
+      philox_key(seed, stream, frame, 0),
+      static_cast<float>(noise_depth),
+      load_reference(reference, reference_pose, reference_intrinsics, intensity_weight, intensity_kernel),
+      tf32};
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
                              workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
                              mutable_data<float>(hessian));
@@ -79,8 +99,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
   m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor pose, float[] intrinsics, int num_pixels, int iterations, float truncation, "
-        "float kernel_start, float kernel_end, float damping, int seed, int stream, int frame, bool tf32=True) "
-        "-> (Tensor, Tensor, Tensor)");
+        "float kernel_start, float kernel_end, float damping, int seed, int stream, int frame, float noise_depth, "
+        "Tensor? reference, Tensor? reference_pose, float[] reference_intrinsics, float intensity_weight, "
+        "float intensity_kernel, bool tf32=True) -> (Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
         "-> (Tensor, Tensor, Tensor, Tensor)");

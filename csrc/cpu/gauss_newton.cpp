@@ -3,6 +3,7 @@
 #include "core/for_each.h"
 #include "cpu/scene_tile.h"
 #include "kernels/gauss_newton.h"
+#include "kernels/reference_image.h"
 
 namespace spslam {
 namespace {
@@ -10,21 +11,27 @@ namespace {
 // Pixels summed by one worker before its sums are added to the others', in order.
 constexpr std::int64_t kPixelGrain = 2 * kTileRows;
 
+struct Measurement {
+  Intrinsics camera;
+  float truncation, kernel, noise_depth;
+  ReferenceView reference;
+};
+
 // Sums over pixels [begin, end), whose records `record(i)` gives.
 template <class Record>
-void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intrinsics& camera, const Pose<float>& pose,
-                float truncation, float kernel, std::int64_t begin, std::int64_t end, const Record& record,
-                double* terms) {
+void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measurement& measure,
+                const Pose<float>& pose, std::int64_t begin, std::int64_t end, const Record& record, double* terms) {
+  const Intrinsics& camera = measure.camera;
   GeometryTile tile(net);
   Vec3<float> offsets[kTileRows], gradients[kTileRows];
-  float sdf[kTileRows];
+  float sdf[kTileRows], certainty[kTileRows];
   const float inverse_voxel = 1.0f / scene.voxel_size;
   const auto flush = [&] {
     tile.decode(sdf);
     tile.position_gradient(scene, gradients);
     for (std::int64_t i = 0; i < tile.size(); ++i) {
       if (!is_tracking_inlier(1.0f, true, sdf[i])) continue;
-      add_tracking_residual(offsets[i], sdf[i], gradients[i], truncation, kernel, terms);
+      add_tracking_residual(offsets[i], sdf[i], gradients[i], measure.truncation, measure.kernel, certainty[i], terms);
     }
     tile.clear();
   };
@@ -32,9 +39,13 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intri
     const Pixel pixel = unpack_pixel(record(i));
     if (!(pixel.depth > 0.0f)) continue;
     const SurfacePoint point = surface_point(pixel, pose, camera.fx, camera.fy, camera.cx, camera.cy);
+    if (measure.reference.image.height > 0) {
+      add_intensity_residual(measure.reference, pixel, point.world, point.offset, terms);
+    }
     const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
     if (!cell.corner_ids) continue;
     offsets[tile.size()] = point.offset;
+    certainty[tile.size()] = depth_certainty(pixel.depth, measure.noise_depth);
     tile.add(scene, point.world, cell);
     if (tile.full()) flush();
   }
@@ -43,12 +54,12 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intri
 
 // terms[kTrackingTerms] = sums over all n pixels, chunk by chunk in order, whatever the number of threads.
 template <class Record>
-void sum_pixels(const SceneView& scene, const PackedMlp<float>& net, const Intrinsics& camera, const Pose<float>& pose,
-                float truncation, float kernel, std::int64_t n, const Record& record, double* partials, double* terms) {
+void sum_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measurement& measure,
+                const Pose<float>& pose, std::int64_t n, const Record& record, double* partials, double* terms) {
   parallel_chunks(n, kPixelGrain, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {
     double* own = partials + chunk * kTrackingTerms;
     for (int t = 0; t < kTrackingTerms; ++t) own[t] = 0.0;
-    add_pixels(scene, net, camera, pose, truncation, kernel, begin, end, record, own);
+    add_pixels(scene, net, measure, pose, begin, end, record, own);
   });
   for (int t = 0; t < kTrackingTerms; ++t) terms[t] = 0.0;
   for (std::int64_t chunk = 0; chunk < chunk_count(n, kPixelGrain); ++chunk) {
@@ -83,9 +94,11 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
       return pixels +
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
-    const float kernel = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
-    sum_pixels(scene, net, options.intrinsics, load_pose(pose), options.truncation, kernel, options.num_pixels, record,
-               static_cast<double*>(workspace), terms);
+    const Measurement measure{options.intrinsics, options.truncation,
+                              annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations),
+                              options.noise_depth, load_reference(options.reference)};
+    sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
+               terms);
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, options.num_pixels, own_stats);
     tracking_step(terms, options.damping, pose, own_stats + 2, hessian);
@@ -99,14 +112,15 @@ void gauss_newton_poses<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
                              float* cost, float* inliers) {
   const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
   double* partials = static_cast<double*>(workspace);
+  const Measurement measure{intrinsics, truncation, kernel, 0.0f, {}};
   // Frames run side by side; within one, the loop over its pixels is nested and so runs in place.
   const std::int64_t share = chunk_count(pixels_per_frame, kPixelGrain) * kTrackingTerms;
   parallel_for(frames, 1, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t f = begin; f < end; ++f) {
       const auto record = [&](std::int64_t i) { return pixels + kPixelWords * (f * pixels_per_frame + i); };
       double terms[kTrackingTerms], total;
-      sum_pixels(scene, net, intrinsics, load_pose(poses + kPoseSize * f), truncation, kernel, pixels_per_frame, record,
-                 partials + f * share, terms);
+      sum_pixels(scene, net, measure, load_pose(poses + kPoseSize * f), pixels_per_frame, record, partials + f * share,
+                 terms);
       double h[36], g[6];
       store_normal_terms<double>(terms, h, g, &total);
       for (int i = 0; i < 36; ++i) hessian[36 * f + i] = static_cast<float>(h[i]);

@@ -9,6 +9,7 @@
 #include "cuda/geometry_fragments.cuh"
 #include "cuda/warp_sums.cuh"
 #include "kernels/gauss_newton.h"
+#include "kernels/reference_image.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
@@ -48,7 +49,8 @@ struct PixelSource {
 
 struct Measurement {
   Intrinsics camera;
-  float truncation, kernel;
+  float truncation, kernel, noise_depth;
+  ReferenceView reference;
 };
 
 // Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms.
@@ -67,8 +69,13 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   Vec3<float> gradient;
   const float sdf = geometry_tile(scene, network, point.world, cell.local, voxel, lane, gradient);
   // Two lanes bring the same pixel; one adds it.
-  if (lane % 4 < 2 && is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf)) {
-    add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, terms);
+  const bool adds = lane % 4 < 2;
+  if (adds && is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf)) {
+    const float certainty = depth_certainty(pixel.depth, measure.noise_depth);
+    add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, certainty, terms);
+  }
+  if (adds && measure.reference.image.height > 0) {
+    add_intensity_residual(measure.reference, pixel, point.world, point.offset, terms);
   }
 }
 
@@ -153,10 +160,12 @@ __global__ void __launch_bounds__(kThreads)
   if (threadIdx.x < kPoseSize) own_pose[threadIdx.x] = pose[threadIdx.x];
   const PhiloxKey key{options.key.seed, options.key.stream, options.key.frame, 0};
   PixelQueue queue({pixels, num_records, options.num_pixels, true, key}, 0);
+  const ReferenceView reference = load_reference(options.reference);
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     const Measurement measure{options.intrinsics, options.truncation,
-                              annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations)};
+                              annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations),
+                              options.noise_depth, reference};
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
     double* shared_sums = partials + (iteration % 2) * gridDim.x * kPaddedTerms;
@@ -249,7 +258,8 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
     const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
-    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, {intrinsics, truncation, kernel}, partials);
+    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, {intrinsics, truncation, kernel, 0.0f, {}},
+                                                   partials);
   }
   store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, hessian,
                                                                        gradient, cost, inliers);

@@ -11,11 +11,12 @@
 #include "core/vec.h"
 #include "kernels/optimizer.h"
 #include "kernels/pixel_record.h"
+#include "spslam/gauss_newton.h"
 
 namespace spslam {
 
-constexpr int kNormalTerms = 28;                  // 21 of the hessian, 6 of the gradient, the cost
-constexpr int kTrackingTerms = kNormalTerms + 2;  // and the sum of weights and the number of inliers
+// And the sum of weights, the number of inliers, the sum of weights times certainties.
+constexpr int kTrackingTerms = kNormalTerms + 3;
 // Beyond this the decoder's tanh is saturated and its slope says nothing about where the surface is.
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
@@ -31,26 +32,38 @@ SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pos
   return {offset + pose.translation, offset};
 }
 
-// Adds a residual (m) of weight 1 / (1 + (r / kernel)^2)^2 to sums of type T. slope is its derivative by the surface
-// point, offset the point seen from the camera centre that the increment turns about.
+// Adds a residual (m) of weight 1 / (1 + (r / kernel)^2)^2 times `certainty` to sums of type T. slope is its derivative
+// by the surface point, offset the point seen from the camera centre that the increment turns about. How well the pose
+// fits, the cost and the sum of weights, is told without the certainty.
 template <class T>
 SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, float kernel,
-                                    T* terms) {
+                                    float certainty, T* terms) {
   const Vec3<float> torque = cross(offset, slope);
   const float ratio = residual / kernel;
   const float root = 1.0f / (1.0f + ratio * ratio);
   const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
-  const T weight = static_cast<T>(root * root);
-  add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
+  const T weight = static_cast<T>(root * root), r = static_cast<T>(residual);
+  const T cost = terms[kNormalTerms - 1] + weight * r * r;
+  add_normal_terms<T>(jacobian, r, static_cast<T>(certainty) * weight, terms);
+  terms[kNormalTerms - 1] = cost;
   terms[kNormalTerms] += weight;
   terms[kNormalTerms + 1] += T(1);
+  terms[kNormalTerms + 2] += static_cast<T>(certainty) * weight;
 }
 
 // The same of an inlier's SDF, which is normalised, and its gradient by the world point (1/m).
 template <class T>
 SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
-                                      float truncation, float kernel, T* terms) {
-  add_robust_residual(offset, sdf * truncation, truncation * gradient, kernel, terms);
+                                      float truncation, float kernel, float certainty, T* terms) {
+  add_robust_residual(offset, sdf * truncation, truncation * gradient, kernel, certainty, terms);
+}
+
+// Inverse variance of a residual as a share of that at the camera: a structured-light or stereo depth's noise grows
+// with z^2, and adds to that of the map.
+SPS_INLINE float depth_certainty(float depth, float noise_depth) {
+  if (!(noise_depth > 0.0f)) return 1.0f;
+  const float ratio = depth / noise_depth, squared = ratio * ratio;
+  return 1.0f / (1.0f + squared * squared);
 }
 
 SPS_INLINE bool is_tracking_inlier(float depth, bool inside, float sdf) {
@@ -71,7 +84,8 @@ SPS_INLINE double tracking_cost(const double* terms) {
   return weights > 1e-6 ? terms[kNormalTerms - 1] / weights : 0.0;
 }
 
-// Solves the normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad).
+// Solves the normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad), hessian what the matrix would
+// be if the mean certainty were 1, so that it tells how the pose is held and not how far away the surface is.
 SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, float* steps, float* hessian) {
   double h[36], g[6], cost, delta[6];
   store_normal_terms<double>(terms, h, g, &cost);
@@ -91,7 +105,8 @@ SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, 
   pose[4] += dt.x, pose[5] += dt.y, pose[6] += dt.z;
   steps[0] = std::sqrt(dot(dt, dt));
   steps[1] = std::sqrt(dot(domega, domega));
-  for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(h[i]);
+  const double certain = terms[kNormalTerms + 2], share = certain > 0.0 ? terms[kNormalTerms] / certain : 1.0;
+  for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(share * h[i]);
 }
 
 // What an iteration's sums say of the pose before its step; columns 0, 1 and 4 of its statistics.

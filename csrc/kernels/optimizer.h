@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "core/macros.h"
+#include "spslam/optimizer.h"
 
 namespace spslam {
 
@@ -27,7 +28,7 @@ SPS_INLINE void adam_update(const AdamCoefficients<T>& c, T& param, T& grad, T& 
   grad = T(0);
 }
 
-// Adds one residual's share to the 21 + 6 + 1 terms. `V` is a number, or a vector register of them.
+// Adds one residual's share to the kNormalTerms terms. `V` is a number, or a vector register of them.
 template <class V>
 SPS_INLINE void add_normal_terms(const V* jacobian, const V& residual, const V& weight, V* terms) {
   int term = 0;

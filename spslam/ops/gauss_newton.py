@@ -3,7 +3,13 @@
 A pixel of depth z is the world point x = R (z d) + t. Its residual is r = truncation * s(x), its weight
 1 / (1 + (r / k)^2)^2 (Geman-McClure's), and the increment (dt, domega) moves the camera by dt and turns it by
 exp(domega) about its centre, so that dr = truncation * grad s . (dt + domega x (x - t)).
+
+Where the noise of depth grows with z^2, as for structured light and stereo, a residual's inverse variance falls as
+1 / (1 + (z / z0)^4). A reference image adds, pixel by pixel, what direct methods minimise (Kerl et al. 2013): the
+intensity I of an earlier frame where x falls in it, less the pixel's own, times a weight in metres.
 """
+
+from typing import NamedTuple
 
 import torch
 
@@ -36,6 +42,25 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     return torch.ops.spslam.predict_pose(before, last)
 
 
+class ReferenceImage(NamedTuple):
+    """A small grey image of an earlier frame, to compare colours with.
+
+    Attributes:
+        cells: float32 [H, W, 2] intensity in [0, 1] (0.299 r + 0.587 g + 0.114 b) and depth (m, 0 where unknown). A
+            point is compared where it falls between four cells whose depth agrees with its own to a tenth.
+        pose: float32 [7] T_world_camera of the frame, unit quaternion (w, x, y, z) and translation (m).
+        intrinsics: in cells: those of s x s pixels have focal lengths f / s and principal point (c + 1/2) / s - 1/2.
+        weight: m that an intensity difference of 1 counts as.
+        kernel: width of the robust kernel, intensity.
+    """
+
+    cells: torch.Tensor
+    pose: torch.Tensor
+    intrinsics: Intrinsics
+    weight: float
+    kernel: float
+
+
 def track_gauss_newton(
     scene: SceneView,
     pixels: torch.Tensor,
@@ -51,6 +76,8 @@ def track_gauss_newton(
     seed: int,
     stream: int,
     frame: int,
+    noise_depth: float = 0.0,
+    reference: ReferenceImage | None = None,
     tf32: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Tracks one frame against a frozen scene; all iterations in one call, on CUDA in one kernel that never stops for
@@ -73,14 +100,19 @@ def track_gauss_newton(
         kernel_end: last width, m.
         damping: relative Levenberg damping.
         seed, stream, frame: keys of the draws, see `philox_uniform`.
+        noise_depth: depth z0 at which noise that grows with z^2 is as large as that of the map, m; pixels weigh
+            1 / (1 + (z / z0)^4) of what they would. 0 weighs near and far alike.
+        reference: an earlier frame to compare colours with; None uses the surface alone. It takes no part in what the
+            statistics say.
         tf32: on CUDA devices from sm_80 on, let tensor cores multiply in the decoder, with factors rounded to 10 bits
             of mantissa: under 0.1 mm of SDF. Elsewhere, and without it, everything is float32.
 
     Returns:
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of pixels on
         mapped surface, the norms of the step in translation (m) and rotation (rad), and the mean weight over all pixels
-        (0 for those off the map), each before the iteration's step; float32 [6, 6] H of the last iteration. The same to
-        the bit every time on one device, and for any number of CPU threads.
+        (0 for those off the map), each before the iteration's step; float32 [6, 6] H of the last iteration, as it would
+        be if the weights by depth were 1 on average. The same to the bit every time on one device, and for any number
+        of CPU threads.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -111,6 +143,11 @@ def track_gauss_newton(
         (kernel_start, kernel_end),
     )
     check(damping >= 0, name, "damping", "be at least 0", damping)
+    check(noise_depth >= 0, name, "noise_depth", "be at least 0", noise_depth)
+    image: tuple[torch.Tensor | None, torch.Tensor | None, list[float], float, float] = (None, None, [], 0.0, 1.0)
+    if reference is not None:
+        _check_reference(name, reference, like=scene.embeddings)
+        image = (reference.cells, reference.pose, list(reference.intrinsics), reference.weight, reference.kernel)
     return torch.ops.spslam.track_gauss_newton(
         *scene.arguments(),
         pixels,
@@ -125,8 +162,17 @@ def track_gauss_newton(
         seed,
         stream,
         frame,
+        noise_depth,
+        *image,
         tf32,
     )
+
+
+def _check_reference(name: str, reference: ReferenceImage, like: torch.Tensor) -> None:
+    check_tensor(name, "reference.cells", reference.cells, ("H", "W", 2), torch.float32, like=like)
+    check_tensor(name, "reference.pose", reference.pose, (7,), torch.float32, like=like)
+    check(reference.weight >= 0, name, "reference.weight", "be at least 0", reference.weight)
+    check(reference.kernel > 0, name, "reference.kernel", "be positive", reference.kernel)
 
 
 def gauss_newton_poses(

@@ -55,6 +55,14 @@ class Past:
         rows = self._rows()
         return self._frame(int(rows[-1])) if len(rows) else None
 
+    def mapped(self, every: int) -> tuple[int, EarlierFrame] | None:
+        """The newest frame, and its number, that was mapped if every n-th is and its pose is to be trusted."""
+        has_pixels, lost = self._state.pixels.has_pixels, self._state.frames.lost
+        for row in range((len(lost) - 1) // every * every, -1, -every):
+            if has_pixels[row] and not lost[row]:
+                return row, self._frame(row)
+        return None
+
     def similar(self, pixels: FramePixels, count: int) -> list[EarlierFrame]:
         """Frames whose coarse depth is most like that of the given pixels, the likest first; at most `count`.
 

@@ -6,10 +6,10 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix
+from spslam.slam.cell_grid import CellGrid
 from spslam.slam.past import EarlierFrame
 from spslam.slam.pixels import FramePixels, unpack_points
 
-MAP_COLUMNS = 80  # of the frame's surface maps: about three pixel records a cell
 POINTS = 4096  # of the earlier frame
 
 
@@ -30,7 +30,7 @@ class IcpAlignment:
 
 
 def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:
-    """What a frame's pixel records show of the surface, as maps of at most `MAP_COLUMNS` columns.
+    """What a frame's pixel records show of the surface, as maps with the cells of a `CellGrid`.
 
     A cell holds the first record that falls in it and has a normal, so both devices choose the same.
 
@@ -38,20 +38,14 @@ def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, tor
         vertices float32 [h, w, 3] (m, camera axes; 0 where there is none), normals float32 [h, w, 3], and the
         intrinsics of the maps.
     """
-    step = -(-camera.width // MAP_COLUMNS)
-    rows, columns = -(-camera.height // step), -(-camera.width // step)
-    records, normals = pixels.records, pixels.normals
-    u, v = records[:, 0] & 0xFFFF, (records[:, 0] >> 16) & 0xFFFF
-    cell = (v // step * columns + u // step).long()
-    count = len(records)
+    grid, records, normals = CellGrid.of(camera), pixels.records, pixels.normals
+    shape, count = (grid.rows, grid.columns, 3), len(records)
     order = torch.where(normals.any(1), torch.arange(count, device=records.device), count)
-    first = torch.full((rows * columns,), count, device=records.device).scatter_reduce_(0, cell, order, "amin")
+    first = torch.full((grid.rows * grid.columns,), count, device=records.device)
+    first.scatter_reduce_(0, grid.cells(records), order, "amin")
     points = torch.cat([unpack_points(records, camera), normals.new_zeros(1, 3)])
     normals = torch.cat([normals, normals.new_zeros(1, 3)])
-    intrinsics = ops.Intrinsics(
-        camera.fx / step, camera.fy / step, (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5
-    )
-    return points[first].view(rows, columns, 3), normals[first].view(rows, columns, 3), intrinsics
+    return points[first].view(shape), normals[first].view(shape), grid.intrinsics
 
 
 def _matrix(pose: torch.Tensor) -> np.ndarray:

@@ -13,6 +13,7 @@ from spslam.slam.loss_decision import Fit, information, jump
 from spslam.slam.optimization import render_options
 from spslam.slam.past import Past
 from spslam.slam.pixels import FramePixels
+from spslam.slam.reference_image import ReferenceKeeper
 from spslam.slam.rescue import IcpAlignment
 from spslam.slam.state import FrameTable
 
@@ -48,6 +49,9 @@ class Tracker:
         self.camera = camera
         self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self._graph = ops.LaunchGraph()
+        weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
+        self._references = ReferenceKeeper(camera, weight_m, kernel) if weight_m > 0 else None
+        self._reference: ops.ReferenceImage | None = None
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
@@ -77,12 +81,21 @@ class Tracker:
         """
         if self.is_blind(pixels):
             return TrackingResult(start.clone(), 0, Fit(), lost=True)
+        self._reference = self._mapped_view(past)
         adam = self.config.tracking.optimizer == "adam"
         find = self._track_adam if adam else self._track_gauss_newton
         result = find(scene, pixels.records, start, frame, self._iterations(frame))
         if past is not None and (past.is_lost or self._is_doubtful(result)):
             result = self._look_again(scene, pixels, start, frame, past, result)
         return replace(result, pose=start.clone()) if result.lost else result
+
+    def _mapped_view(self, past: Past | None) -> ops.ReferenceImage | None:
+        """What the last mapped frame looked like, where colours are to be compared."""
+        mapped = past.mapped(self.config.mapping.every) if self._references and past else None
+        if mapped is None or self._references is None:
+            return None
+        row, frame = mapped
+        return self._references.of(row, frame.records, frame.pose)
 
     def is_blind(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to tell a pose from."""
@@ -143,6 +156,8 @@ class Tracker:
             seed=self.config.seed,
             stream=ops.Stream.TRACKING_PIXELS,
             frame=frame,
+            noise_depth=tracking.noise_depth_m,
+            reference=self._reference,
         )
         # The frame's one wait for the device.
         numbers = torch.cat([expected, pose, stats[-1], hessian.view(-1)]).tolist()

@@ -5,72 +5,20 @@ import pytest
 import torch
 
 from spslam import ops
-from spslam.geometry import constant_speed, matrix_to_pose7, pose7_to_matrix, rotation_angle
+from spslam.geometry import constant_speed, pose7_to_matrix, rotation_angle
 from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
-
-
-def _look_at_corner():
-    """A pose (float64 [4, 4]) from which all three walls of the corner fill the view."""
-    center = np.array([0.02, -0.1, 0.05])
-    forward = np.array([0.9, 0.5, 1.1]) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross([0.2, 1.0, -0.1], forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    pose[:3, 3] = center
-    return pose
-
-
-POSE = _look_at_corner()
-OPTIONS = dict(
-    num_pixels=1024, iterations=8, truncation=0.16, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=3, stream=1
-)
-
-
-def _pose7(matrix, device="cpu"):
-    return torch.from_numpy(matrix_to_pose7(matrix)).float().to(device)
-
-
-def _moved(matrix, shift, angle):
-    axis = np.array([0.3, -0.8, 0.52])
-    axis /= np.linalg.norm(axis)
-    quaternion = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-    moved = matrix.copy()
-    moved[:3, :3] = pose7_to_matrix(np.concatenate([quaternion, np.zeros(3)]))[:3, :3] @ matrix[:3, :3]
-    moved[:3, 3] += shift
-    return moved
-
-
-def _exp(omega):
-    x, y, z = omega
-    zero = torch.zeros((), dtype=omega.dtype)
-    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+from tests.ops.tracking_scene import OPTIONS, POSE, moved_pose, pose7, surface_equations
 
 
 def test_normal_equations_are_those_of_autograd(device, generator):
     """H and g from the Jacobian that autograd finds through the SDF's own gradient."""
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
-    u, v = (records[:, 0] & 0xFFFF).double(), (records[:, 0] >> 16).double()
-    depth = records[:, 1].contiguous().view(torch.float32).double()
-    rays = torch.stack([(u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy, torch.ones(400)], 1)
-    local = rays * depth[:, None]
-    rotation, translation = torch.from_numpy(POSE[:3, :3]), torch.from_numpy(POSE[:3, 3])
-
-    def moved(increment):
-        return local @ (_exp(increment[3:]) @ rotation).T + translation + increment[:3]
-
-    zero = torch.zeros(6, dtype=torch.float64)
-    points_by_increment = torch.func.jacfwd(moved)(zero)
-    sdf, valid, gradient = (t.cpu() for t in ops.query_sdf_gradient(scene, moved(zero).float().to(device)))
-    jacobian = TRUNCATION * torch.einsum("ni,nij->nj", gradient.double(), points_by_increment)
-    residual = TRUNCATION * sdf.double()
-    weight = (1 / (1 + (residual / 0.03) ** 2)) ** 2 * valid * (sdf.abs() < 0.98)
+    residual, jacobian, weight, inlier = surface_equations(scene, records, 0.03)
     h, g, cost, inliers = (
         t.cpu()
         for t in ops.gauss_newton_poses(
-            scene, records[None].to(device), _pose7(POSE, device)[None], INTRINSICS, truncation=TRUNCATION, kernel=0.03
+            scene, records[None].to(device), pose7(POSE, device)[None], INTRINSICS, truncation=TRUNCATION, kernel=0.03
         )
     )
     want = torch.einsum("n,ni,nj->ij", weight, jacobian, jacobian)
@@ -79,15 +27,15 @@ def test_normal_equations_are_those_of_autograd(device, generator):
     want_g = torch.einsum("n,n,ni->i", weight, residual, jacobian)
     assert torch.allclose(g[0].double(), want_g, rtol=0, atol=5e-3 * want_g.abs().max())
     assert torch.isclose(cost[0].double(), (weight * residual**2).sum() / weight.sum(), rtol=1e-3)
-    assert torch.isclose(inliers[0].double(), (valid & (sdf.abs() < 0.98)).double().mean(), atol=0.01)
+    assert torch.isclose(inliers[0].double(), inlier.double().mean(), atol=0.01)
 
 
 @pytest.mark.parametrize("shift_m, angle_deg", [(0.0, 0.0), (0.02, 2.0), (0.04, 3.0)])
 def test_recovers_the_pose(device, generator, shift_m, angle_deg):
     scene = make_scene(generator, random_decoder=False, device=device)
     records = corner_pixels(POSE, generator).to(device)
-    start = _moved(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
-    pose, stats, hessian = ops.track_gauss_newton(scene, records, _pose7(start, device), INTRINSICS, **OPTIONS, frame=4)
+    start = moved_pose(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
+    pose, stats, hessian = ops.track_gauss_newton(scene, records, pose7(start, device), INTRINSICS, **OPTIONS, frame=4)
     found = pose7_to_matrix(pose.cpu().double().numpy())
     assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 2e-3
     assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.1
@@ -106,7 +54,7 @@ FLOAT32_SUMS, TF32_SUMS = 1e-4, 5e-3  # of the largest
 def test_devices_agree(device, generator, tf32, num_pixels):
     """Whole and part tiles, one a warp and several."""
     scene = make_scene(generator, random_decoder=False, device=device)
-    records, start = corner_pixels(POSE, generator), _pose7(_moved(POSE, 0.01, 0.02))
+    records, start = corner_pixels(POSE, generator), pose7(moved_pose(POSE, 0.01, 0.02))
     options = {**OPTIONS, "num_pixels": num_pixels}
     on_cpu = make_scene(torch.Generator().manual_seed(0), random_decoder=False)
     want = ops.track_gauss_newton(on_cpu, records, start, INTRINSICS, **options, frame=4)
@@ -123,7 +71,7 @@ def test_devices_agree(device, generator, tf32, num_pixels):
 def test_same_bits_every_time(device, generator):
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator).to(device)
-    start = _pose7(_moved(POSE, 0.01, 0.02), device)
+    start = pose7(moved_pose(POSE, 0.01, 0.02), device)
     options = {**OPTIONS, "num_pixels": 3000}
     first = ops.track_gauss_newton(scene, records, start, INTRINSICS, **options, frame=0)
     for _ in range(9):
@@ -135,23 +83,23 @@ def test_support_is_the_mean_weight(device, generator):
     """At the true pose every mapped pixel weighs one; off the map none does."""
     scene = make_scene(generator, random_decoder=False, device=device)
     records = corner_pixels(POSE, generator).to(device)
-    _, stats, _ = ops.track_gauss_newton(scene, records, _pose7(POSE, device), INTRINSICS, **OPTIONS, frame=0)
+    _, stats, _ = ops.track_gauss_newton(scene, records, pose7(POSE, device), INTRINSICS, **OPTIONS, frame=0)
     inliers, support = stats[-1, 1].item(), stats[-1, 4].item()
     assert 0.95 * inliers < support <= inliers + 1e-6
 
 
 @pytest.mark.parametrize("shift_m, angle_deg", [(0.0, 0.0), (0.03, 2.0), (0.5, 80.0)])
 def test_prediction_is_constant_speed(device, shift_m, angle_deg):
-    before, last = POSE, _moved(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
-    predicted = ops.predict_pose(_pose7(before, device), _pose7(last, device)).cpu()
-    torch.testing.assert_close(predicted, _pose7(constant_speed(before, last)))
+    before, last = POSE, moved_pose(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
+    predicted = ops.predict_pose(pose7(before, device), pose7(last, device)).cpu()
+    torch.testing.assert_close(predicted, pose7(constant_speed(before, last)))
     assert predicted[0] >= 0
 
 
 def test_same_bits_for_any_number_of_threads(generator):
     scene = make_scene(generator, random_decoder=False)
     records = corner_pixels(POSE, generator)
-    start = _pose7(_moved(POSE, 0.01, 0.02))
+    start = pose7(moved_pose(POSE, 0.01, 0.02))
     results = []
     threads = torch.ops.spslam.get_num_threads()
     try:
@@ -169,7 +117,7 @@ def test_outside_the_map_nothing_moves(device, generator):
     far = POSE.copy()
     far[:3, 3] += 50
     records = corner_pixels(POSE, generator).to(device)
-    start = _pose7(far, device)
+    start = pose7(far, device)
     pose, stats, _ = ops.track_gauss_newton(scene, records, start, INTRINSICS, **OPTIONS, frame=0)
     assert torch.allclose(pose, start, atol=1e-6)
     assert bool((stats[:, 1] == 0).all())
@@ -186,18 +134,19 @@ def test_arguments_are_named(generator):
     scene = make_scene(generator, random_decoder=False)
     records = corner_pixels(POSE, generator)
     with pytest.raises(ValueError, match="track_gauss_newton: iterations must be at least 1, got 0"):
-        ops.track_gauss_newton(scene, records, _pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
     with pytest.raises(ValueError, match=r"predict_pose: before must have shape \[7\], got \[8\]"):
         ops.predict_pose(torch.zeros(8), torch.zeros(7))
     with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):
-        ops.track_gauss_newton(scene, records[:0], _pose7(POSE), INTRINSICS, **OPTIONS, frame=0)
+        ops.track_gauss_newton(scene, records[:0], pose7(POSE), INTRINSICS, **OPTIONS, frame=0)
 
 
 def test_opcheck(generator):
     scene = make_scene(generator, random_decoder=False)
-    records, pose = corner_pixels(POSE, generator, 50), _pose7(POSE)
-    arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4, 0, 1, 0)
-    torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, (*scene.arguments(), *arguments))
+    records, pose = corner_pixels(POSE, generator, 50), pose7(POSE)
+    arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4, 0, 1, 0, 1.0)
+    call = (*scene.arguments(), *arguments, None, None, [], 0.3, 0.4)
+    torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)
     torch.library.opcheck(torch.ops.spslam.predict_pose.default, (pose, pose))
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)
     torch.library.opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments))

@@ -13,14 +13,26 @@ constexpr int kPoseSize = 7;  // unit quaternion (w, x, y, z), translation (m)
 // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean robust weight over all pixels
 constexpr int kTrackingStatSize = 5;
 
+// A small grey image of an earlier frame, which tracking compares colours with; none where height is 0.
+struct ReferenceImage {
+  const float* cells;  // [height, width, 2] intensity in [0, 1], depth (m; 0 where unknown)
+  const float* pose;   // [7] T_world_camera of the frame
+  std::int64_t height, width;
+  Intrinsics intrinsics;  // in cells
+  float weight;           // m that an intensity difference of 1 counts as
+  float kernel;           // width of the robust kernel, intensity
+};
+
 struct TrackingOptions {
   Intrinsics intrinsics;
   std::int64_t num_pixels, iterations;
   float truncation;                // m
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
   double damping;
-  PhiloxKey key;  // its iteration is replaced by the running one
-  bool tf32;      // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
+  PhiloxKey key;      // its iteration is replaced by the running one
+  float noise_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
+  ReferenceImage reference;
+  bool tf32;  // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
 };
 
 // next [7]: the pose after `before` [7] and `last` [7] at constant speed.
@@ -32,7 +44,7 @@ template <class Device>
 std::int64_t gauss_newton_workspace_size(Device device, std::int64_t frames, std::int64_t pixels);
 
 // One frame. pixels [num_records, 3] are drawn from anew in each iteration; pose [7] is read and overwritten; stats
-// [iterations, 4]; hessian [36] of the last iteration, before damping.
+// [iterations, kTrackingStatSize]; hessian [36] of the last iteration, before damping.
 template <class Device>
 void track_gauss_newton(Device device, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
                         const TrackingOptions& options, void* workspace, float* pose, float* stats, float* hessian);

@@ -1,0 +1,85 @@
+// The maths of direct alignment: what a surface point should look like in an earlier frame's small grey image, against
+// what it looks like now.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/macros.h"
+#include "core/vec.h"
+#include "kernels/optimizer.h"
+#include "kernels/pixel_record.h"
+#include "spslam/gauss_newton.h"
+
+namespace spslam {
+
+// A point is held against a cell of the reference only if their depths agree to this share: else one hides the other.
+constexpr float kReferenceDepthAgreement = 0.1f;
+
+// The reference with its pose read.
+struct ReferenceView {
+  ReferenceImage image;
+  Pose<float> pose;
+};
+
+SPS_INLINE ReferenceView load_reference(const ReferenceImage& image) {
+  return {image, image.height > 0 ? load_pose(image.pose) : Pose<float>{}};
+}
+
+// Rec. 601 luma of a colour in [0, 1].
+SPS_INLINE float luma(const float* color) {
+  return 0.299f * color[0] + 0.587f * color[1] + 0.114f * color[2];
+}
+
+struct ReferenceCorner {
+  float intensity, depth;
+};
+
+SPS_INLINE ReferenceCorner reference_corner(const ReferenceImage& image, std::int64_t row, std::int64_t column) {
+  const float* cell = image.cells + 2 * (row * image.width + column);
+  return {cell[0], cell[1]};
+}
+
+// Adds the difference between the reference's intensity where the world point falls and the pixel's own, in units of
+// `weight` m, to hessian and gradient (terms of type T); the cost is the surface's alone. Nothing where the point falls
+// off the image, or on a cell without depth or of another depth.
+template <class T>
+SPS_INLINE void add_intensity_residual(const ReferenceView& reference, const Pixel& pixel, const Vec3<float>& world,
+                                       const Vec3<float>& offset, T* terms) {
+  const ReferenceImage& image = reference.image;
+  const float* r = reference.pose.rotation.m;
+  const Vec3<float> from = world - reference.pose.translation;
+  const Vec3<float> seen{r[0] * from.x + r[3] * from.y + r[6] * from.z, r[1] * from.x + r[4] * from.y + r[7] * from.z,
+                         r[2] * from.x + r[5] * from.y + r[8] * from.z};
+  if (!(pixel.depth > 0.0f) || !(seen.z > 0.05f)) return;
+  const Intrinsics& k = image.intrinsics;
+  const float inverse_z = 1.0f / seen.z;
+  const float u = seen.x * inverse_z * k.fx + k.cx, v = seen.y * inverse_z * k.fy + k.cy;
+  if (!(u >= 0.0f && v >= 0.0f && u < static_cast<float>(image.width - 1) && v < static_cast<float>(image.height - 1)))
+    return;
+  const float left = std::floor(u), top = std::floor(v), a = u - left, b = v - top;
+  const std::int64_t column = static_cast<std::int64_t>(left), row = static_cast<std::int64_t>(top);
+  const ReferenceCorner c00 = reference_corner(image, row, column), c01 = reference_corner(image, row, column + 1);
+  const ReferenceCorner c10 = reference_corner(image, row + 1, column),
+                        c11 = reference_corner(image, row + 1, column + 1);
+  const float tolerance = kReferenceDepthAgreement * seen.z;
+  const auto agrees = [&](const ReferenceCorner& c) { return std::fabs(c.depth - seen.z) < tolerance; };
+  if (!(agrees(c00) && agrees(c01) && agrees(c10) && agrees(c11))) return;
+  const float upper = c00.intensity + a * (c01.intensity - c00.intensity);
+  const float lower = c10.intensity + a * (c11.intensity - c10.intensity);
+  const float difference = upper + b * (lower - upper) - luma(pixel.color);
+  const float by_u = (1.0f - b) * (c01.intensity - c00.intensity) + b * (c11.intensity - c10.intensity);
+  const float by_v = lower - upper;
+  const float x = by_u * k.fx * inverse_z, y = by_v * k.fy * inverse_z;
+  const Vec3<float> by_seen{x, y, -(x * seen.x + y * seen.y) * inverse_z};
+  const Vec3<float> slope = image.weight * (reference.pose.rotation * by_seen);
+  const Vec3<float> torque = cross(offset, slope);
+  const float ratio = difference / image.kernel;
+  const float root = 1.0f / (1.0f + ratio * ratio);
+  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
+  const T cost = terms[kNormalTerms - 1];
+  add_normal_terms<T>(jacobian, static_cast<T>(image.weight * difference), static_cast<T>(root * root), terms);
+  terms[kNormalTerms - 1] = cost;
+}
+
+}  // namespace spslam

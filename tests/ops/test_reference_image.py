@@ -1,0 +1,173 @@
+"""Tracking beyond the plain surface: pixels weighed by their depth, and colours compared with an earlier frame."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from spslam.geometry import pose7_to_matrix, rotation_angle
+from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
+from tests.ops.tracking_scene import OPTIONS, POSE, camera_points, moved_points, moved_pose, pose7, surface_equations
+
+ONE_STEP = dict(
+    num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0, seed=3
+)
+KEY = dict(stream=1, frame=4)
+
+
+def _drawn(records):
+    """The pixels that the first iteration of ONE_STEP takes."""
+    return records[ops.sample_indices(3, KEY["stream"], KEY["frame"], 0, ONE_STEP["num_pixels"], len(records))]
+
+
+@pytest.mark.parametrize("noise_depth", [0.0, 0.7, 2.0])
+def test_far_pixels_weigh_less(device, generator, noise_depth):
+    """By 1 / (1 + (z / z0)^4) in the equations, which are told at a mean weight of 1; the fit doesn't know of it."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    records = corner_pixels(POSE, generator, 400)
+    drawn = _drawn(records)
+    residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
+    depth = camera_points(drawn)[:, 2]
+    certain = weight / (1 + (depth / noise_depth) ** 4) if noise_depth else weight
+    _, stats, hessian = ops.track_gauss_newton(
+        scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, noise_depth=noise_depth,
+        tf32=False,
+    )  # fmt: skip
+    want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * weight.sum() / certain.sum()
+    assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=2e-3 * want.abs().max())
+    assert stats[0, 0].item() == pytest.approx(float((weight * residual**2).sum() / weight.sum()), rel=1e-3)
+    assert stats[0, 4].item() == pytest.approx(float(weight.mean()), rel=2e-3)
+
+
+CELL_PX = 2
+
+
+def _reference(pose, device="cpu", weight=0.3):
+    """The corner, painted with smooth waves, as a camera at `pose` (float64 [4, 4]) sees it in cells."""
+    rows, columns = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+    intrinsics = ops.Intrinsics(INTRINSICS.fx / CELL_PX, INTRINSICS.fy / CELL_PX, 15.5, 11.5)
+    rays = torch.stack(
+        [(columns - intrinsics.cx) / intrinsics.fx, (rows - intrinsics.cy) / intrinsics.fy, torch.ones(24, 32)], -1
+    )
+    directions = rays.double() @ torch.from_numpy(pose[:3, :3]).T
+    walls = torch.tensor([0.9, 0.5, 1.1], dtype=torch.float64) - torch.from_numpy(pose[:3, 3])
+    depth = torch.where(directions > 1e-6, walls / directions, torch.inf).min(-1).values
+    points = directions * depth[..., None] + torch.from_numpy(pose[:3, 3])
+    cells = torch.stack([_paint(points), depth], -1).float().to(device)
+    return ops.ReferenceImage(cells, pose7(pose, device), intrinsics, weight, kernel=0.4)
+
+
+def _paint(points):
+    return 0.5 + 0.2 * torch.sin(6 * points).sum(-1) / 3
+
+
+def _painted(records):
+    """The records with the colour of the waves where a camera at POSE sees them."""
+    grey = _paint(moved_points(camera_points(records), torch.zeros(6, dtype=torch.float64)))
+    level = (255 * grey).round().int()
+    return torch.stack([records[:, 0], records[:, 1], level | level << 8 | level << 16], 1)
+
+
+def _intensity_equations(reference, records):
+    """Jacobian [P, 6] (m) by autograd through torch's bilinear sampling, and weight [P], at POSE."""
+    local, grey = camera_points(records), (records[:, 2] & 0xFF).double() / 255
+    cells, k = reference.cells.cpu().double(), reference.intrinsics
+    pose = torch.from_numpy(pose7_to_matrix(reference.pose.cpu().double().numpy()))
+    size = torch.tensor([cells.shape[1] - 1, cells.shape[0] - 1], dtype=torch.float64)
+
+    def seen(increment):
+        return (moved_points(local, increment) - pose[:3, 3]) @ pose[:3, :3]
+
+    def place(increment):
+        x, y, z = seen(increment).unbind(-1)
+        return torch.stack([x / z * k.fx + k.cx, y / z * k.fy + k.cy], -1)
+
+    def difference(increment):
+        grid = (2 * place(increment) / size - 1)[None, None]
+        image = cells[None, ..., 0][None]
+        return torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, 0, 0] - grey
+
+    zero = torch.zeros(6, dtype=torch.float64)
+    left_top, depth = place(zero).floor().long(), seen(zero)[:, 2]
+    inside = ((left_top >= 0) & (left_top < size.long())).all(1)
+    u, v = torch.where(inside[:, None], left_top, 0).unbind(1)
+    corners = torch.stack([cells[v + dv, u + du, 1] for dv in (0, 1) for du in (0, 1)])
+    agrees = inside & ((corners - depth).abs() < 0.1 * depth).all(0)
+    weight = (1 / (1 + (difference(zero) / reference.kernel) ** 2)) ** 2 * agrees
+    return reference.weight * torch.func.jacrev(difference)(zero), weight
+
+
+def test_colour_equations_are_those_of_autograd(device, generator):
+    """On a map without voxels the equations are the reference image's alone."""
+    scene = ops.SceneView.empty(device=device)
+    reference = _reference(moved_pose(POSE, 0.01, 0.03), device)
+    records = _painted(corner_pixels(POSE, generator, 400))
+    jacobian, weight = _intensity_equations(reference, _drawn(records))
+    _, stats, hessian = ops.track_gauss_newton(
+        scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, reference=reference
+    )
+    want = torch.einsum("n,ni,nj->ij", weight, jacobian, jacobian)
+    assert weight.gt(0).double().mean() > 0.5
+    # A point that rounding moves over the border of a cell has another gradient.
+    assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=5e-3 * want.abs().max())
+    assert stats[0, [0, 1, 4]].tolist() == [0, 0, 0]
+
+
+def test_colours_alone_find_the_pose(device, generator):
+    """Three painted walls, of which nothing is mapped."""
+    reference = _reference(POSE, device)
+    records = _painted(corner_pixels(POSE, generator)).to(device)
+    start = moved_pose(POSE, 0.01 * np.array([0.6, -0.64, 0.48]), np.radians(1.0))
+    pose, _, _ = ops.track_gauss_newton(
+        ops.SceneView.empty(device=device), records, pose7(start, device), INTRINSICS,
+        **{**OPTIONS, "iterations": 20}, frame=4, reference=reference,
+    )  # fmt: skip
+    found = pose7_to_matrix(pose.cpu().double().numpy())
+    # Cells of two pixels, seen from 1 m at a focal length of 60: a tenth of a cell.
+    assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 4e-3
+    assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.2
+
+
+def test_devices_agree_with_a_reference(device, generator):
+    """The CPU's pose and equations, with weights by depth and colours."""
+    records, start = _painted(corner_pixels(POSE, generator)), pose7(moved_pose(POSE, 0.01, 0.02))
+    results = []
+    for place in ("cpu", device):
+        scene = make_scene(torch.Generator().manual_seed(0), random_decoder=False, device=place)
+        results.append(
+            ops.track_gauss_newton(
+                scene,
+                records.to(place),
+                start.to(place),
+                INTRINSICS,
+                **OPTIONS,
+                frame=4,
+                noise_depth=1.0,
+                reference=_reference(POSE, place),
+                tf32=False,
+            )  # fmt: skip
+        )
+    want, got = results
+    # Other orders of float32 sums.
+    torch.testing.assert_close(got[0].cpu(), want[0], rtol=0, atol=1e-5)
+    assert torch.allclose(got[2].cpu(), want[2], rtol=0, atol=1e-4 * float(want[2].abs().max()))
+
+
+def test_bad_references_are_named(generator):
+    scene, records = ops.SceneView.empty(), corner_pixels(POSE, generator)
+    good = _reference(POSE)
+    for bad, message in (
+        (good._replace(kernel=0.0), "reference.kernel must be positive, got 0.0"),
+        (good._replace(weight=-1.0), "reference.weight must be at least 0, got -1.0"),
+        (good._replace(cells=good.cells[..., 0]), r"reference.cells must have shape \[H, W, 2\]"),
+    ):
+        with pytest.raises(ValueError, match=f"track_gauss_newton: {message}"):
+            ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **OPTIONS, frame=0, reference=bad)
+
+
+def test_opcheck_with_a_reference(generator):
+    scene, reference = make_scene(generator, random_decoder=False), _reference(POSE)
+    arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4)
+    image = (reference.cells, reference.pose, list(reference.intrinsics), 0.3, 0.4)
+    call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image)
+    torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)

@@ -1,0 +1,72 @@
+"""What the tests of tracking share: a pose before the corner, and the equations that autograd finds there."""
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.geometry import matrix_to_pose7, pose7_to_matrix
+from tests.ops.scenes import INTRINSICS, TRUNCATION
+
+
+def _look_at_corner():
+    """A pose (float64 [4, 4]) from which all three walls of the corner fill the view."""
+    center = np.array([0.02, -0.1, 0.05])
+    forward = np.array([0.9, 0.5, 1.1]) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.2, 1.0, -0.1], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = center
+    return pose
+
+
+POSE = _look_at_corner()
+OPTIONS = dict(
+    num_pixels=1024, iterations=8, truncation=0.16, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=3, stream=1
+)
+
+
+def pose7(matrix, device="cpu"):
+    return torch.from_numpy(matrix_to_pose7(matrix)).float().to(device)
+
+
+def moved_pose(matrix, shift, angle):
+    axis = np.array([0.3, -0.8, 0.52])
+    axis /= np.linalg.norm(axis)
+    quaternion = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+    moved = matrix.copy()
+    moved[:3, :3] = pose7_to_matrix(np.concatenate([quaternion, np.zeros(3)]))[:3, :3] @ matrix[:3, :3]
+    moved[:3, 3] += shift
+    return moved
+
+
+def rotation_exp(omega):
+    x, y, z = omega
+    zero = torch.zeros((), dtype=omega.dtype)
+    return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+
+
+def camera_points(records):
+    """float64 [P, 3] surface points in camera axes."""
+    u, v = (records[:, 0] & 0xFFFF).double(), (records[:, 0] >> 16).double()
+    depth = records[:, 1].contiguous().view(torch.float32).double()
+    rays = [(u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy, torch.ones_like(u)]
+    return torch.stack(rays, 1) * depth[:, None]
+
+
+def moved_points(local, increment):
+    rotation, translation = torch.from_numpy(POSE[:3, :3]), torch.from_numpy(POSE[:3, 3])
+    return local @ (rotation_exp(increment[3:]) @ rotation).T + translation + increment[:3]
+
+
+def surface_equations(scene, records, kernel):
+    """Residual [P], Jacobian [P, 6] through the SDF's own gradient, weight [P] and inliers [P] at POSE, all float64."""
+    local, zero = camera_points(records), torch.zeros(6, dtype=torch.float64)
+    points_by_increment = torch.func.jacfwd(lambda increment: moved_points(local, increment))(zero)
+    points = moved_points(local, zero).float().to(scene.embeddings.device)
+    sdf, valid, gradient = (t.cpu() for t in ops.query_sdf_gradient(scene, points))
+    inlier = valid & (sdf.abs() < 0.98)
+    residual = TRUNCATION * sdf.double()
+    jacobian = TRUNCATION * torch.einsum("ni,nij->nj", gradient.double(), points_by_increment)
+    return residual, jacobian, (1 / (1 + (residual / kernel) ** 2)) ** 2 * inlier, inlier
