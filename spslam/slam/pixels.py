@@ -73,14 +73,7 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
         camera: pinhole intrinsics of the frame.
         config: sections `dataset` (depth range), `pixels` and `prior` (normals).
     """
-    sampling = ops.PixelSampling(
-        count=config.pixels.per_frame,
-        min_depth=config.dataset.min_depth_m,
-        max_depth=config.dataset.max_depth_m,
-        step_px=config.prior.normal_step_px,
-        max_jump=config.prior.max_jump,
-        lattice_step=LATTICE_STEP_PX,
-    )
+    sampling = _sampling(config)
     buffer, num_valid = ops.sample_frame_pixels(
         torch.from_numpy(np.ascontiguousarray(frame.depth, np.float32)),
         torch.from_numpy(np.ascontiguousarray(frame.color)),
@@ -95,6 +88,25 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
     )
     shape = sampling.lattice_shape(*frame.depth.shape)
     return FramePixels(buffer, sampling.count, shape, num_valid / frame.depth.size)
+
+
+def blank_pixels(camera: Camera, config: Config) -> FramePixels:
+    """What `sample_frame` makes of a frame without depth."""
+    sampling = _sampling(config)
+    rows, columns = sampling.lattice_shape(camera.height, camera.width)
+    words = 6 * sampling.count + -(-rows * columns // 2)
+    return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, (rows, columns), 0.0)
+
+
+def _sampling(config: Config) -> ops.PixelSampling:
+    return ops.PixelSampling(
+        count=config.pixels.per_frame,
+        min_depth=config.dataset.min_depth_m,
+        max_depth=config.dataset.max_depth_m,
+        step_px=config.prior.normal_step_px,
+        max_jump=config.prior.max_jump,
+        lattice_step=LATTICE_STEP_PX,
+    )
 
 
 def unpack_points(records: torch.Tensor, camera: Camera) -> torch.Tensor:

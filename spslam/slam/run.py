@@ -19,6 +19,7 @@ from spslam.errors import OutputError
 from spslam.io import atomic_write
 from spslam.slam.checkpoint import load_checkpoint
 from spslam.slam.device import explained_failures, resolve_device
+from spslam.slam.frame_feed import FrameFeed
 from spslam.slam.run_files import RunFiles
 from spslam.slam.run_loop import Progress, RunLoop
 from spslam.slam.run_results import provenance, write_results
@@ -97,12 +98,14 @@ def _run(
     system = SlamSystem(config, dataset.camera, _first_pose(config, dataset), device)
     files = RunFiles(output_dir)
     position, clock = _begin(files, system, dataset, data_dir, resume)
-    if device.type == "cuda":
-        warm_up(config, dataset.camera, device)
-        torch.cuda.reset_peak_memory_stats(device)
-    clock["start_s"] = time.perf_counter() - started
-    with _one_thread_a_frame(device):
-        RunLoop(system, dataset, files, _identity(dataset, data_dir), clock, progress).run(position)
+    with FrameFeed(dataset, config, device, position) as feed:
+        if device.type == "cuda":
+            warm_up(config, dataset.camera, device)
+            torch.cuda.reset_peak_memory_stats(device)
+        feed.prepare()
+        clock["start_s"] = time.perf_counter() - started
+        with _one_thread_a_frame(device):
+            RunLoop(system, feed, len(dataset), files, _identity(dataset, data_dir), clock, progress).run(position)
     return write_results(system, dataset, config, files, clock, mesh)
 
 

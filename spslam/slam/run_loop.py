@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import IO, Any
 
-from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError
 from spslam.slam.checkpoint_writer import CheckpointWriter
-from spslam.slam.frame_feed import FrameFeed, PreparedFrame
+from spslam.slam.frame_feed import FrameFeed
 from spslam.slam.frame_report import FrameReport, PendingReport
 from spslam.slam.interruption import Interruption
+from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.run_files import RunFiles
 from spslam.slam.system import SlamSystem
 
@@ -24,7 +24,8 @@ class RunLoop:
 
     Args:
         system: takes the frames.
-        dataset: has them.
+        feed: has them, from the run's first or the checkpoint's next on.
+        total: frames of the whole run.
         files: of the output folder.
         identity: JSON object that names the data, for checkpoints.
         clock: `wall_s`, `decode_s` and `frames` so far; kept up to date.
@@ -34,13 +35,14 @@ class RunLoop:
     def __init__(
         self,
         system: SlamSystem,
-        dataset: RgbdDataset,
+        feed: FrameFeed,
+        total: int,
         files: RunFiles,
         identity: dict[str, Any],
         clock: dict[str, Any],
         progress: Progress | None,
     ):
-        self.system, self.dataset, self.files = system, dataset, files
+        self.system, self.feed, self.total, self.files = system, feed, total, files
         self.identity, self.clock, self.progress = identity, clock, progress
         self._before, self._started, self._start = dict(clock), 0.0, 0
         self._pending: deque[tuple[int, PendingReport | None]] = deque()
@@ -54,29 +56,28 @@ class RunLoop:
         self._start, self._started = start, time.perf_counter()
         threaded = self.system.device.type == "cuda"
         with (
-            FrameFeed(self.dataset, self.system.config, self.system.device, start) as feed,
             self.files.open_log() as log,
             Interruption() as interruption,
             contextlib.closing(CheckpointWriter(self.files.checkpoint, threaded)) as writer,
         ):
             try:
-                self._process(feed, log, writer, interruption)
+                self._process(log, writer, interruption)
             except Exception:
                 # What was done before goes into the log, if the device still tells.
                 with contextlib.suppress(Exception):
                     self._tell(log, wait=True)
                 raise
 
-    def _process(self, feed: FrameFeed, log: IO[str], writer: CheckpointWriter, interruption: Interruption) -> None:
-        every, total, last_saved = self.system.config.run.checkpoint_every, len(self.dataset), self._start
+    def _process(self, log: IO[str], writer: CheckpointWriter, interruption: Interruption) -> None:
+        every, last_saved = self.system.config.run.checkpoint_every, self._start
         done = self._start
-        for done, item in enumerate(feed, self._start + 1):
+        for done, item in enumerate(self.feed, self._start + 1):
             self._pending.append((done, self._take(item, done - 1)))
             self._tell(log)
-            self._keep_time(done, feed)
+            self._keep_time(done)
             if interruption.noted:
                 break
-            if done < total and _is_checkpoint_due(every, last_saved, done) and not writer.is_busy:
+            if done < self.total and _is_checkpoint_due(every, last_saved, done) and not writer.is_busy:
                 self._save(done, log, writer)
                 last_saved = done
         if interruption.noted:
@@ -85,7 +86,7 @@ class RunLoop:
             raise KeyboardInterrupt
         self.system.finish()
         self._tell(log, wait=True)
-        self._keep_time(done, feed)
+        self._keep_time(done)
 
     def _take(self, item: PreparedFrame | DatasetError, position: int) -> PendingReport | None:
         if isinstance(item, DatasetError):
@@ -101,13 +102,13 @@ class RunLoop:
             if report:
                 log.write(json.dumps(vars(report)) + "\n")
             if self.progress:
-                self.progress(done, len(self.dataset), report)
+                self.progress(done, self.total, report)
 
-    def _keep_time(self, done: int, feed: FrameFeed) -> None:
+    def _keep_time(self, done: int) -> None:
         self.clock |= {
             "frames": self._before["frames"] + done - self._start,
             "wall_s": self._before["wall_s"] + time.perf_counter() - self._started,
-            "decode_s": self._before["decode_s"] + feed.decode_seconds,
+            "decode_s": self._before["decode_s"] + self.feed.decode_seconds,
         }
 
     def _save(self, position: int, log: IO[str], writer: CheckpointWriter) -> None:

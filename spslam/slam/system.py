@@ -10,15 +10,16 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
 from spslam.prior import load_prior
-from spslam.slam.frame_feed import PreparedFrame, Upload
 from spslam.slam.frame_report import FrameMarks, FrameReport, PendingReport
 from spslam.slam.loss_decision import Fit
 from spslam.slam.mapper import Mapper
 from spslam.slam.past import Past
 from spslam.slam.pixels import FramePixels, sample_frame
+from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.state import SlamState, pose_tensor
 from spslam.slam.timeline import marker
 from spslam.slam.tracker import Tracker, TrackingResult
+from spslam.slam.upload import Upload
 from spslam.trajectory import Trajectory
 
 SETTLED_FRAMES = 3  # known one after another, before what follows a loss is trusted with the map

@@ -6,11 +6,12 @@ import torch
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
-from spslam.slam.frame_feed import PreparedFrame, Uploader
 from spslam.slam.frame_report import FrameReport
 from spslam.slam.pixels import sample_frame
+from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.system import SlamSystem
 from spslam.slam.timeline import marker
+from spslam.slam.upload import Uploader
 
 FRAMES = 4
 DEPTH_M = 2.0

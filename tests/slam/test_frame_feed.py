@@ -6,8 +6,10 @@ import torch
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
 from spslam.slam import frame_feed
-from spslam.slam.frame_feed import FrameFeed, PreparedFrame, automatic_workers
+from spslam.slam.frame_feed import FrameFeed, automatic_workers
 from spslam.slam.pixels import sample_frame
+from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.upload import Upload, Uploader
 from tests.system.sequences import Recorded, settings
 
 FRAMES = 9
@@ -19,13 +21,16 @@ def break_third(frame: RgbdFrame) -> None:
 
 
 def pixels_of(item: PreparedFrame) -> torch.Tensor:
-    received = item.pixels.received() if isinstance(item.pixels, frame_feed.Upload) else item.pixels
+    received = item.pixels.received() if isinstance(item.pixels, Upload) else item.pixels
     return received.buffer.cpu()
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_frames_come_in_order_with_their_pixels(device, workers):
-    dataset, config = Recorded(FRAMES, break_third), settings(f"run.prefetch_workers={workers}")
+@pytest.mark.parametrize(
+    ("reader", "workers", "ahead"), [("threads", 1, 8), ("threads", 3, 8), ("process", 1, 1), ("process", 3, 4)]
+)
+def test_frames_come_in_order_with_their_pixels(device, reader, workers, ahead):
+    options = f"run.reader={reader}", f"run.prefetch_workers={workers}", f"run.prefetch_ahead={ahead}"
+    dataset, config = Recorded(FRAMES, break_third), settings(*options)
     with FrameFeed(dataset, config, device, start=1) as feed:
         items = list(feed)
         assert feed.decode_seconds > 0
@@ -43,7 +48,7 @@ def test_frames_come_in_order_with_their_pixels(device, workers):
 @pytest.mark.cuda
 def test_an_upload_waits_for_nothing():
     dataset, config, device = Recorded(2), settings(), torch.device("cuda")
-    uploader = frame_feed.Uploader(device)
+    uploader = Uploader(device)
     pixels = sample_frame(dataset[0], dataset.camera, config)
     uploader.send(pixels).received()
     torch.cuda.synchronize()

@@ -1,0 +1,68 @@
+"""Frames' way to a CUDA device, beside whatever it does."""
+
+import threading
+from dataclasses import dataclass
+
+import torch
+
+from spslam.slam.pixels import FramePixels
+from spslam.slam.timeline import StreamMark
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A frame's pixels on their way to the device, on a stream of their own.
+
+    Attributes:
+        pixels: on the device; not to be read before `received`.
+        source: the same in page-locked memory, to be kept as it is until `end` has passed.
+        begin, end: of the copy.
+    """
+
+    pixels: FramePixels
+    source: FramePixels
+    begin: StreamMark
+    end: StreamMark
+
+    def received(self) -> FramePixels:
+        """The pixels, for work that is given to the current stream from now on; the host waits for nothing."""
+        stream = torch.cuda.current_stream(self.pixels.buffer.device)
+        stream.wait_event(self.end.event)
+        # Their memory must not be given to another upload while this stream may read it.
+        self.pixels.buffer.record_stream(stream)
+        return self.pixels
+
+
+class Uploader:
+    """Copies frames to a CUDA device beside whatever it does; each thread that uses it has a stream of its own."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self._own = threading.local()
+
+    def send(self, pixels: FramePixels) -> Upload:
+        """Starts the copy and returns."""
+        buffer = pixels.buffer
+        source = pixels if buffer.is_pinned() else pixels.holding(buffer.pin_memory())
+        stream = self._stream()
+        with torch.cuda.stream(stream):
+            buffer = torch.empty(len(source.buffer), dtype=torch.int32, device=self.device)
+            begin = StreamMark(stream)
+            buffer.copy_(source.buffer, non_blocking=True)
+            return Upload(pixels.holding(buffer), source, begin, StreamMark(stream))
+
+    def _stream(self) -> torch.cuda.Stream:
+        if not hasattr(self._own, "stream"):
+            self._own.stream = torch.cuda.Stream(self.device)
+        return self._own.stream
+
+    @staticmethod
+    def lock_pages(memory: torch.Tensor) -> None:
+        """Locks the pages of memory that this process only maps, so that copies out of it wait for nothing."""
+        # Where that is not allowed, copies are slower and nothing else changes.
+        torch.cuda.cudart().cudaHostRegister(memory.data_ptr(), memory.nbytes, 0)
+
+    @staticmethod
+    def unlock_pages(memory: torch.Tensor) -> None:
+        """Undoes `lock_pages`; all copies must be done."""
+        torch.cuda.cudart().cudaHostUnregister(memory.data_ptr())

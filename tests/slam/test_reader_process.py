@@ -1,0 +1,95 @@
+"""Frames read by another process: what happens where that can't be, or where either side goes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+
+import pytest
+import torch
+
+from spslam.errors import SpslamError
+from spslam.slam.frame_feed import FrameFeed
+from spslam.slam.reader_process import ReaderProcess
+from tests.system.sequences import Recorded, settings
+
+CPU = torch.device("cpu")
+FRAMES = 6
+PATIENCE_S = 60
+ROOT = Path(__file__).parents[2]
+
+
+def feed_of(dataset: Recorded) -> FrameFeed:
+    return FrameFeed(dataset, settings("run.reader=process", "run.prefetch_workers=1", "run.prefetch_ahead=2"), CPU)
+
+
+def fail(frame):
+    raise ZeroDivisionError("a bug")
+
+
+def has_ended(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except FileNotFoundError:
+        return True
+    return state == "Z"
+
+
+def test_a_data_set_that_cannot_be_pickled_is_read_by_threads():
+    with feed_of(Recorded(FRAMES, lambda frame: None)) as feed:
+        assert not isinstance(feed.prepare(), ReaderProcess)
+        assert [frame.index for frame in feed] == list(range(FRAMES))
+
+
+def test_a_data_set_unknown_to_another_process_is_read_by_threads(monkeypatch):
+    class Stranger(Recorded):
+        pass
+
+    Stranger.__module__, Stranger.__qualname__ = "spslam_nowhere", "Stranger"
+    module = types.ModuleType("spslam_nowhere")
+    module.Stranger = Stranger
+    monkeypatch.setitem(sys.modules, "spslam_nowhere", module)
+    with feed_of(Stranger(FRAMES)) as feed:
+        assert not isinstance(feed.prepare(), ReaderProcess)
+        assert [frame.index for frame in feed] == list(range(FRAMES))
+
+
+def test_a_bug_in_a_data_set_shows_where_it_is():
+    with feed_of(Recorded(FRAMES, fail)) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
+        next(feed)
+
+
+def test_a_reader_that_was_killed_is_told_of_in_one_line():
+    with feed_of(Recorded(FRAMES)) as feed:
+        next(feed)
+        feed.prepare()._process.send_signal(signal.SIGKILL)
+        with pytest.raises(SpslamError, match=r"^the process that reads frames ended by SIGKILL; .*run.reader=threads"):
+            list(feed)
+
+
+def test_closing_half_way_leaves_no_process():
+    with feed_of(Recorded(FRAMES)) as feed:
+        next(feed)
+        pid = feed.prepare()._process.pid
+    assert has_ended(pid)
+
+
+def test_the_reader_ends_with_a_loop_that_was_killed():
+    script = (
+        "import time\nfrom tests.slam.test_reader_process import FRAMES, Recorded, feed_of\n"
+        "feed = feed_of(Recorded(FRAMES))\nnext(feed)\n"
+        "print(feed.prepare()._process.pid, flush=True)\ntime.sleep(600)"
+    )
+    loop = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    reader = int(loop.stdout.readline())
+    assert not has_ended(reader)
+    os.kill(loop.pid, signal.SIGKILL)
+    loop.wait()
+    loop.stdout.close()
+    deadline = time.monotonic() + PATIENCE_S
+    while not has_ended(reader):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
