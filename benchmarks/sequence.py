@@ -23,6 +23,7 @@ from benchmarks import timing
 from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.slam.device import resolve_device
+from spslam.slam.reader_launch import launch_spare
 from spslam.slam.run import run_sequence
 
 # Columns of the table that are medians of metrics.json.
@@ -91,6 +92,7 @@ def run_preset(args: argparse.Namespace, preset: str) -> list[dict]:
     for _ in range(args.repeats):
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder) / "run"
+            launch_spare(config)  # as the command line does
             metrics = run_sequence(config, args.data, output, frames, mesh=False)
             runs.append({**metrics, "digest": digest(output)})
     return runs

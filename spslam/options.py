@@ -224,8 +224,8 @@ class RunOptions(Section):
         "threads that read and decode images; null is as many as suit the cores and the device", "threads", ge=1
     )
     reader: Literal["auto", "process", "threads"] = _text(
-        "where those threads are: in a `process` of their own, so that they don't hold up the loop, or in the run's; "
-        "`auto` is the first for a GPU"
+        "where those threads are: in a `process` of their own, so that they don't hold up the loop, or the run's; "
+        "`auto` is the first for a GPU where the command line starts the run"
     )
     prefetch_ahead: int | None = _option("most frames read ahead; null is two a thread", "frames", ge=1)
     previews: int = _option("input frames kept as pictures for the report", "frames", ge=0)

@@ -13,11 +13,12 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.prefetch import Prefetcher, prefetch
 from spslam.errors import DatasetError
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
+from spslam.slam.reader_launch import has_spare
 from spslam.slam.reader_process import ReaderProcess
 from spslam.slam.timeline import marker
 from spslam.slam.upload import Uploader
 
-# More threads than this decode no faster: they would wait for each other's turn at the interpreter.
+# More threads than this decode little faster: they wait for each other's turn at the interpreter, and slow the loop.
 MOST_WORKERS = 16
 LEAST_WORKERS = 2
 LEAST_AHEAD = 8
@@ -40,7 +41,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         self._threads = prefetch(FramePreparation(dataset, config, start, uploader), workers, ahead)
         self._process = (
             ReaderProcess.start(dataset, config, start, workers, ahead, uploader)
-            if run.reader == "process" or (run.reader == "auto" and device.type == "cuda")
+            if run.reader == "process" or (run.reader == "auto" and device.type == "cuda" and has_spare())
             else None
         )
         self._reader: Prefetcher[PreparedFrame] | ReaderProcess | None = None
@@ -76,7 +77,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
 
 def automatic_workers(device: torch.device) -> int:
-    """Reading threads for a run on `device`: a GPU is fed by all cores but the loop's, CPU kernels get by with few."""
+    """Reading threads for a run on `device`: a GPU is fed by half the cores, CPU kernels get by with fewer."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    wanted = cores - 1 if device.type == "cuda" else cores // 4
+    wanted = cores // 2 if device.type == "cuda" else cores // 4
     return min(max(wanted, LEAST_WORKERS), MOST_WORKERS)

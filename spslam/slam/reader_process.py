@@ -10,11 +10,9 @@ import os
 import pickle
 import signal
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 
 import torch
@@ -24,7 +22,8 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, SpslamError
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
-from spslam.slam.reader_service import GONE, Message, Work, mapped, serve
+from spslam.slam.reader_launch import launch, take_spare
+from spslam.slam.reader_service import GONE, Message, Work, mapped
 from spslam.slam.upload import Upload, Uploader
 
 _WORD_BYTES = 4
@@ -90,12 +89,15 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         work = Work(dataset, config, start, workers, max(ahead - slots, 1), slots, words)
         try:
             content = pickle.dumps(work)
-            process, connection, memory = _launch(slots, words)
+            reader = take_spare() or launch()
         except (pickle.PicklingError, AttributeError, TypeError, OSError):
             return None
+        os.ftruncate(reader.shared, max(slots * words * _WORD_BYTES, 1))
+        memory = mapped(reader.shared, slots, words)
+        os.close(reader.shared)
         with contextlib.suppress(*GONE):
-            connection.send_bytes(content)
-        return cls(process, connection, memory, blank, uploader)
+            reader.connection.send_bytes(content)
+        return cls(reader.process, reader.connection, memory, blank, uploader)
 
     def is_ready(self) -> bool:
         """Waits until it can read. False where the data set means nothing to another process, which has then ended."""
@@ -172,30 +174,6 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
                 upload.end.wait()
             self._in_use.popleft()
             self._connection.send(slot)
-
-
-def _launch(slots: int, words: int) -> tuple[subprocess.Popen, Connection, torch.Tensor]:
-    """A process that waits for its work, the socket to it, and the memory that it shares."""
-    shared = os.memfd_create("spslam-frames")
-    own, other = Pipe()
-    try:
-        os.ftruncate(shared, max(slots * words * _WORD_BYTES, 1))
-        process = subprocess.Popen(
-            [sys.executable, "-c", f"from {serve.__module__} import serve; serve({other.fileno()}, {shared})"],
-            stdin=subprocess.DEVNULL,
-            pass_fds=(other.fileno(), shared),
-            # It needs no GPU; what is importable here must be there.
-            env={**os.environ, "CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            # Ctrl-C is for the loop, which ends it.
-            start_new_session=True,
-        )
-        return process, own, mapped(shared, slots, words)
-    except BaseException:
-        own.close()
-        raise
-    finally:
-        other.close()
-        os.close(shared)
 
 
 def _epitaph(code: int | None) -> str:

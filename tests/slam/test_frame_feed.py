@@ -63,7 +63,8 @@ def test_an_upload_waits_for_nothing():
 
 
 @pytest.mark.parametrize(
-    ("cores", "kind", "workers"), [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (16, "cuda", 15)]
+    ("cores", "kind", "workers"),
+    [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (64, "cuda", 16), (16, "cuda", 8)],
 )
 def test_number_of_threads_suits_cores_and_device(monkeypatch, cores, kind, workers):
     monkeypatch.setattr(frame_feed.os, "sched_getaffinity", lambda _: range(cores), raising=False)

@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from spslam.errors import SpslamError
+from spslam.slam import reader_launch
 from spslam.slam.frame_feed import FrameFeed
+from spslam.slam.reader_launch import end_spare, has_spare, launch_spare
 from spslam.slam.reader_process import ReaderProcess
 from tests.system.sequences import Recorded, settings
 
@@ -55,6 +57,29 @@ def test_a_data_set_unknown_to_another_process_is_read_by_threads(monkeypatch):
     with feed_of(Stranger(FRAMES)) as feed:
         assert not isinstance(feed.prepare(), ReaderProcess)
         assert [frame.index for frame in feed] == list(range(FRAMES))
+
+
+def test_a_process_started_early_is_used_once():
+    launch_spare(settings("run.reader=process"))
+    launch_spare(settings("run.reader=process"))
+    pid = reader_launch._spares[0].process.pid
+    with feed_of(Recorded(FRAMES)) as feed:
+        assert feed.prepare()._process.pid == pid
+        assert [frame.index for frame in feed] == list(range(FRAMES))
+    assert not has_spare()
+
+
+def test_a_process_that_nobody_takes_is_ended():
+    launch_spare(settings("run.reader=process"))
+    pid = reader_launch._spares[0].process.pid
+    end_spare()
+    assert has_ended(pid) and not has_spare()
+
+
+@pytest.mark.parametrize("options", [("device=cpu",), ("run.reader=threads", "device=cuda")])
+def test_a_run_that_wants_no_process_starts_none(options):
+    launch_spare(settings(*options))
+    assert not has_spare()
 
 
 def test_a_bug_in_a_data_set_shows_where_it_is():
