@@ -8,7 +8,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7
-from tests.ops.scenes import BACKENDS, INTRINSICS, OPTIONS, POSES, Backend, corner_pixels, make_scene
+from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, corner_pixels, make_scene
 
 RENDER_OPTIONS = replace(OPTIONS, seed=2**40 + 3, frame=5, iteration=0)
 NUM_PIXELS, ITERATIONS, FIXED = 300, 4, 1
@@ -17,11 +17,6 @@ RATES = dict(embeddings=4e-3, texels=4e-3, geometry_params=1e-3, color_params=1e
 FIRST_TOLERANCE = dict(rtol=1e-5, atol=1e-6)
 # Adam's first steps go by a gradient's sign, so rounding sends parameters of almost no gradient another way.
 STRAYED_SHARE, LOSS_TOLERANCE = 0.02, dict(rtol=2e-3, atol=1e-5)
-
-
-@pytest.fixture(params=BACKENDS)
-def backend(request) -> Backend:
-    return request.param
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7, quaternion_to_matrix
-from tests.ops.scenes import BACKENDS, INTRINSICS, OPTIONS, POSES, TRUNCATION, Backend, corner_pixels, make_scene
+from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, TRUNCATION, corner_pixels, make_scene
 from tests.reference.render_step import PARAMETERS, render_step
 
 GRADIENTS = dict(
@@ -28,11 +28,6 @@ CUDA_ELEMENT_TOLERANCE, CUDA_NORM_TOLERANCE = 0.03, 0.02
 # with its products rounded so strays from itself by as much: 0.30 and 0.07. Where the decoder is the scene's own the
 # tolerance above holds.
 TF32_ELEMENT_TOLERANCE, TF32_NORM_TOLERANCE = 0.35, 0.1
-
-
-@pytest.fixture(params=BACKENDS)
-def backend(request) -> Backend:
-    return request.param
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7
-from tests.ops.scenes import BACKENDS, INTRINSICS, OPTIONS, POSES, Backend, corner_pixels, make_scene
+from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, corner_pixels, make_scene
 
 RENDER_OPTIONS = replace(OPTIONS, cosine_targets=False, seed=77, stream=ops.Stream.TRACKING_RAYS, frame=9, iteration=0)
 NUM_PIXELS, ITERATIONS = 200, 6
@@ -17,11 +17,6 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 # Rounding in other places, carried through six steps; on CUDA the call's kernel is another than the single step's.
 POSE_TOLERANCE, LOSS_TOLERANCE = dict(rtol=0, atol=2e-5), dict(rtol=1e-3, atol=1e-5)
 TF32_POSE_TOLERANCE, TF32_LOSS_TOLERANCE = dict(rtol=0, atol=2e-4), dict(rtol=5e-3, atol=1e-4)
-
-
-@pytest.fixture(params=BACKENDS)
-def backend(request) -> Backend:
-    return request.param
 
 
 @pytest.fixture

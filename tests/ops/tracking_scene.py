@@ -5,23 +5,9 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
-from tests.ops.scenes import INTRINSICS, TRUNCATION
+from tests.ops.scenes import INTRINSICS, POSES, TRUNCATION
 
-
-def _look_at_corner():
-    """A pose (float64 [4, 4]) from which all three walls of the corner fill the view."""
-    center = np.array([0.02, -0.1, 0.05])
-    forward = np.array([0.9, 0.5, 1.1]) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross([0.2, 1.0, -0.1], forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    pose[:3, 3] = center
-    return pose
-
-
-POSE = _look_at_corner()
+POSE = POSES[0]  # all three walls of the corner fill the view
 OPTIONS = dict(
     num_pixels=1024, iterations=8, truncation=0.16, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=3, stream=1
 )
