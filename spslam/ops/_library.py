@@ -26,7 +26,10 @@ def _load_cpu() -> str:
     for isa in _candidates():
         path = _FOLDER / _LIBRARY_OF_ISA[isa]
         if path.exists():
-            torch.ops.load_library(str(path))
+            try:
+                torch.ops.load_library(str(path))
+            except OSError as error:
+                raise ImportError(f"spslam: torch must be 2.11 or later, got {torch.__version__}: {error}") from error
             return isa
     raise ImportError(
         f"spslam: no compiled kernels for {' or '.join(_candidates())} in {_FOLDER}; install the wheel, "
@@ -41,7 +44,10 @@ def _load_cuda() -> str | None:
         return "spslam was built without CUDA"
     if not torch.version.cuda:
         return "the installed torch is a CPU build"
-    torch.ops.load_library(str(path))
+    try:
+        torch.ops.load_library(str(path))
+    except OSError as error:
+        return f"{path.name} does not load: {error}"
     if not torch.cuda.is_available():
         return "torch finds no CUDA device"
     return None
