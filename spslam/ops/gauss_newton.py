@@ -171,6 +171,7 @@ def track_gauss_newton(
 def _check_reference(name: str, reference: ReferenceImage, like: torch.Tensor) -> None:
     check_tensor(name, "reference.cells", reference.cells, ("H", "W", 2), torch.float32, like=like)
     check_tensor(name, "reference.pose", reference.pose, (7,), torch.float32, like=like)
+    check_intrinsics(name, reference.intrinsics, "reference.intrinsics")
     check(reference.weight >= 0, name, "reference.weight", "be at least 0", reference.weight)
     check(reference.kernel > 0, name, "reference.kernel", "be positive", reference.kernel)
 

@@ -21,9 +21,9 @@ class Intrinsics(NamedTuple):
     cy: float
 
 
-def check_intrinsics(function: str, intrinsics: Sequence[float]) -> None:
+def check_intrinsics(function: str, intrinsics: Sequence[float], argument: str = "intrinsics") -> None:
     """Raises ValueError unless a camera has its four numbers."""
-    check(len(intrinsics) == 4, function, "intrinsics", "be (fx, fy, cx, cy)", tuple(intrinsics))
+    check(len(intrinsics) == 4, function, argument, "be (fx, fy, cx, cy)", tuple(intrinsics))
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,9 @@ def _parts(value, path):
     if is_dataclass(value):
         for field in fields(value):
             yield from _parts(getattr(value, field.name), (*path, field.name))
-    elif isinstance(value, ops.Intrinsics):
-        for name, number in value._asdict().items():
-            yield (*path, name), number
+    elif hasattr(value, "_asdict"):  # a NamedTuple
+        for name, part in value._asdict().items():
+            yield from _parts(part, (*path, name))
 
 
 def get(call, path):
@@ -55,7 +55,7 @@ def _with(owner, path, value):
     if not path:
         return value
     part = {path[0]: _with(getattr(owner, path[0]), path[1:], value)}
-    return owner._replace(**part) if isinstance(owner, ops.Intrinsics) else replace(owner, **part)
+    return owner._replace(**part) if hasattr(owner, "_replace") else replace(owner, **part)
 
 
 def outputs(result):

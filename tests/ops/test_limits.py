@@ -127,5 +127,5 @@ def test_a_camera_has_four_numbers(name, device, generator):
     call = arguments(name, generator, device)
     for path in cameras(call):
         for wrong in (get(call, path)[:3], (*get(call, path), 1.0)):
-            with pytest.raises(ValueError, match=rf"{name}: intrinsics must be \(fx, fy, cx, cy\), got \("):
+            with pytest.raises(ValueError, match=rf"{name}: .*intrinsics must be \(fx, fy, cx, cy\), got \("):
                 run(name, changed(call, path, wrong))
