@@ -94,7 +94,7 @@ def _intensity_equations(reference, records):
     corners = torch.stack([cells[v + dv, u + du, 1] for dv in (0, 1) for du in (0, 1)])
     agrees = inside & ((corners - depth).abs() < 0.1 * depth).all(0)
     weight = (1 / (1 + (difference(zero) / reference.kernel) ** 2)) ** 2 * agrees
-    return reference.weight * torch.func.jacrev(difference)(zero), weight
+    return reference.weight * torch.autograd.functional.jacobian(difference, zero), weight
 
 
 def test_colour_equations_are_those_of_autograd(device, generator):
