@@ -13,7 +13,8 @@ from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.io import atomic_write
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
-_LOST = "# lost frames:"
+_LOST = "# lost"
+_NO_POSE = " 0 0 0 0 0 0 1"
 
 
 @dataclass
@@ -24,7 +25,8 @@ class Trajectory:
     ----------
     timestamps : float64 [F], seconds.
     poses : float64 [F,4,4], ``T_world_camera``.
-    lost : bool [F], frames whose pose is a prediction because tracking failed; all False if not given.
+    lost : bool [F], frames whose pose isn't known; all False if not given. Their rows of ``poses`` repeat the last
+        known pose, or the first known one before it, so that they are finite; they say nothing.
     """
 
     timestamps: np.ndarray
@@ -39,11 +41,12 @@ class Trajectory:
         count = len(self.timestamps)
         if count == 0:
             self.poses = self.poses.reshape(0, 4, 4)
-        self.lost = np.zeros(count, dtype=bool) if self.lost is None else np.asarray(self.lost, dtype=bool)
+        self.lost = np.zeros(count, dtype=bool) if self.lost is None else np.array(self.lost, dtype=bool)
         if self.poses.shape != (count, 4, 4):
             raise ValueError(f"Trajectory: poses must have shape {(count, 4, 4)}, got {self.poses.shape}")
         if self.lost.shape != (count,):
             raise ValueError(f"Trajectory: lost must have shape {(count,)}, got {self.lost.shape}")
+        self.poses = _hold_known(self.poses, self.lost)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -51,22 +54,20 @@ class Trajectory:
     def save_tum(self, path: str | os.PathLike) -> None:
         """Write the TUM format, a line a frame: ``timestamp tx ty tz qx qy qz qw``, camera to world.
 
-        The numbers of lost frames stand in a comment line, which other readers skip. The same trajectory
-        gives the same bytes. Poses are kept to a nanometre and 1e-9 in the quaternion. Written at once or not
-        at all; raises OutputError.
+        A lost frame has no pose but a comment in its place, ``# lost timestamp``, which other readers skip. The same
+        trajectory gives the same bytes. Poses are kept to a nanometre and 1e-9 in the quaternion. Written at once or
+        not at all; raises OutputError.
         """
         lines = [_HEADER]
-        if self.lost.any():
-            lines.append(" ".join([_LOST, *map(str, np.flatnonzero(self.lost))]))
-        for timestamp, row in zip(self.timestamps, matrix_to_pose7(self.poses), strict=True):
+        for timestamp, row, lost in zip(self.timestamps, matrix_to_pose7(self.poses), self.lost, strict=True):
             w, x, y, z, *translation = row
             numbers = " ".join(f"{value:.9f}" for value in (*translation, x, y, z, w))
-            lines.append(f"{timestamp:.6f} {numbers}")
+            lines.append(f"{_LOST} {timestamp:.6f}" if lost else f"{timestamp:.6f} {numbers}")
         atomic_write(path, "\n".join(lines) + "\n")
 
     @classmethod
     def load_tum(cls, path: str | os.PathLike, skip_unknown: bool = False) -> Trajectory:
-        """Read the TUM format; rows stay in the file's order. A file without a pose gives an empty trajectory.
+        """Read the TUM format; rows stay in the file's order. A file without a frame gives an empty trajectory.
 
         With ``skip_unknown`` rows with a number that isn't finite are left out; they say that the pose is unknown.
         Raises DatasetError, naming file and line, for a missing file or a line that isn't eight finite numbers
@@ -77,18 +78,28 @@ class Trajectory:
             lines = path.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"{path}: can't be read as a trajectory: {error}") from error
-        rows, lost_frames = [], []
+        rows: list[list[float]] = []
+        lost: list[bool] = []
         for number, line in enumerate(lines, start=1):
-            if line.startswith(_LOST):
-                lost_frames = [int(word) for word in line[len(_LOST) :].split() if word.isdigit()]
-            elif line.strip() and not line.startswith("#"):
+            is_lost = line.startswith(f"{_LOST} ")
+            if is_lost:
+                line = line.removeprefix(_LOST) + _NO_POSE
+            if line.strip() and not line.startswith("#"):
                 row = _parse_row(path, number, line, skip_unknown)
                 if np.all(np.isfinite(row)):
                     rows.append(row)
+                    lost.append(is_lost)
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-        lost = np.zeros(len(table), dtype=bool)
-        lost[[frame for frame in lost_frames if frame < len(table)]] = True
-        return cls(table[:, 0], pose7_to_matrix(table[:, [7, 4, 5, 6, 1, 2, 3]]), lost)
+        return cls(table[:, 0], pose7_to_matrix(table[:, [7, 4, 5, 6, 1, 2, 3]]), np.array(lost, bool))
+
+
+def _hold_known(poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """Poses with each lost row replaced by the last known one, those before the first known one by that."""
+    known = np.flatnonzero(~lost)
+    if not lost.any() or not len(known):
+        return poses
+    before = np.searchsorted(known, np.arange(len(poses)), side="right") - 1
+    return poses[known[before.clip(min=0)]]
 
 
 def _parse_row(path: Path, number: int, line: str, may_be_unknown: bool) -> list[float]:

@@ -15,12 +15,34 @@ def make_trajectory(count: int) -> Trajectory:
 
 def test_round_trip(tmp_path):
     trajectory = make_trajectory(7)
-    trajectory.lost[[2, 5]] = True
     trajectory.save_tum(tmp_path / "trajectory.txt")
     loaded = Trajectory.load_tum(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(loaded.timestamps, trajectory.timestamps, atol=5.1e-7)
     np.testing.assert_allclose(loaded.poses, trajectory.poses, atol=1e-8)
     np.testing.assert_array_equal(loaded.lost, trajectory.lost)
+
+
+def test_lost_frames_have_no_pose_in_the_file(tmp_path):
+    poses = make_trajectory(7).poses
+    trajectory = Trajectory(np.arange(7) / 30, poses, [True, False, True, False, False, True, True])
+    trajectory.save_tum(tmp_path / "trajectory.txt")
+    lines = (tmp_path / "trajectory.txt").read_text().splitlines()[1:]
+    assert [line for line in lines if line.startswith("#")] == [
+        "# lost 0.000000", "# lost 0.066667", "# lost 0.166667", "# lost 0.200000",
+    ]  # fmt: skip
+    loaded = Trajectory.load_tum(tmp_path / "trajectory.txt")
+    np.testing.assert_array_equal(loaded.lost, trajectory.lost)
+    np.testing.assert_allclose(loaded.timestamps, trajectory.timestamps, atol=5.1e-7)
+    # What stands there is finite, and the last pose that is known.
+    np.testing.assert_allclose(loaded.poses, poses[[1, 1, 1, 3, 4, 4, 4]], atol=1e-8)
+    np.testing.assert_array_equal(loaded.poses.round(6), trajectory.poses.round(6))
+
+
+def test_a_trajectory_without_any_known_pose(tmp_path):
+    Trajectory([0.0, 1.0], make_trajectory(2).poses, [True, True]).save_tum(tmp_path / "t.txt")
+    loaded = Trajectory.load_tum(tmp_path / "t.txt")
+    assert loaded.lost.all()
+    np.testing.assert_array_equal(loaded.poses, [np.eye(4)] * 2)
 
 
 def test_the_same_trajectory_gives_the_same_bytes(tmp_path):

@@ -62,7 +62,7 @@ def path_chart(estimate: np.ndarray, truth: np.ndarray | None, lost: np.ndarray)
     ----------
     estimate : [F,2].
     truth : [F,2] in the same axes, NaN where unknown, or None.
-    lost : bool [F].
+    lost : bool [F]; the estimate's line has a gap there.
     """
     known = estimate if truth is None else np.concatenate([estimate, truth[np.isfinite(truth).all(axis=1)]])
     if not len(known):
@@ -79,7 +79,8 @@ def path_chart(estimate: np.ndarray, truth: np.ndarray | None, lost: np.ndarray)
     parts = [_grid(low, high, scale, height)]
     if truth is not None:
         parts.append(f'<path class="line truth" d="{_path(place(truth))}"/>')
-    parts.append(f'<path class="line estimate" d="{_path(place(estimate))}"/>')
+    known_path = np.where(lost[:, None], np.nan, estimate)
+    parts.append(f'<path class="line estimate" d="{_path(place(known_path))}"/>')
     parts += [f'<circle class="dot lost" cx="{u:.1f}" cy="{v:.1f}" r="3"/>' for u, v in place(estimate[lost])]
     (u, v), (end_u, end_v) = place(estimate[0]), place(estimate[-1])
     parts.append(f'<circle class="dot estimate" cx="{u:.1f}" cy="{v:.1f}" r="5"><title>start</title></circle>')

@@ -33,10 +33,11 @@ def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, fl
 
     With ``with_scale`` also ATE after alignment by a similarity, under names of its own.
     """
-    if run.truth is None:
+    truth = run.known_truth
+    if truth is None:
         return {}
-    figures = {**ate(run.trajectory.poses, run.truth), **rpe(run.trajectory.poses, run.truth)}
-    return {**figures, **ate(run.trajectory.poses, run.truth, with_scale=True)} if with_scale else figures
+    figures = {**ate(run.trajectory.poses, truth), **rpe(run.trajectory.poses, truth)}
+    return {**figures, **ate(run.trajectory.poses, truth, with_scale=True)} if with_scale else figures
 
 
 def surface_figures(
@@ -62,12 +63,11 @@ def surface_figures(
         When the run has no mesh, or none of its frames is in the dataset.
     """
     mesh = _require_mesh(run)
-    rows, indices = _frames_of(run, dataset, _CULLING_FRAMES)
+    known = run.known_truth
+    rows, indices = _frames_of(run, dataset, _CULLING_FRAMES, known_only=run.truth is None)
     poses = run.trajectory.poses if run.truth is None else run.truth
     rows, depths = _read_depths(dataset, rows, indices)
-    vertices = (
-        mesh.vertices if run.truth is None else _align_views(run.trajectory.poses, run.truth).apply(mesh.vertices)
-    )
+    vertices = mesh.vertices if known is None else _align_views(run.trajectory.poses, known).apply(mesh.vertices)
 
     def observed(points: np.ndarray) -> np.ndarray:
         return observed_mask(points, depths, poses[rows], dataset.camera)
@@ -109,7 +109,7 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
         raise OutputError(f"{run.folder}: has no map.safetensors to draw")
     scene = Scene.load(map_file)
     likeness, coverage = [], []
-    for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS), strict=True):
+    for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS, known_only=True), strict=True):
         try:
             frame = dataset[int(index)]
         except DatasetError:
@@ -149,10 +149,10 @@ def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
     return Alignment(*umeyama(*points))
 
 
-def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int, known_only: bool) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the run's trajectory, spread evenly, and the dataset's numbers of those frames."""
     indices = match_times(dataset.timestamps(), run.trajectory.timestamps)
-    rows = np.flatnonzero(indices >= 0)
+    rows = np.flatnonzero((indices >= 0) & ~(run.trajectory.lost & known_only))
     if not len(rows):
         raise OutputError(f"{run.folder}: must be a run over {dataset.name}, but has none of its frames")
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]

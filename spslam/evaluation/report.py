@@ -155,6 +155,7 @@ def _errors(run: RunOutput) -> str:
     estimate, truth = _aligned_positions(run) if len(run.trajectory) else (np.zeros((0, 3)), None)
     if truth is None:
         return ""
+    estimate = np.where(run.trajectory.lost[:, None], np.nan, estimate)
     difference = 100 * (estimate - truth) @ np.column_stack([pictures.top_axes(run.trajectory.poses), _up(run)])
     series = [charts.Series(name, name[0], column) for name, column in zip(_AXES, difference.T, strict=True)]
     series.append(charts.Series("distance", "total", np.linalg.norm(difference, axis=1)))
@@ -173,9 +174,9 @@ def _up(run: RunOutput) -> np.ndarray:
 def _aligned_positions(run: RunOutput) -> tuple[np.ndarray, np.ndarray | None]:
     """Estimated positions [F,3], and the true ones carried into the estimate's world; None if none is known."""
     estimate = run.trajectory.poses[:, :3, 3]
-    if run.truth is None:
+    if run.truth is None or run.known_truth is None:
         return estimate, None
-    alignment = align(run.trajectory.poses, run.truth)
+    alignment = align(run.trajectory.poses, run.known_truth)
     return estimate, (run.truth[:, :3, 3] - alignment.translation) @ alignment.rotation
 
 

@@ -83,10 +83,18 @@ class RunOutput:
             _read_camera(folder / "previews" / "camera.json"),
         )
 
+    @property
+    def known_truth(self) -> np.ndarray | None:
+        """The true poses [F,4,4] of the frames whose pose the run knew, NaN for the others; None if none is known."""
+        return None if self.truth is None else np.where(self.trajectory.lost[:, None, None], np.nan, self.truth)
+
     def previews(self) -> list[Preview]:
-        """The kept input frames, by row; ones that can't be read, or aren't in the trajectory, are left out."""
+        """The kept input frames, by row; ones that can't be read, or whose pose isn't known, are left out."""
         found = (_read_preview(path) for path in sorted((self.folder / "previews").glob("frame-*.png")))
-        return [preview for preview in found if preview is not None and preview.row < len(self.trajectory)]
+        return [preview for preview in found if preview is not None and self._is_known(preview.row)]
+
+    def _is_known(self, row: int) -> bool:
+        return row < len(self.trajectory) and not self.trajectory.lost[row]
 
     def mesh(self) -> Mesh | None:
         """mesh.ply; None where there is none or it is empty. Raises OutputError if it can't be read."""

@@ -27,7 +27,8 @@ class FrameReport:
         support: mean robust weight of its pixels on the map, from 0 to 1; None where it was not tracked.
         information: smallest eigenvalue of its normal equations a pixel; None where it was not tracked.
         jump_cm, jump_deg: from the motion model's pose to the one found; None where that was not asked.
-        conflict: share of its surface that other frames saw to be free space; None where there was no doubt.
+        conflict: share of the surface other frames know that it looks through; None where that was not asked.
+        hidden: share of that surface that something nearer hides; None where that was not asked.
         doubt: probability from these that its pose is wrong; None where it was not tracked.
         rescued: whether its pose comes from a start that projective ICP found.
         relocalised: whether that start was a stored frame that looks alike.
@@ -56,6 +57,7 @@ class FrameReport:
     jump_cm: float | None
     jump_deg: float | None
     conflict: float | None
+    hidden: float | None
     doubt: float | None
     rescued: bool
     relocalised: bool

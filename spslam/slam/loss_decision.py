@@ -7,8 +7,8 @@ A logistic model of four measures, fitted to right poses of clean runs and to wh
 
 support is the mean robust weight of the frame's pixels, information the smallest eigenvalue of the normal equations a
 pixel (how well the worst direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5
-degrees) from where the motion model put the camera, conflict the share of its surface that lies where other frames saw
-free space. What is not known takes part as a number between right and wrong.
+degrees) from where the motion model put the camera, conflict the share of the surface known from other frames that it
+would have to look through. What is not known takes part as a number between right and wrong.
 """
 
 import math
@@ -21,6 +21,7 @@ JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
 MOST_CONFLICT = 0.3  # beyond it one wrong pose is as wrong as another
 UNKNOWN_JUMP, UNKNOWN_CONFLICT = 1.3, 0.11
+MOST_HIDDEN = 0.15  # of known surface; in clean runs it is at most 0.07
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class Fit:
         support: mean robust weight of all pixels, from 0 (none fits the map) to 1 (all do).
         information: smallest eigenvalue of the normal equations a pixel, 1.
         jump_cm, jump_deg: distance and angle to the pose that was expected.
-        conflict: share of the pixels on surface known to be elsewhere, of those whose surface is known.
+        conflict: share of the surface in view, as other frames know it, that the frame looks through.
+        hidden: share of it that something nearer hides from the frame; no sign of a wrong pose.
     """
 
     residual_cm: float = math.nan
@@ -43,6 +45,12 @@ class Fit:
     jump_cm: float = math.nan
     jump_deg: float = math.nan
     conflict: float = math.nan
+    hidden: float = math.nan
+
+    @property
+    def is_obstructed(self) -> bool:
+        """Whether something is before the lens that is no part of the scene."""
+        return self.hidden > MOST_HIDDEN
 
     @property
     def doubt(self) -> float:

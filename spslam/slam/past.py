@@ -5,16 +5,18 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 
+from spslam import ops
 from spslam.camera import Camera
-from spslam.slam.pixels import LATTICE_STEP_PX, FramePixels, unpack_points
+from spslam.slam.loss_decision import UNKNOWN_CONFLICT
+from spslam.slam.pixels import LATTICE_STEP_PX, FramePixels
 from spslam.slam.state import SlamState
 
-POINTS = 512  # of a frame, held against what other frames saw
-VIEWS = 256  # most of those others, the recent and an even sample of the rest
+VIEWS = 128  # most frames that a pose is held against: the recent and an even sample of the rest
 RECENT_VIEWS = 16
-BEST_VIEWS = 8  # of them, the ones that saw most of the points, are asked
-TOLERANCE_M, TOLERANCE_SHARE = 0.05, 0.02  # of a depth in a lattice
-FREE = 1.5  # tolerances in front of a surface begins what was seen to be free
+BEST_VIEWS = 8  # of them, the ones that share most surface, are asked
+TOLERANCE_M, TOLERANCE_SHARE = 0.05, 0.02  # of a depth
+FREE = 1.5  # tolerances from a surface begins what is clearly before or behind it
+FEW_POINTS = 50  # say as much as the knowledge before
 # Likeness of two coarse depth images: difference of the logarithms, with a limit, and what one without a depth costs.
 MOST_DIFFERENCE, NO_DEPTH_DIFFERENCE = 0.3, 0.15
 APART = 5  # frames; a run of like frames gives one candidate
@@ -50,6 +52,12 @@ class Past:
         """Whether the last frame's pose isn't known."""
         return bool(self._state.frames.lost[-1])
 
+    @property
+    def frames_lost(self) -> int:
+        """How many frames at the end have no known pose."""
+        known = (~self._state.frames.lost).nonzero()
+        return len(self._state.frames) - (int(known[-1]) + 1 if len(known) else 0)
+
     def last(self) -> EarlierFrame | None:
         """The last frame with pixels and a pose to be trusted; None where there is none."""
         rows = self._rows()
@@ -77,20 +85,22 @@ class Past:
         order = candidates.argsort(stable=True)[:count]
         return [self._frame(row) for row in rows[order[candidates[order].isfinite()]].tolist()]
 
-    def conflict(self, pixels: FramePixels, pose: torch.Tensor) -> float:
-        """Share of the frame's points that lie where other frames saw free space, of all whose surroundings they saw.
+    def conflict(self, vertices: torch.Tensor, intrinsics: ops.Intrinsics, pose: torch.Tensor) -> tuple[float, float]:
+        """Shares of the surface known from other frames that a frame looks through, and that something hides from it.
 
         Args:
-            pixels: of the frame.
-            pose: float32 [7] that it is held to have.
+            vertices: float32 [H, W, 3], m, what the frame sees of the surface, in its axes; z = 0 where unknown.
+            intrinsics: of that map.
+            pose: float32 [7].
 
         Returns:
-            0 to 1; 0 where no frame saw any of the points.
+            Two numbers from 0 to 1. Where little is known, the first goes towards what it counts as unmeasured.
         """
-        rows = self._views()
-        points = unpack_points(pixels.records[:POINTS], self._camera)
-        frames = self._state.frames
-        return float(free_space_conflict(points, pose, frames.poses[rows], frames.lattices[rows], self._camera))
+        rows, frames = self._views(), self._state.frames
+        counts = surface_counts(vertices, intrinsics, pose, frames.poses[rows], frames.lattices[rows], self._camera)
+        seen, through, hidden = counts.tolist()
+        share = (through + UNKNOWN_CONFLICT * FEW_POINTS) / (seen + through + FEW_POINTS)
+        return share, hidden / max(seen + hidden, 1)
 
     def _rows(self) -> torch.Tensor:
         return self._state.usable.nonzero()[:, 0]
@@ -124,40 +134,58 @@ def lattice_difference(lattice: torch.Tensor, others: torch.Tensor) -> torch.Ten
     return (difference * either).sum((1, 2)) / either.sum((1, 2)).clamp(min=1)
 
 
-def free_space_conflict(
-    points: torch.Tensor, pose: torch.Tensor, poses: torch.Tensor, lattices: torch.Tensor, camera: Camera
+def surface_counts(
+    vertices: torch.Tensor,
+    intrinsics: ops.Intrinsics,
+    pose: torch.Tensor,
+    poses: torch.Tensor,
+    lattices: torch.Tensor,
+    camera: Camera,
 ) -> torch.Tensor:
-    """Share of points in what other frames saw to be free, of those free or on a surface, in the frames that saw most.
+    """How many points of other frames' surface a frame sees, looks through, and has hidden from it by something nearer.
+
+    Points are counted in the frames that share most surface with it.
 
     Args:
-        points: float32 [N, 3], m, in the axes of a camera.
-        pose: float32 [7] of that camera.
+        vertices: float32 [H, W, 3], m, what the frame sees of the surface; z = 0 where unknown.
+        intrinsics: of that map.
+        pose: float32 [7] of the frame.
         poses: float32 [F, 7] of the other frames.
         lattices: float16 [F, h, w] their coarse depth (m).
         camera: of all of them.
 
     Returns:
-        float32 []; 0 for no points or frames.
+        int64 [3].
     """
-    x, y, z = _in_cameras(points, pose, poses).unbind(-1)
-    rows, columns = lattices.shape[1:]
-    column = ((x / z * camera.fx + camera.cx + 0.5) / LATTICE_STEP_PX).floor()
-    row = ((y / z * camera.fy + camera.cy + 0.5) / LATTICE_STEP_PX).floor()
-    inside = (z > LEAST_DEPTH_M) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    points, known = _lattice_points(lattices, camera)
+    x, y, z = _in_camera(points, poses, pose).unbind(-1)
+    rows, columns = vertices.shape[:2]
+    column = (x / z * intrinsics.fx + intrinsics.cx + 0.5).floor()
+    row = (y / z * intrinsics.fy + intrinsics.cy + 0.5).floor()
+    inside = known & (z > LEAST_DEPTH_M) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     cell = torch.where(inside, row * columns + column, 0).long()
-    depth = torch.where(inside, lattices.flatten(1).float().gather(1, cell), 0)
+    depth = torch.where(inside, vertices[..., 2].flatten()[cell], 0)
     tolerance = TOLERANCE_M + TOLERANCE_SHARE * z
-    on_surface = (depth > 0) & ((depth - z).abs() < tolerance)
-    in_free_space = (depth > 0) & (depth - z > FREE * tolerance)
-    free, seen = in_free_space.sum(1), (on_surface | in_free_space).sum(1)
-    best = seen.argsort(descending=True, stable=True)[:BEST_VIEWS]
-    return free[best].sum() / seen[best].sum().clamp(min=1)
+    behind = (depth - z) / tolerance
+    kinds = torch.stack([behind.abs() < 1, behind > FREE, behind < -FREE]) & (depth > 0)
+    counts = kinds.sum(2)
+    best = (counts[0] + counts[1]).argsort(descending=True, stable=True)[:BEST_VIEWS]
+    return counts[:, best].sum(1)
 
 
-def _in_cameras(points: torch.Tensor, pose: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-    """Points [N, 3] of one camera in the axes of others, [F, N, 3]."""
-    world = points @ _rotations(pose[None, :4])[0].T + pose[4:]
-    return (world - poses[:, None, 4:]) @ _rotations(poses[:, :4])
+def _lattice_points(lattices: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Surface points [F, h w, 3] of coarse depth images in their cameras' axes, and which of them are known."""
+    rows, columns = (torch.arange(n, device=lattices.device) * LATTICE_STEP_PX for n in lattices.shape[1:])
+    v, u = torch.meshgrid(rows + LATTICE_STEP_PX // 2, columns + LATTICE_STEP_PX // 2, indexing="ij")
+    rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], -1)
+    depth = lattices.flatten(1).float()
+    return depth[..., None] * rays.view(-1, 3), depth > 0
+
+
+def _in_camera(points: torch.Tensor, poses: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+    """Points [F, N, 3] of cameras at `poses` [F, 7] in the axes of the one at `pose` [7]."""
+    world = points @ _rotations(poses[:, :4]).transpose(1, 2) + poses[:, None, 4:]
+    return (world - pose[4:]) @ _rotations(pose[None, :4])
 
 
 def _rotations(quaternions: torch.Tensor) -> torch.Tensor:

@@ -14,18 +14,22 @@ POINTS = 4096  # of the earlier frame
 
 
 class IcpAlignment:
-    """Poses of one frame by ICP against earlier ones, from any number of starts."""
+    """Poses of one frame by ICP against earlier ones, from any number of starts.
+
+    Attributes:
+        vertices, normals, intrinsics: the frame's surface maps, see `surface_maps`.
+    """
 
     def __init__(self, pixels: FramePixels, camera: Camera):
         self._camera = camera
-        self._maps = surface_maps(pixels, camera)
+        self.vertices, self.normals, self.intrinsics = surface_maps(pixels, camera)
 
     def pose(self, earlier: EarlierFrame, start: torch.Tensor) -> torch.Tensor:
         """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
         origin = _matrix(earlier.pose)
         between = _pose(compose(inverse(_matrix(start)), origin), start.device)
         points = unpack_points(earlier.records[:POINTS], self._camera)
-        between, _, _ = ops.projective_icp(points, *self._maps[:2], between, self._maps[2])
+        between, _, _ = ops.projective_icp(points, self.vertices, self.normals, between, self.intrinsics)
         return _pose(compose(origin, inverse(_matrix(between))), start.device)
 
 

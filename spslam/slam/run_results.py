@@ -5,6 +5,7 @@ import resource
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from spslam import __version__
@@ -45,6 +46,7 @@ def write_results(
     if len(frames) == 0:
         raise DatasetError(f"{dataset.name}: no frame could be read; the first: {skipped[0]['error']}")
     trajectory, truth, log = system.trajectory(), dataset.poses(), files.read_log()
+    lost = trajectory.lost
     trajectory.save_tum(files.trajectory)
     system.state.scene.save(files.map)
     metrics = {
@@ -52,16 +54,19 @@ def write_results(
         "frames": len(frames),
         **_speed(clock),
         **_timings(log, clock),
-        "lost_frames": int(frames.lost.sum()),
+        "lost_frames": int(lost.sum()),
+        "losses": int((lost[1:] & ~lost[:-1]).sum()) + int(lost[0]),
         "rescued_frames": sum(line["rescued"] for line in log),
+        "relocalised_frames": sum(line["relocalised"] for line in log),
+        **_most_doubt(log),
         "skipped_frames": len(skipped),
         **_sizes(system),
     }
     if truth is not None:
-        known = truth[frames.indices.numpy()]
+        known = np.where(lost[:, None, None], np.nan, truth[frames.indices.numpy()])
         metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
     if mesh:
-        tracked = trajectory.poses[~trajectory.lost]
+        tracked = trajectory.poses[~lost]
         metrics["mesh_s"] = files.write_mesh(system.state.scene, config.mesh.resolution_m, system.camera, tracked)
     atomic_write(files.metrics, json.dumps(metrics, indent=1) + "\n")
     files.write_report(dataset, frames.indices.tolist(), truth, config.run.previews)
@@ -86,6 +91,12 @@ def _processor() -> str:
     except OSError:
         return "cpu"
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "cpu")
+
+
+def _most_doubt(log: list[dict[str, Any]]) -> dict[str, float]:
+    """The highest doubt about a pose that was taken."""
+    doubts = [line["doubt"] for line in log if not line["lost"] and line["doubt"] is not None]
+    return {"max_doubt": max(doubts)} if doubts else {}
 
 
 def _speed(clock: dict[str, Any]) -> dict[str, float]:

@@ -87,8 +87,10 @@ class SlamSystem:
         number = len(self.state.frames)
         tracked = self._track(pixels, number, marks)
         self.state.frames.append(tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice)
-        self.state.pixels.add(pixels.records)
-        mapped = self._is_mapping_frame(number)
+        obstructed = tracked.fit.is_obstructed
+        # What is before the lens is no part of the scene: neither mapped now nor drawn from later.
+        self.state.pixels.add(pixels.records[:0] if obstructed else pixels.records)
+        mapped = not obstructed and self._is_mapping_frame(number)
         self.state.unmapped = not mapped
         iterations, losses = self._map(pixels, marks) if mapped else (0, None)
         loss = None if losses is None else _fetch(losses[0])
@@ -107,6 +109,7 @@ class SlamSystem:
             "jump_cm": _known(tracked.fit.jump_cm),
             "jump_deg": _known(tracked.fit.jump_deg),
             "conflict": _known(tracked.fit.conflict),
+            "hidden": _known(tracked.fit.hidden),
             "doubt": _known(tracked.fit.doubt),
             "rescued": tracked.rescued,
             "relocalised": tracked.relocalised,

@@ -17,6 +17,7 @@ from spslam.slam.reference_image import ReferenceKeeper
 from spslam.slam.rescue import IcpAlignment
 from spslam.slam.state import FrameTable
 
+SHORT_LOSS = 5  # frames: for as long the camera cannot be far from where it was
 RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
 
 
@@ -198,14 +199,13 @@ class Tracker:
         last = past.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
         starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
         best = self._best(scene, pixels, starts, start, frame, best)
-        best = self._verified(pixels, past, best)
+        best = self._verified(alignment, past, best, past.frames_lost <= SHORT_LOSS)
         if not best.lost:
             return best
         alike = past.similar(pixels, tracking.relocalise_frames)
         starts = [alignment.pose(other, other.pose) for other in alike]
         found = self._best(scene, pixels, starts, start, frame, best)
-        # Where a camera may be that looks like a frame of long ago, the motion model doesn't know.
-        found = self._verified(pixels, past, found, has_motion=False)
+        found = self._verified(alignment, past, found, is_near=False)
         return replace(found, relocalised=found.pose is not best.pose and not found.lost)
 
     def _best(
@@ -227,11 +227,16 @@ class Tracker:
                 best = replace(again, rescued=True)
         return replace(best, iterations=iterations)
 
-    def _verified(
-        self, pixels: FramePixels, past: Past, result: TrackingResult, has_motion: bool = True
-    ) -> TrackingResult:
-        """The result, judged anew with what other frames saw to be free; after loss the motion model has no say."""
-        fit = replace(result.fit, conflict=past.conflict(pixels, result.pose))
-        if past.is_lost or not has_motion:
-            fit = replace(fit, jump_cm=math.nan, jump_deg=math.nan)
-        return replace(result, fit=fit, lost=self._is_lost(fit))
+    def _verified(self, alignment: IcpAlignment, past: Past, result: TrackingResult, is_near: bool) -> TrackingResult:
+        """The result, judged anew with what it would look through of other frames' surface.
+
+        Where the camera need not be near its last pose, the motion model has no say, and there must be no doubt: of all
+        the places that a camera may have been carried to, some are always alike.
+        """
+        conflict, hidden = past.conflict(alignment.vertices, alignment.intrinsics, result.pose)
+        fit = replace(result.fit, conflict=conflict, hidden=hidden)
+        if is_near:
+            return replace(result, fit=fit, lost=self._is_lost(fit))
+        fit = replace(fit, jump_cm=math.nan, jump_deg=math.nan)
+        doubtful = not fit.doubt <= self.config.tracking.doubtful_above
+        return replace(result, fit=fit, lost=doubtful or self._is_lost(fit))

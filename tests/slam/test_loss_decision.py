@@ -1,0 +1,68 @@
+"""The doubt about a pose: what raises it, what it is where nothing is known, and the measures it is made of."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spslam.slam.loss_decision import Fit, information, jump
+
+GOOD = Fit(0.5, 0.95, 0.8, 0.012, 0.5, 0.3, 0.02)
+
+
+def pose(vector, translation):
+    x, y, z, w = Rotation.from_rotvec(vector).as_quat()
+    return [w, x, y, z, *translation]
+
+
+def test_a_good_fit_leaves_no_doubt_and_a_bad_one_no_trust():
+    assert GOOD.doubt < 0.001
+    assert Fit(1.2, 0.15, 0.06, 0.0005, 18.0, 5.0, 0.6).doubt > 0.999
+
+
+@pytest.mark.parametrize(
+    "worse", [{"support": 0.4}, {"information": 0.001}, {"jump_cm": 20.0}, {"jump_deg": 10.0}, {"conflict": 0.2}]
+)
+def test_each_measure_raises_the_doubt(worse):
+    assert replace(GOOD, **worse).doubt > 2 * GOOD.doubt
+
+
+def test_what_is_not_known_lies_between_right_and_wrong():
+    for name, wrong in (("conflict", 0.3), ("jump_cm", 50.0)):
+        unknown = replace(GOOD, **{name: math.nan}).doubt
+        assert GOOD.doubt < unknown < replace(GOOD, **{name: wrong}).doubt
+
+
+def test_nothing_measured_is_no_number():
+    assert math.isnan(Fit().doubt)
+    assert 0 < replace(GOOD, information=0.0).doubt < 1
+
+
+def test_extremes_stay_probabilities():
+    assert Fit(0, 0, 0, 0, 1e6, 180, 1).doubt == pytest.approx(1)
+    assert Fit(0, 1, 1, 1e3, 0, 0, 0).doubt == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 5.0, 179.0, 180.0])
+def test_jump_is_distance_and_angle(degrees):
+    axis = np.array([0.36, 0.48, 0.8])
+    start = pose([0.3, -0.2, 0.1], [1, 2, 3])
+    turned = (Rotation.from_rotvec(np.radians(degrees) * axis) * Rotation.from_rotvec([0.3, -0.2, 0.1])).as_rotvec()
+    for sign in (1, -1):
+        other = pose(turned, [1.03, 2, 3.04])
+        other[:4] = [sign * number for number in other[:4]]
+        assert jump(start, other) == (pytest.approx(5.0), pytest.approx(degrees, abs=1e-6))
+
+
+def test_jump_of_a_pose_of_nan_is_none():
+    assert all(math.isnan(number) for number in jump(pose([0, 0, 0], [0, 0, 0]), [math.nan] * 7))
+
+
+def test_information_is_the_weakest_direction_a_pixel():
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
+    hessian = turn @ np.diag([5.0, 7, 9, 20, 30, 40]) @ turn.T
+    assert information(hessian.flatten().tolist(), 10) == pytest.approx(0.5)
+    assert information([0.0] * 36, 10) == 0
+    assert math.isnan(information([math.nan] * 36, 10))

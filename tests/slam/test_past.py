@@ -1,0 +1,148 @@
+"""What tracking asks of the frames before: which are alike, and whether a pose looks through known surface."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam.geometry import matrix_to_pose7, pose7_to_matrix, transform_points
+from spslam.slam.past import APART, Past, lattice_difference, surface_counts
+from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame
+from spslam.slam.rescue import surface_maps
+from spslam.slam.state import SlamState, pose_tensor
+from tests.system.sequences import Recorded, settings
+
+FRAMES = 20
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return Recorded(25)
+
+
+@pytest.fixture(scope="module")
+def pixels(dataset):
+    return [sample_frame(dataset[i], dataset.camera, settings()) for i in range(25)]
+
+
+def state_of(dataset, pixels, device=CPU, lost=()):
+    """The first frames at their true poses, and no map."""
+    state = SlamState.start(settings(), dataset.camera, np.eye(4), None, device)
+    for i in range(FRAMES):
+        moved = pixels[i].to(device)
+        pose = pose_tensor(dataset.poses()[i], device)
+        state.frames.append(pose, i / 30, i, i in lost, moved.lattice)
+        state.pixels.add(moved.records)
+    return state
+
+
+def test_difference_of_depth_images(device):
+    lattice = torch.tensor([[1.0, 2.0, 0.0, 0.0]], dtype=torch.float16, device=device)
+    others = torch.tensor(
+        [[[1.0, 2.0, 0.0, 0.0]], [[1.1, 2.0, 0.0, 0.0]], [[9.0, 0.0, 3.0, 0.0]], [[0.0, 0.0, 0.0, 0.0]]],
+        dtype=torch.float16,
+        device=device,
+    )
+    found = lattice_difference(lattice, others).cpu()
+    torch.testing.assert_close(
+        found, torch.tensor([0.0, 0.5 * np.log(1.1), 0.2, 0.15], dtype=torch.float32), rtol=1e-2, atol=1e-3
+    )
+    assert lattice_difference(torch.zeros_like(lattice), others[3:]).tolist() == [0]
+
+
+def test_the_likest_frames_come_first_and_apart(dataset, pixels, device):
+    past = Past(state_of(dataset, pixels, device), dataset.camera)
+    found = past.similar(pixels[8].to(device), 6)
+    poses = torch.stack([frame.pose for frame in found]).cpu()
+    rows = [int((poses[i] - past._state.frames.poses.cpu()).norm(dim=1).argmin()) for i in range(len(found))]
+    assert rows[0] == 8
+    assert 1 <= len(rows) <= 6
+    assert min(abs(a - b) for i, a in enumerate(rows) for b in rows[:i]) > APART if len(rows) > 1 else True
+    assert past.similar(pixels[8].to(device), 0) == []
+
+
+def test_lost_frames_are_not_offered(dataset, pixels):
+    past = Past(state_of(dataset, pixels, lost={8, 18, 19}), dataset.camera)
+    assert past.is_lost
+    assert past.frames_lost == 2
+    torch.testing.assert_close(past.last().pose, pose_tensor(dataset.poses()[17], CPU))
+    assert not torch.equal(past.similar(pixels[8], 1)[0].pose, pose_tensor(dataset.poses()[8], CPU))
+
+
+def test_without_a_known_frame_there_is_nothing(dataset, pixels):
+    past = Past(state_of(dataset, pixels, lost=set(range(FRAMES))), dataset.camera)
+    assert past.last() is None
+    assert past.similar(pixels[3], 5) == []
+    assert past.frames_lost == FRAMES
+    assert conflict(past, pixels[3], pose_tensor(dataset.poses()[3], CPU), dataset.camera) == (0.11, 0)
+
+
+def conflict(past, pixels, pose, camera):
+    vertices, _, intrinsics = surface_maps(pixels, camera)
+    return past.conflict(vertices, intrinsics, pose)
+
+
+def test_a_wrong_pose_looks_through_known_surface(dataset, pixels, device):
+    past = Past(state_of(dataset, pixels, device), dataset.camera)
+    true, seen = dataset.poses()[21], pixels[21].to(device)
+    through, hidden = conflict(past, seen, pose_tensor(true, device), dataset.camera)
+    assert through < 0.04
+    assert hidden < 0.1
+    ahead = true.copy()
+    ahead[:3, 3] -= 0.5 * true[:3, 2]
+    turned = true @ pose7_to_matrix(np.array([np.cos(0.2), 0, np.sin(0.2), 0, 0, 0, 0]))
+    for wrong in (ahead, turned):
+        assert conflict(past, seen, pose_tensor(wrong, device), dataset.camera)[0] > 0.15
+
+
+def test_what_hides_surface_is_told_from_a_wrong_pose(dataset, pixels):
+    past = Past(state_of(dataset, pixels), dataset.camera)
+    frame = dataset[21]
+    frame.depth[30:, :90] = 0.3
+    seen = sample_frame(frame, dataset.camera, settings())
+    through, hidden = conflict(past, seen, pose_tensor(dataset.poses()[21], CPU), dataset.camera)
+    assert through < 0.04
+    assert hidden > 0.3
+
+
+def test_counts_by_the_formula(dataset, pixels, device):
+    """Point by point in NumPy."""
+    camera, rows = dataset.camera, [0, 5, 10]
+    pose = dataset.poses()[12]
+    pose[:3, 3] += [0.1, -0.1, 0.2]
+    vertices, _, k = surface_maps(pixels[12], camera)
+    counts = [0, 0, 0]
+    for row in rows:
+        into = np.linalg.inv(pose) @ dataset.poses()[row]
+        lattice = pixels[row].lattice.double().numpy()
+        for line, column in np.argwhere(lattice > 0):
+            u, v = (LATTICE_STEP_PX * (cell + 0.5) for cell in (column, line))
+            ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1])
+            x, y, z = transform_points(into, lattice[line, column] * ray[None])[0]
+            i, j = int(np.floor(y / z * k.fy + k.cy + 0.5)), int(np.floor(x / z * k.fx + k.cx + 0.5))
+            if z <= 0.05 or not (0 <= i < vertices.shape[0] and 0 <= j < vertices.shape[1]) or vertices[i, j, 2] == 0:
+                continue
+            behind, tolerance = float(vertices[i, j, 2]) - z, 0.05 + 0.02 * z
+            counts[0] += abs(behind) < tolerance
+            counts[1] += behind > 1.5 * tolerance
+            counts[2] += behind < -1.5 * tolerance
+    found = surface_counts(
+        vertices.to(device),
+        k,
+        pose_tensor(pose, device),
+        torch.from_numpy(matrix_to_pose7(dataset.poses()[rows])).float().to(device),
+        torch.stack([pixels[row].lattice for row in rows]).to(device),
+        camera,
+    )
+    assert min(counts) > 2
+    # Single precision moves a point or two over a cell's edge.
+    np.testing.assert_allclose(found.tolist(), counts, atol=2)
+
+
+def test_conflict_of_nothing_is_none(dataset, pixels):
+    pose = pose_tensor(np.eye(4), CPU)
+    vertices, _, k = surface_maps(pixels[0], dataset.camera)
+    lattices = pixels[0].lattice[None]
+    assert not surface_counts(0 * vertices, k, pose, pose[None], lattices, dataset.camera).any()
+    assert not surface_counts(vertices, k, pose, pose[None], 0 * lattices, dataset.camera).any()
+    assert not surface_counts(vertices, k, pose, pose[None][:0], lattices[:0], dataset.camera).any()
