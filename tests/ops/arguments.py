@@ -3,6 +3,7 @@
 from dataclasses import fields, is_dataclass, replace
 
 import torch
+from torch.utils._pytree import tree_map_only
 
 from spslam import ops
 
@@ -56,6 +57,13 @@ def _with(owner, path, value):
         return value
     part = {path[0]: _with(getattr(owner, path[0]), path[1:], value)}
     return owner._replace(**part) if hasattr(owner, "_replace") else replace(owner, **part)
+
+
+def opcheck(op, arguments, device, **options):
+    """`torch.library.opcheck` with every tensor of the arguments on a device."""
+    torch.library.opcheck(
+        op, tree_map_only(torch.Tensor, lambda tensor: tensor.to(device), tuple(arguments)), **options
+    )
 
 
 def outputs(result):

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from spslam import ops
+from tests.ops.arguments import opcheck
 from tests.reference.covisibility import overlap, select
 
 INTRINSICS = ops.Intrinsics(140.0, 140.0, 79.5, 59.5)
@@ -159,11 +160,10 @@ def test_arguments_are_named(generator):
         ops.frame_overlap(torch.zeros(1, 3), frames[0], frames[1].float(), INTRINSICS, STEP)
 
 
-def test_opcheck(generator):
+def test_opcheck(device, generator):
     (poses, lattices), records = make_frames(generator, 6), make_records(generator)
     k = list(INTRINSICS)
-    torch.library.opcheck(
-        torch.ops.spslam.frame_overlap.default, (torch.rand(9, 3, generator=generator), poses, lattices, k, STEP)
-    )
+    points = torch.rand(9, 3, generator=generator)
+    opcheck(torch.ops.spslam.frame_overlap.default, (points, poses, lattices, k, STEP), device)
     arguments = (records, 5, poses, lattices, torch.arange(5), k, STEP, 64, 2, 3, 0.1, 0, 6, 0)
-    torch.library.opcheck(torch.ops.spslam.select_covisible_frames.default, arguments)
+    opcheck(torch.ops.spslam.select_covisible_frames.default, arguments, device)

@@ -6,6 +6,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import constant_speed, pose7_to_matrix, rotation_angle
+from tests.ops.arguments import opcheck
 from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
 from tests.ops.tracking_scene import OPTIONS, POSE, moved_pose, pose7, surface_equations
 
@@ -141,12 +142,12 @@ def test_arguments_are_named(generator):
         ops.track_gauss_newton(scene, records[:0], pose7(POSE), INTRINSICS, **OPTIONS, frame=0)
 
 
-def test_opcheck(generator):
+def test_opcheck(device, generator):
     scene = make_scene(generator, random_decoder=False)
     records, pose = corner_pixels(POSE, generator, 50), pose7(POSE)
     arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4, 0, 1, 0, 1.0)
     call = (*scene.arguments(), *arguments, None, None, [], 0.3, 0.4)
-    torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)
-    torch.library.opcheck(torch.ops.spslam.predict_pose.default, (pose, pose))
+    opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)
+    opcheck(torch.ops.spslam.predict_pose.default, (pose, pose), device)
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)
-    torch.library.opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments))
+    opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments), device)

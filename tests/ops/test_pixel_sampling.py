@@ -9,6 +9,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import quaternion_to_matrix
+from tests.ops.arguments import opcheck
 from tests.reference import pixel_sampling as reference
 
 CAMERA = (61.0, 59.5, 33.2, 21.7)
@@ -184,8 +185,11 @@ def test_opcheck(generator):
         (depth, color, *CAMERA, *numbers),
         test_utils=("test_schema", "test_autograd_registration"),
     )
+
+
+def test_opcheck_of_unprojection(device):
     records, normals, pose = torch.zeros(4, 3, dtype=torch.int32), torch.zeros(4, 3), torch.ones(7)
-    torch.library.opcheck(torch.ops.spslam.unproject_pixels, (records, normals, pose, *CAMERA))
+    opcheck(torch.ops.spslam.unproject_pixels, (records, normals, pose, *CAMERA), device)
 
 
 def test_unprojection_is_the_formula(device, generator):

@@ -6,6 +6,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
+from tests.ops.arguments import opcheck
 from tests.reference.projective_icp import icp
 
 WIDTH, HEIGHT = 64, 48
@@ -149,7 +150,7 @@ def test_arguments_are_named():
         ops.projective_icp(points, vertices, normals, START.double(), INTRINSICS)
 
 
-def test_opcheck():
+def test_opcheck(device):
     points, vertices, normals, _ = problem(0.0, 0.0)
     arguments = (points, vertices, normals, START, list(INTRINSICS), 2, 0.3, 0.1, 0.03, 1e-4)
-    torch.library.opcheck(torch.ops.spslam.projective_icp.default, arguments)
+    opcheck(torch.ops.spslam.projective_icp.default, arguments, device)

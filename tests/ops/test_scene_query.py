@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from spslam import ops
+from tests.ops.arguments import opcheck
 from tests.ops.scenes import VOXEL, make_scene
 
 # float32 sums of some 100 terms of order one.
@@ -91,8 +92,8 @@ def test_arguments_are_named(generator):
         ops.query_color(scene, torch.zeros(4, 3, dtype=torch.float64))
 
 
-def test_opcheck(generator):
+def test_opcheck(device, generator):
     scene = make_scene(generator, random_decoder=True)
     points = _points(generator, 10)
-    torch.library.opcheck(torch.ops.spslam.query_sdf.default, (*scene.arguments(), points, True))
-    torch.library.opcheck(torch.ops.spslam.query_color.default, (*scene.arguments(), points))
+    opcheck(torch.ops.spslam.query_sdf.default, (*scene.arguments(), points, True), device)
+    opcheck(torch.ops.spslam.query_color.default, (*scene.arguments(), points), device)
