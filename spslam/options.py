@@ -133,7 +133,9 @@ class TrackingOptions(Section):
         ge=0,
     )
     color_kernel: float = _option("gauss_newton: width of the robust kernel of brightness, of which white is 1", gt=0)
-    rescue: bool = _option("gauss_newton: start anew from projective ICP where a frame fits the map badly")
+    rescue: bool = _option(
+        "start anew from projective ICP where a frame fits the map badly; with adam only where it is lost"
+    )
     rescue_below: float = _option("rescue where the mean robust weight of the pixels is below this", ge=0, le=1)
     doubtful_above: float = _option(
         "verify a pose, and try others, where the doubt about it is above this (docs/loss.md)", ge=0, le=1
