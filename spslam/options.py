@@ -141,6 +141,9 @@ class TrackingOptions(Section):
         "verify a pose, and try others, where the doubt about it is above this (docs/loss.md)", ge=0, le=1
     )
     lost_above: float = _option("a frame is lost where the doubt about its pose stays above this", ge=0, le=1)
+    relocalise_below: float = _option(
+        "the doubt must be below this where a camera is found again after loss", ge=0, le=1
+    )
     relocalise_frames: int = _option(
         "stored frames that a lost frame is laid onto, the likest ones; 0 looks for none", "frames", ge=0
     )

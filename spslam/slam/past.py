@@ -1,12 +1,15 @@
 """What tracking asks of the frames before, where it is in doubt about a pose; a frame without doubt costs nothing."""
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 
 from spslam import ops
 from spslam.camera import Camera
+from spslam.geometry import compose, matrix_to_pose7, pose7_to_matrix
 from spslam.slam.loss_decision import UNKNOWN_CONFLICT
 from spslam.slam.pixels import LATTICE_STEP_PX, FramePixels
 from spslam.slam.state import SlamState
@@ -20,6 +23,9 @@ FEW_POINTS = 50  # say as much as the knowledge before
 # Likeness of two coarse depth images: difference of the logarithms, with a limit, and what one without a depth costs.
 MOST_DIFFERENCE, NO_DEPTH_DIFFERENCE = 0.3, 0.15
 APART = 5  # frames; a run of like frames gives one candidate
+TURNED_CANDIDATES = 32  # the likest are also compared as if the camera had turned
+TURN_COLUMNS, TURN_ROWS = 0.15, 0.2  # of the picture, by which it may have turned, or twice that to the side
+LEAST_OVERLAP = 0.4  # of a picture, that can be compared
 LEAST_DEPTH_M = 0.05
 
 
@@ -34,6 +40,14 @@ class EarlierFrame:
 
     records: torch.Tensor
     pose: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Alike:
+    """An earlier frame that a frame looks like, and the pose float32 [7] from where it would look most alike."""
+
+    frame: EarlierFrame
+    start: torch.Tensor
 
 
 class Past:
@@ -71,10 +85,11 @@ class Past:
                 return row, self._frame(row)
         return None
 
-    def similar(self, pixels: FramePixels, count: int) -> list[EarlierFrame]:
+    def similar(self, pixels: FramePixels, count: int) -> list[Alike]:
         """Frames whose coarse depth is most like that of the given pixels, the likest first; at most `count`.
 
-        Of frames that follow one another, only the likest is taken, so that a slow camera fills no list by itself.
+        Of frames that follow one another, only the likest is taken, so that a slow camera fills no list by itself. The
+        likest are compared also as they would look if the camera had turned.
         """
         rows = self._rows().to(self._state.frames.lattices.device)
         if len(rows) == 0 or count == 0:
@@ -82,8 +97,13 @@ class Past:
         difference = lattice_difference(pixels.lattice, self._state.frames.lattices[rows])
         least = -F.max_pool1d(-difference[None, None], 2 * APART + 1, 1, APART)[0, 0]
         candidates = torch.where(difference == least, difference, torch.inf)
-        order = candidates.argsort(stable=True)[:count]
-        return [self._frame(row) for row in rows[order[candidates[order].isfinite()]].tolist()]
+        order = candidates.argsort(stable=True)[:TURNED_CANDIDATES]
+        rows = rows[order[candidates[order].isfinite()]]
+        shifts, differences = turned_differences(pixels.lattice, self._state.frames.lattices[rows])
+        smallest, turn = differences.min(0)
+        order = smallest.argsort(stable=True)[:count]
+        chosen = zip(rows[order].tolist(), turn[order].tolist(), strict=True)
+        return [self._alike(row, shifts[of_shift]) for row, of_shift in chosen]
 
     def conflict(self, vertices: torch.Tensor, intrinsics: ops.Intrinsics, pose: torch.Tensor) -> tuple[float, float]:
         """Shares of the surface known from other frames that a frame looks through, and that something hides from it.
@@ -112,6 +132,10 @@ class Past:
             rows = torch.cat([rows[older], rows[-RECENT_VIEWS:]])
         return rows.to(self._state.frames.poses.device)
 
+    def _alike(self, row: int, shift: tuple[int, int]) -> Alike:
+        frame = self._frame(row)
+        return Alike(frame, turned(frame.pose, shift, self._camera))
+
     def _frame(self, row: int) -> EarlierFrame:
         return EarlierFrame(self._state.pixels.records[row], self._state.frames.poses[row])
 
@@ -132,6 +156,46 @@ def lattice_difference(lattice: torch.Tensor, others: torch.Tensor) -> torch.Ten
     difference = torch.where(known & others_known, difference, NO_DEPTH_DIFFERENCE)
     either = known | others_known
     return (difference * either).sum((1, 2)) / either.sum((1, 2)).clamp(min=1)
+
+
+def turned_differences(lattice: torch.Tensor, others: torch.Tensor) -> tuple[list[tuple[int, int]], torch.Tensor]:
+    """How unlike coarse depth images are if the first is shifted over the others by so many rows and columns.
+
+    Args:
+        lattice: float16 [h, w], m.
+        others: float16 [F, h, w].
+
+    Returns:
+        The S shifts, of which one is none; differences float32 [S, F] of where the images overlap.
+    """
+    height, width = lattice.shape
+    down, right = max(round(TURN_ROWS * height), 1), max(round(TURN_COLUMNS * width), 1)
+    shifts = [(y, x) for y in (0, -down, down) for x in (0, -right, right, -2 * right, 2 * right)]
+    shifts = [(y, x) for y, x in shifts if (height - abs(y)) * (width - abs(x)) >= LEAST_OVERLAP * height * width]
+    differences = [lattice_difference(_part(lattice, -y, -x), _part(others, y, x)) for y, x in shifts]
+    return shifts, torch.stack(differences)
+
+
+def _part(lattices: torch.Tensor, down: int, right: int) -> torch.Tensor:
+    """What is left of images [..., h, w] without the first rows and columns, or the last where negative."""
+    height, width = lattices.shape[-2:]
+    rows = slice(max(down, 0), height + min(down, 0))
+    return lattices[..., rows, max(right, 0) : width + min(right, 0)]
+
+
+def turned(pose: torch.Tensor, shift: tuple[int, int], camera: Camera) -> torch.Tensor:
+    """The pose float32 [7] of a camera that has turned from `pose` so that its picture shifted by lattice cells.
+
+    Args:
+        pose: float32 [7].
+        shift: rows and columns; what is at a cell was that much further down and to the right.
+        camera: of the picture.
+    """
+    down, right = (math.atan(n * LATTICE_STEP_PX / f) / 2 for n, f in zip(shift, (camera.fy, camera.fx), strict=True))
+    yaw = pose7_to_matrix(np.array([math.cos(right), 0, math.sin(right), 0, 0, 0, 0]))
+    pitch = pose7_to_matrix(np.array([math.cos(down), -math.sin(down), 0, 0, 0, 0, 0]))
+    matrix = compose(pose7_to_matrix(pose.cpu().double().numpy()), yaw, pitch)
+    return torch.from_numpy(matrix_to_pose7(matrix)).to(pose)
 
 
 def surface_counts(

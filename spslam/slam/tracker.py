@@ -203,7 +203,7 @@ class Tracker:
         if not best.lost:
             return best
         alike = past.similar(pixels, tracking.relocalise_frames)
-        starts = [alignment.pose(other, other.pose) for other in alike]
+        starts = [alignment.pose(other.frame, other.start) for other in alike]
         found = self._best(scene, pixels, starts, start, frame, best)
         found = self._verified(alignment, past, found, is_near=False)
         return replace(found, relocalised=found.pose is not best.pose and not found.lost)
@@ -238,5 +238,5 @@ class Tracker:
         if is_near:
             return replace(result, fit=fit, lost=self._is_lost(fit))
         fit = replace(fit, jump_cm=math.nan, jump_deg=math.nan)
-        doubtful = not fit.doubt <= self.config.tracking.doubtful_above
+        doubtful = not fit.doubt <= self.config.tracking.relocalise_below
         return replace(result, fit=fit, lost=doubtful or self._is_lost(fit))

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from spslam.geometry import matrix_to_pose7, pose7_to_matrix, transform_points
-from spslam.slam.past import APART, Past, lattice_difference, surface_counts
+from spslam.datasets.base import RgbdFrame
+from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle, transform_points
+from spslam.slam.past import APART, Past, lattice_difference, surface_counts, turned, turned_differences
 from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame
 from spslam.slam.rescue import surface_maps
 from spslam.slam.state import SlamState, pose_tensor
@@ -53,7 +54,8 @@ def test_difference_of_depth_images(device):
 def test_the_likest_frames_come_first_and_apart(dataset, pixels, device):
     past = Past(state_of(dataset, pixels, device), dataset.camera)
     found = past.similar(pixels[8].to(device), 6)
-    poses = torch.stack([frame.pose for frame in found]).cpu()
+    poses = torch.stack([alike.frame.pose for alike in found]).cpu()
+    torch.testing.assert_close(found[0].start, found[0].frame.pose)
     rows = [int((poses[i] - past._state.frames.poses.cpu()).norm(dim=1).argmin()) for i in range(len(found))]
     assert rows[0] == 8
     assert 1 <= len(rows) <= 6
@@ -61,12 +63,41 @@ def test_the_likest_frames_come_first_and_apart(dataset, pixels, device):
     assert past.similar(pixels[8].to(device), 0) == []
 
 
+@pytest.mark.parametrize(("yaw", "pitch"), [(16.0, 0.0), (-16.0, 0.0), (0.0, 12.0), (0.0, -12.0), (14.0, 11.0)])
+def test_a_turned_camera_is_put_where_it_would_look_alike(dataset, yaw, pitch):
+    """The same place, looking elsewhere: the start is nearer to the truth than the frame's own pose."""
+    base = dataset.poses()[8]
+    half = np.radians([yaw, pitch]) / 2
+    turns = [
+        np.array([np.cos(half[0]), 0, np.sin(half[0]), 0, 0, 0, 0]),
+        np.array([np.cos(half[1]), np.sin(half[1]), *[0] * 5]),
+    ]
+    true = base @ pose7_to_matrix(turns[0]) @ pose7_to_matrix(turns[1])
+    lattices = []
+    for pose in (base, true):
+        color, depth = dataset.room.room.render(dataset.camera, pose)
+        frame = RgbdFrame(0, 0.0, color, depth)
+        lattices.append(sample_frame(frame, dataset.camera, settings()).lattice)
+    shifts, differences = turned_differences(lattices[1], lattices[0][None])
+    assert (0, 0) in shifts
+    start = turned(pose_tensor(base, CPU), shifts[int(differences[:, 0].argmin())], dataset.camera).double().numpy()
+    left = np.degrees(rotation_angle(pose7_to_matrix(start)[:3, :3].T @ true[:3, :3]))
+    assert left < 0.6 * np.degrees(rotation_angle(base[:3, :3].T @ true[:3, :3]))
+    np.testing.assert_allclose(start[4:], base[:3, 3], atol=1e-6)
+
+
+def test_tiny_images_are_compared_too():
+    shifts, differences = turned_differences(torch.ones(1, 1).half(), torch.ones(3, 1, 1).half())
+    assert shifts == [(0, 0)]
+    assert differences.tolist() == [[0, 0, 0]]
+
+
 def test_lost_frames_are_not_offered(dataset, pixels):
     past = Past(state_of(dataset, pixels, lost={8, 18, 19}), dataset.camera)
     assert past.is_lost
     assert past.frames_lost == 2
     torch.testing.assert_close(past.last().pose, pose_tensor(dataset.poses()[17], CPU))
-    assert not torch.equal(past.similar(pixels[8], 1)[0].pose, pose_tensor(dataset.poses()[8], CPU))
+    assert not torch.equal(past.similar(pixels[8], 1)[0].frame.pose, pose_tensor(dataset.poses()[8], CPU))
 
 
 def test_without_a_known_frame_there_is_nothing(dataset, pixels):
