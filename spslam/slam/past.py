@@ -67,6 +67,11 @@ class Past:
         return bool(self._state.frames.lost[-1])
 
     @property
+    def agreeing(self) -> int:
+        """How many of the last frames are lost, but have likely poses that agree with one another."""
+        return int(self._state.frames.agreeing[-1])
+
+    @property
     def frames_lost(self) -> int:
         """How many frames at the end have no known pose."""
         known = (~self._state.frames.lost).nonzero()

@@ -36,6 +36,7 @@ class FrameTable:
             "timestamps": torch.zeros(0, dtype=torch.float64),
             "indices": torch.zeros(0, dtype=torch.int64),
             "lost": torch.zeros(0, dtype=torch.bool),
+            "agreeing": torch.zeros(0, dtype=torch.int64),
             "lattices": torch.zeros(0, rows, columns, dtype=torch.float16, device=device),
         }
 
@@ -60,11 +61,18 @@ class FrameTable:
         return self._columns["lost"][: self._count]
 
     @property
+    def agreeing(self) -> torch.Tensor:
+        """int64 [F] how many lost frames up to this one had a pose that is likely, and agree with one another."""
+        return self._columns["agreeing"][: self._count]
+
+    @property
     def lattices(self) -> torch.Tensor:
         """float16 [F, h, w] coarse depth (m), on the device."""
         return self._columns["lattices"][: self._count]
 
-    def append(self, pose: torch.Tensor, timestamp: float, index: int, lost: bool, lattice: torch.Tensor) -> None:
+    def append(
+        self, pose: torch.Tensor, timestamp: float, index: int, lost: bool, lattice: torch.Tensor, agreeing: int = 0
+    ) -> None:
         """Adds a row."""
         if self._count == len(self._columns["poses"]):
             capacity = max(2 * self._count, _FIRST_CAPACITY)
@@ -74,6 +82,7 @@ class FrameTable:
             "timestamps": timestamp,
             "indices": index,
             "lost": lost,
+            "agreeing": agreeing,
             "lattices": lattice,
         }
         for name, value in values.items():

@@ -86,7 +86,9 @@ class SlamSystem:
         pixels = self._receive(frame, marks)
         number = len(self.state.frames)
         tracked = self._track(pixels, number, marks)
-        self.state.frames.append(tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice)
+        self.state.frames.append(
+            tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice, tracked.agreeing
+        )
         obstructed = tracked.fit.is_obstructed
         # What is before the lens is no part of the scene: neither mapped now nor drawn from later.
         self.state.pixels.add(pixels.records[:0] if obstructed else pixels.records)
@@ -142,15 +144,18 @@ class SlamSystem:
             return TrackingResult(pose, 0, Fit(), lost=self.tracker.is_blind(pixels))
         begin = self._mark()
         start = self.tracker.predict(self.state.frames)
-        tracked = self.tracker.track(self.state.scene, pixels, start, number, self.past)
+        tracked = self.tracker.track(self.state.scene, pixels, start, number, self.past, self._is_turn(number))
         marks.tracking = (begin, self._mark())
         return tracked
+
+    def _is_turn(self, number: int) -> bool:
+        return number % self.config.mapping.every == 0
 
     def _is_mapping_frame(self, number: int) -> bool:
         """Whether the newest frame is to be mapped: a lost one never, one soon after loss not yet."""
         if self.state.scene.volume.num_voxels == 0:
             return not bool(self.state.frames.lost[-1])
-        if number % self.config.mapping.every:
+        if not self._is_turn(number):
             return False
         return not bool(self.state.frames.lost[-SETTLED_FRAMES:].any())
 

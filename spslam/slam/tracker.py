@@ -17,6 +17,9 @@ from spslam.slam.reference_image import ReferenceKeeper
 from spslam.slam.rescue import IcpAlignment
 from spslam.slam.state import FrameTable
 
+AGREEING = 4  # frames in a row whose likely poses agree are found
+AGREE_CM, AGREE_DEG = 5.0, 4.0  # from one frame to the next
+MAPPED_SUPPORT = 0.7  # a frame to be mapped that has less may have something before the lens
 SHORT_LOSS = 5  # frames: for as long the camera cannot be far from where it was
 RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
 
@@ -32,6 +35,7 @@ class TrackingResult:
         lost: whether the pose is not to be trusted.
         rescued: whether the pose comes from a start that ICP found.
         relocalised: whether that start was another frame than the last.
+        agreeing: how many lost frames up to this one had likely poses that agree; `pose` is the last of them.
     """
 
     pose: torch.Tensor
@@ -40,6 +44,7 @@ class TrackingResult:
     lost: bool
     rescued: bool = False
     relocalised: bool = False
+    agreeing: int = 0
 
 
 class Tracker:
@@ -67,6 +72,7 @@ class Tracker:
         start: torch.Tensor,
         frame: int,
         past: Past | None = None,
+        to_be_mapped: bool = False,
     ) -> TrackingResult:
         """Optimises the pose from `start`; where that is doubtful, tries again from where ICP leads.
 
@@ -76,9 +82,10 @@ class Tracker:
             start: float32 [7] where the motion model puts the camera.
             frame: number of the frame, keys the random draws.
             past: the frames before; without it there is no second try.
+            to_be_mapped: whether the frame is to be mapped if its pose is good.
 
         Returns:
-            The best supported pose; `start` where the frame is lost.
+            The best supported pose. Where the frame is lost, a likely one, or else `start`.
         """
         if self.is_blind(pixels):
             return TrackingResult(start.clone(), 0, Fit(), lost=True)
@@ -88,7 +95,9 @@ class Tracker:
         result = find(scene, pixels.records, start, frame, self._iterations(frame))
         if past is not None and (past.is_lost or self._is_doubtful(result)):
             result = self._look_again(scene, pixels, start, frame, past, result)
-        return replace(result, pose=start.clone()) if result.lost else result
+        elif past is not None and to_be_mapped and result.fit.support < MAPPED_SUPPORT:
+            result = self._verified(IcpAlignment(pixels, self.camera), past, result)
+        return replace(result, pose=start.clone()) if result.lost and not result.agreeing else result
 
     def _mapped_view(self, past: Past | None) -> ops.ReferenceImage | None:
         """What the last mapped frame looked like, where colours are to be compared."""
@@ -199,13 +208,14 @@ class Tracker:
         last = past.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
         starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
         best = self._best(scene, pixels, starts, start, frame, best)
-        best = self._verified(alignment, past, best, past.frames_lost <= SHORT_LOSS)
-        if not best.lost:
-            return best
+        if past.frames_lost <= SHORT_LOSS:
+            best = self._verified(alignment, past, best)
+            if not best.lost:
+                return best
         alike = past.similar(pixels, tracking.relocalise_frames)
         starts = [alignment.pose(other.frame, other.start) for other in alike]
         found = self._best(scene, pixels, starts, start, frame, best)
-        found = self._verified(alignment, past, found, is_near=False)
+        found = self._found_again(self._verified(alignment, past, found), past)
         return replace(found, relocalised=found.pose is not best.pose and not found.lost)
 
     def _best(
@@ -227,16 +237,23 @@ class Tracker:
                 best = replace(again, rescued=True)
         return replace(best, iterations=iterations)
 
-    def _verified(self, alignment: IcpAlignment, past: Past, result: TrackingResult, is_near: bool) -> TrackingResult:
-        """The result, judged anew with what it would look through of other frames' surface.
-
-        Where the camera need not be near its last pose, the motion model has no say, and there must be no doubt: of all
-        the places that a camera may have been carried to, some are always alike.
-        """
+    def _verified(self, alignment: IcpAlignment, past: Past, result: TrackingResult) -> TrackingResult:
+        """The result, judged anew with what it would look through of other frames' surface."""
         conflict, hidden = past.conflict(alignment.vertices, alignment.intrinsics, result.pose)
         fit = replace(result.fit, conflict=conflict, hidden=hidden)
-        if is_near:
-            return replace(result, fit=fit, lost=self._is_lost(fit))
-        fit = replace(fit, jump_cm=math.nan, jump_deg=math.nan)
-        doubtful = not fit.doubt <= self.config.tracking.relocalise_below
-        return replace(result, fit=fit, lost=doubtful or self._is_lost(fit))
+        return replace(result, fit=fit, lost=self._is_lost(fit))
+
+    def _found_again(self, result: TrackingResult, past: Past) -> TrackingResult:
+        """The result, judged as that of a camera that may be anywhere: of all places some are always alike.
+
+        The motion model has no say in the doubt, and there must be next to none; or little, in some frames one after
+        another whose poses agree.
+        """
+        tracking = self.config.tracking
+        agrees = result.fit.jump_cm < AGREE_CM and result.fit.jump_deg < AGREE_DEG
+        fit = replace(result.fit, jump_cm=math.nan, jump_deg=math.nan)
+        likely = fit.doubt <= tracking.doubtful_above and not self._is_lost(fit)
+        agreeing = int(likely) * (1 + past.agreeing * int(agrees))
+        if likely and (fit.doubt <= tracking.relocalise_below or agreeing >= AGREEING):
+            return replace(result, fit=fit, lost=False, agreeing=0)
+        return replace(result, fit=fit, lost=True, agreeing=agreeing)
