@@ -29,6 +29,7 @@ class FrameReport:
         jump_cm, jump_deg: from the motion model's pose to the one found; None where that was not asked.
         conflict: share of the surface other frames know that it looks through; None where that was not asked.
         hidden: share of that surface that something nearer hides; None where that was not asked.
+        coverage: share of the last trusted frame's pixels on mapped surface; None where that was not asked.
         doubt: probability from these that its pose is wrong; None where it was not tracked.
         rescued: whether its pose comes from a start that projective ICP found.
         relocalised: whether that start was a stored frame that looks alike.
@@ -58,6 +59,7 @@ class FrameReport:
     jump_deg: float | None
     conflict: float | None
     hidden: float | None
+    coverage: float | None
     doubt: float | None
     rescued: bool
     relocalised: bool

@@ -8,7 +8,8 @@ A logistic model of four measures, fitted to right poses of clean runs and to wh
 support is the mean robust weight of the frame's pixels, information the smallest eigenvalue of the normal equations a
 pixel (how well the worst direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5
 degrees) from where the motion model put the camera, conflict the share of the surface known from other frames that it
-would have to look through. What is not known takes part as a number between right and wrong.
+would have to look through. Support counts for more on a map with holes, as small images or few points leave it.
+What is not known takes part as a number between right and wrong.
 """
 
 import math
@@ -21,6 +22,7 @@ JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
 MOST_CONFLICT = 0.3  # beyond it one wrong pose is as wrong as another
 UNKNOWN_JUMP, UNKNOWN_CONFLICT = 1.3, 0.11
+USUAL_COVERAGE = 0.9  # or more, in the runs of the calibration
 MOST_HIDDEN = 0.15  # of known surface; in clean runs it is at most 0.07
 
 
@@ -36,6 +38,8 @@ class Fit:
         jump_cm, jump_deg: distance and angle to the pose that was expected.
         conflict: share of the surface in view, as other frames know it, that the frame looks through.
         hidden: share of it that something nearer hides from the frame; no sign of a wrong pose.
+        coverage: share of the last trusted frame's pixels on mapped surface. Where images are small or points are few
+            the map has holes, and no pose has more support than this.
     """
 
     residual_cm: float = math.nan
@@ -46,6 +50,7 @@ class Fit:
     jump_deg: float = math.nan
     conflict: float = math.nan
     hidden: float = math.nan
+    coverage: float = math.nan
 
     @property
     def is_obstructed(self) -> bool:
@@ -60,12 +65,19 @@ class Fit:
         jump = math.log1p(self.jump_cm / JUMP_CM + self.jump_deg / JUMP_DEG)
         odds = (
             CONSTANT
-            + PER_SUPPORT * self.support
+            + PER_SUPPORT * self._support_of_covered
             + PER_INFORMATION * math.log10(max(self.information, LEAST_INFORMATION))
             + PER_JUMP * (UNKNOWN_JUMP if math.isnan(jump) else jump)
             + PER_CONFLICT * (UNKNOWN_CONFLICT if math.isnan(self.conflict) else min(self.conflict, MOST_CONFLICT))
         )
         return 1 / (1 + math.exp(-odds))
+
+    @property
+    def _support_of_covered(self) -> float:
+        """The support, as it would be on a map with as few holes as those of the calibration."""
+        if not 0 < self.coverage < USUAL_COVERAGE:
+            return self.support
+        return min(self.support * USUAL_COVERAGE / self.coverage, 1.0)
 
 
 def jump(start: list[float], pose: list[float]) -> tuple[float, float]:

@@ -112,6 +112,7 @@ class SlamSystem:
             "jump_deg": _known(tracked.fit.jump_deg),
             "conflict": _known(tracked.fit.conflict),
             "hidden": _known(tracked.fit.hidden),
+            "coverage": _known(tracked.fit.coverage),
             "doubt": _known(tracked.fit.doubt),
             "rescued": tracked.rescued,
             "relocalised": tracked.relocalised,

@@ -96,7 +96,7 @@ class Tracker:
         if past is not None and (past.is_lost or self._is_doubtful(result)):
             result = self._look_again(scene, pixels, start, frame, past, result)
         elif past is not None and to_be_mapped and result.fit.support < MAPPED_SUPPORT:
-            result = self._verified(IcpAlignment(pixels, self.camera), past, result)
+            result = self._verified(scene, IcpAlignment(pixels, self.camera), past, result)
         return replace(result, pose=start.clone()) if result.lost and not result.agreeing else result
 
     def _mapped_view(self, past: Past | None) -> ops.ReferenceImage | None:
@@ -209,13 +209,13 @@ class Tracker:
         starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
         best = self._best(scene, pixels, starts, start, frame, best)
         if past.frames_lost <= SHORT_LOSS:
-            best = self._verified(alignment, past, best)
+            best = self._verified(scene, alignment, past, best)
             if not best.lost:
                 return best
         alike = past.similar(pixels, tracking.relocalise_frames)
         starts = [alignment.pose(other.frame, other.start) for other in alike]
         found = self._best(scene, pixels, starts, start, frame, best)
-        found = self._found_again(self._verified(alignment, past, found), past)
+        found = self._found_again(self._verified(scene, alignment, past, found), past)
         return replace(found, relocalised=found.pose is not best.pose and not found.lost)
 
     def _best(
@@ -237,11 +237,26 @@ class Tracker:
                 best = replace(again, rescued=True)
         return replace(best, iterations=iterations)
 
-    def _verified(self, alignment: IcpAlignment, past: Past, result: TrackingResult) -> TrackingResult:
-        """The result, judged anew with what it would look through of other frames' surface."""
+    def _verified(self, scene: Scene, alignment: IcpAlignment, past: Past, result: TrackingResult) -> TrackingResult:
+        """The result, judged anew with what it would look through of other frames' surface, and the map's holes."""
         conflict, hidden = past.conflict(alignment.vertices, alignment.intrinsics, result.pose)
-        fit = replace(result.fit, conflict=conflict, hidden=hidden)
+        fit = replace(result.fit, conflict=conflict, hidden=hidden, coverage=self._coverage(scene, past))
         return replace(result, fit=fit, lost=self._is_lost(fit))
+
+    def _coverage(self, scene: Scene, past: Past) -> float:
+        """Share of the last trusted frame's pixels on mapped surface; NaN where there is no such frame."""
+        last, tracking = past.last(), self.config.tracking
+        if last is None:
+            return math.nan
+        _, _, _, inlier_share = ops.gauss_newton_poses(
+            scene.view(),
+            last.records[None, : tracking.pixels],
+            last.pose[None],
+            self.intrinsics,
+            truncation=scene.settings.truncation_m,
+            kernel=tracking.kernel_end_m,
+        )
+        return float(inlier_share)
 
     def _found_again(self, result: TrackingResult, past: Past) -> TrackingResult:
         """The result, judged as that of a camera that may be anywhere: of all places some are always alike.

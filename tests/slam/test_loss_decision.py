@@ -29,6 +29,15 @@ def test_each_measure_raises_the_doubt(worse):
     assert replace(GOOD, **worse).doubt > 2 * GOOD.doubt
 
 
+def test_support_is_held_against_what_the_map_covers():
+    sparse = replace(GOOD, support=0.3)
+    assert replace(sparse, coverage=0.35).doubt < 0.1 * sparse.doubt
+    assert replace(sparse, coverage=0.95).doubt == sparse.doubt
+    assert replace(sparse, coverage=0.0).doubt == sparse.doubt
+    # A wrong pose has no more on a map with holes.
+    assert replace(GOOD, support=0.05, information=0.0005, jump_cm=18.0, conflict=0.3, coverage=0.4).doubt > 0.99
+
+
 def test_what_is_not_known_lies_between_right_and_wrong():
     for name, wrong in (("conflict", 0.3), ("jump_cm", 50.0)):
         unknown = replace(GOOD, **{name: math.nan}).doubt
