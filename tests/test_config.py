@@ -65,8 +65,8 @@ def test_exponents_without_a_point_are_numbers():
 
 
 def test_empty_section_changes_nothing(tmp_path):
-    path = write(tmp_path, "dataset: {type: tum}\ntracking:\n")
-    assert load_config(path).tracking == load_config("tum").tracking
+    path = write(tmp_path, "dataset: {type: replica}\ntracking:\n")
+    assert load_config(path).tracking == load_config("replica").tracking
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -15,7 +15,7 @@ NEAR_M = 0.01
 EQUAL = 0.05
 WITHOUT_PRIOR = {
     "random embeddings": ("prior.enabled=false",),
-    "random embeddings and decoder": ("prior.enabled=false", "prior.decoder=random"),
+    "random embeddings and decoder": ("prior.enabled=false", "prior.decoder=random", "mapping.decoder_rate=1e-3"),
 }
 
 
