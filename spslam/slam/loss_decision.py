@@ -3,7 +3,7 @@
 A logistic model of four measures, fitted to right poses of clean runs and to what tracking makes of wrong starts
 (docs/loss.md has the figures and the command):
 
-    ln odds = -6.9 - 10 support - 2.1 lg(information) + 3.6 jump + 23 conflict
+    ln odds = -7.3 - 10 support - 2.1 lg(information) + 3.6 jump + 23 conflict
 
 support is the mean robust weight of the frame's pixels, information the smallest eigenvalue of the normal equations a
 pixel (how well the worst direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-CONSTANT, PER_SUPPORT, PER_INFORMATION, PER_JUMP, PER_CONFLICT = -6.9, -10.0, -2.1, 3.6, 23.0
+CONSTANT, PER_SUPPORT, PER_INFORMATION, PER_JUMP, PER_CONFLICT = -7.3, -10.0, -2.1, 3.6, 23.0
 JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
 MOST_CONFLICT = 0.3  # beyond it one wrong pose is as wrong as another
