@@ -19,6 +19,7 @@ from spslam.slam.state import FrameTable
 
 AGREEING = 4  # frames in a row whose likely poses agree are found
 AGREE_CM, AGREE_DEG = 5.0, 4.0  # from one frame to the next
+AGREEING_INFORMATION = 0.004  # of each: a plane agrees with itself wherever it is laid
 MAPPED_SUPPORT = 0.7  # a frame to be mapped that has less may have something before the lens
 SHORT_LOSS = 5  # frames: for as long the camera cannot be far from where it was
 RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
@@ -97,7 +98,11 @@ class Tracker:
             result = self._look_again(scene, pixels, start, frame, past, result)
         elif past is not None and to_be_mapped and result.fit.support < MAPPED_SUPPORT:
             result = self._verified(scene, IcpAlignment(pixels, self.camera), past, result)
-        return replace(result, pose=start.clone()) if result.lost and not result.agreeing else result
+        if result.lost and not result.agreeing:
+            # A start from lost frames was no more than likely.
+            known = past.last() if past is not None and past.agreeing else None
+            result = replace(result, pose=(start if known is None else known.pose).clone())
+        return result
 
     def _mapped_view(self, past: Past | None) -> ops.ReferenceImage | None:
         """What the last mapped frame looked like, where colours are to be compared."""
@@ -208,7 +213,8 @@ class Tracker:
         last = past.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
         starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
         best = self._best(scene, pixels, starts, start, frame, best)
-        if past.frames_lost <= SHORT_LOSS:
+        # After lost frames whose poses agree, the way to where the camera was is not that from the start.
+        if past.frames_lost <= SHORT_LOSS and not past.agreeing:
             best = self._verified(scene, alignment, past, best)
             if not best.lost:
                 return best
@@ -267,8 +273,10 @@ class Tracker:
         tracking = self.config.tracking
         agrees = result.fit.jump_cm < AGREE_CM and result.fit.jump_deg < AGREE_DEG
         fit = replace(result.fit, jump_cm=math.nan, jump_deg=math.nan)
-        likely = fit.doubt <= tracking.doubtful_above and not self._is_lost(fit)
-        agreeing = int(likely) * (1 + past.agreeing * int(agrees))
-        if likely and (fit.doubt <= tracking.relocalise_below or agreeing >= AGREEING):
+        if fit.doubt <= tracking.relocalise_below and not self._is_lost(fit):
+            return replace(result, fit=fit, lost=False, agreeing=0)
+        likely = fit.doubt <= tracking.doubtful_above and fit.information >= AGREEING_INFORMATION
+        agreeing = int(likely and not self._is_lost(fit)) * (1 + past.agreeing * int(agrees))
+        if agreeing >= AGREEING:
             return replace(result, fit=fit, lost=False, agreeing=0)
         return replace(result, fit=fit, lost=True, agreeing=agreeing)

@@ -50,6 +50,13 @@ def test_poses_apart_do_not_agree(tracker, far):
     assert (result.lost, result.agreeing) == (True, 1)
 
 
+def test_a_plane_agrees_with_itself_anywhere(tracker):
+    plane = replace(LIKELY, support=0.65, information=0.002)
+    result = found_again(tracker, plane, AGREEING + 1)
+    assert 0.02 < result.fit.doubt < 0.1
+    assert (result.lost, result.agreeing) == (True, 0)
+
+
 def test_an_unlikely_pose_ends_the_row(tracker):
     result = found_again(tracker, UNLIKELY, AGREEING + 1)
     assert result.fit.doubt > 0.1
