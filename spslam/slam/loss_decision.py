@@ -8,7 +8,8 @@ A logistic model of four measures, fitted to right poses of clean runs and to wh
 support is the mean robust weight of the frame's pixels, information the smallest eigenvalue of the normal equations a
 pixel (how well the worst direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5
 degrees) from where the motion model put the camera, conflict the share of the surface known from other frames that it
-would have to look through. Support counts for more on a map with holes, as small images or few points leave it.
+would have to look through. Support counts for more on a map with holes, as small images or few points leave it, and
+information below 0.002, the least of clean runs, twice as much.
 What is not known takes part as a number between right and wrong.
 """
 
@@ -20,6 +21,7 @@ import numpy as np
 CONSTANT, PER_SUPPORT, PER_INFORMATION, PER_JUMP, PER_CONFLICT = -7.3, -10.0, -2.1, 3.6, 23.0
 JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
+FIRM_INFORMATION = 0.002  # or more, in clean runs; with less, a pose slides where little holds it
 MOST_CONFLICT = 0.3  # beyond it one wrong pose is as wrong as another
 UNKNOWN_JUMP, UNKNOWN_CONFLICT = 1.3, 0.11
 USUAL_COVERAGE = 0.9  # or more, in the runs of the calibration
@@ -66,11 +68,17 @@ class Fit:
         odds = (
             CONSTANT
             + PER_SUPPORT * self._support_of_covered
-            + PER_INFORMATION * math.log10(max(self.information, LEAST_INFORMATION))
+            + PER_INFORMATION * self._lg_information
             + PER_JUMP * (UNKNOWN_JUMP if math.isnan(jump) else jump)
             + PER_CONFLICT * (UNKNOWN_CONFLICT if math.isnan(self.conflict) else min(self.conflict, MOST_CONFLICT))
         )
         return 1 / (1 + math.exp(-odds))
+
+    @property
+    def _lg_information(self) -> float:
+        """The logarithm of the information, which falls twice as fast below that of any clean run."""
+        lg = math.log10(max(self.information, LEAST_INFORMATION))
+        return lg + min(lg - math.log10(FIRM_INFORMATION), 0.0)
 
     @property
     def _support_of_covered(self) -> float:
