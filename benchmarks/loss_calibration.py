@@ -22,6 +22,7 @@ from spslam.datasets import open_sequence
 from spslam.geometry import rotation_angle
 from spslam.options import PRESETS
 from spslam.slam.loss_decision import JUMP_CM, JUMP_DEG, LEAST_INFORMATION, MOST_CONFLICT, Fit
+from spslam.slam.past import surface_shares
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.rescue import IcpAlignment
 from spslam.slam.state import pose_tensor
@@ -75,7 +76,8 @@ def fit_from(
     """What tracking makes of a start alone, with its conflict, and the pose."""
     result = tracker.track(system.state.scene, pixels, start, number)
     alignment = IcpAlignment(pixels, system.camera)
-    conflict, hidden = system.past.conflict(alignment.vertices, alignment.intrinsics, result.pose)
+    counts = system.past.surface_counts(alignment.vertices, alignment.intrinsics, result.pose)
+    conflict, hidden = surface_shares(*counts.tolist())
     return replace(result.fit, conflict=conflict, hidden=hidden), matrix(result.pose)
 
 

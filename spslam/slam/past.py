@@ -110,8 +110,8 @@ class Past:
         chosen = zip(rows[order].tolist(), turn[order].tolist(), strict=True)
         return [self._alike(row, shifts[of_shift]) for row, of_shift in chosen]
 
-    def conflict(self, vertices: torch.Tensor, intrinsics: ops.Intrinsics, pose: torch.Tensor) -> tuple[float, float]:
-        """Shares of the surface known from other frames that a frame looks through, and that something hides from it.
+    def surface_counts(self, vertices: torch.Tensor, intrinsics: ops.Intrinsics, pose: torch.Tensor) -> torch.Tensor:
+        """How much of the surface known from other frames a frame sees, looks through, and has hidden from it.
 
         Args:
             vertices: float32 [H, W, 3], m, what the frame sees of the surface, in its axes; z = 0 where unknown.
@@ -119,13 +119,10 @@ class Past:
             pose: float32 [7].
 
         Returns:
-            Two numbers from 0 to 1. Where little is known, the first goes towards what it counts as unmeasured.
+            int64 [3] on the device, see `surface_counts`; for `surface_shares`.
         """
         rows, frames = self._views(), self._state.frames
-        counts = surface_counts(vertices, intrinsics, pose, frames.poses[rows], frames.lattices[rows], self._camera)
-        seen, through, hidden = counts.tolist()
-        share = (through + UNKNOWN_CONFLICT * FEW_POINTS) / (seen + through + FEW_POINTS)
-        return share, hidden / max(seen + hidden, 1)
+        return surface_counts(vertices, intrinsics, pose, frames.poses[rows], frames.lattices[rows], self._camera)
 
     def _rows(self) -> torch.Tensor:
         return self._state.usable.nonzero()[:, 0]
@@ -135,7 +132,8 @@ class Past:
         if len(rows) > VIEWS:
             older = torch.linspace(0, len(rows) - RECENT_VIEWS - 1, VIEWS - RECENT_VIEWS).long()
             rows = torch.cat([rows[older], rows[-RECENT_VIEWS:]])
-        return rows.to(self._state.frames.poses.device)
+        device = self._state.frames.poses.device
+        return rows if device.type == "cpu" else rows.pin_memory().to(device, non_blocking=True)
 
     def _alike(self, row: int, shift: tuple[int, int]) -> Alike:
         frame = self._frame(row)
@@ -201,6 +199,16 @@ def turned(pose: torch.Tensor, shift: tuple[int, int], camera: Camera) -> torch.
     pitch = pose7_to_matrix(np.array([math.cos(down), -math.sin(down), 0, 0, 0, 0, 0]))
     matrix = compose(pose7_to_matrix(pose.cpu().double().numpy()), yaw, pitch)
     return torch.from_numpy(matrix_to_pose7(matrix)).to(pose)
+
+
+def surface_shares(seen: float, through: float, hidden: float) -> tuple[float, float]:
+    """Shares of known surface that a frame looks through, and that something hides from it, of `surface_counts`.
+
+    Returns:
+        Two numbers from 0 to 1. Where little is known, the first goes towards what it counts as unmeasured.
+    """
+    share = (through + UNKNOWN_CONFLICT * FEW_POINTS) / (seen + through + FEW_POINTS)
+    return share, hidden / max(seen + hidden, 1)
 
 
 def surface_counts(

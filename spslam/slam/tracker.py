@@ -11,7 +11,7 @@ from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.loss_decision import Fit, information, jump
 from spslam.slam.optimization import render_options
-from spslam.slam.past import Past
+from spslam.slam.past import Past, surface_shares
 from spslam.slam.pixels import FramePixels
 from spslam.slam.reference_image import ReferenceKeeper
 from spslam.slam.rescue import IcpAlignment
@@ -245,15 +245,18 @@ class Tracker:
 
     def _verified(self, scene: Scene, alignment: IcpAlignment, past: Past, result: TrackingResult) -> TrackingResult:
         """The result, judged anew with what it would look through of other frames' surface, and the map's holes."""
-        conflict, hidden = past.conflict(alignment.vertices, alignment.intrinsics, result.pose)
-        fit = replace(result.fit, conflict=conflict, hidden=hidden, coverage=self._coverage(scene, past))
+        counts = past.surface_counts(alignment.vertices, alignment.intrinsics, result.pose)
+        # A doubtful frame's second wait for the device.
+        seen, through, hidden, coverage = torch.cat([counts, self._coverage(scene, past)]).tolist()
+        conflict, hidden = surface_shares(seen, through, hidden)
+        fit = replace(result.fit, conflict=conflict, hidden=hidden, coverage=coverage)
         return replace(result, fit=fit, lost=self._is_lost(fit))
 
-    def _coverage(self, scene: Scene, past: Past) -> float:
-        """Share of the last trusted frame's pixels on mapped surface; NaN where there is no such frame."""
+    def _coverage(self, scene: Scene, past: Past) -> torch.Tensor:
+        """Share of the last trusted frame's pixels on mapped surface, float32 [1]; NaN where there is no such frame."""
         last, tracking = past.last(), self.config.tracking
         if last is None:
-            return math.nan
+            return torch.full((1,), math.nan, device=scene.device)
         _, _, _, inlier_share = ops.gauss_newton_poses(
             scene.view(),
             last.records[None, : tracking.pixels],
@@ -262,7 +265,7 @@ class Tracker:
             truncation=scene.settings.truncation_m,
             kernel=tracking.kernel_end_m,
         )
-        return float(inlier_share)
+        return inlier_share
 
     def _found_again(self, result: TrackingResult, past: Past) -> TrackingResult:
         """The result, judged as that of a camera that may be anywhere: of all places some are always alike.

@@ -17,7 +17,8 @@ SCRIPT = ROOT / "examples" / "posed_fusion.py"
 
 def run(*arguments):
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
-    return subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
 
 
 def test_room_is_reconstructed(tmp_path):
@@ -40,9 +41,9 @@ def test_poses_are_needed(tmp_path):
 @pytest.mark.cuda
 def test_on_a_gpu_it_has_the_same_voxels(tmp_path):
     """Vertices and their weights are exact on every device; the surface between them is up to rounding."""
-    lines = [
-        run(tmp_path / f"{name}.ply", "--frames", 3, "--device", name).stdout.split(", ") for name in ("cpu", "cuda")
-    ]
+    finished = [run(tmp_path / f"{name}.ply", "--frames", 3, "--device", name) for name in ("cpu", "cuda")]
+    assert [one.returncode for one in finished] == [0, 0], [one.stderr for one in finished]
+    lines = [one.stdout.split(", ") for one in finished]
     assert lines[0][:2] == lines[1][:2]
     counts = [int(line[3].split()[0]) for line in lines]
     assert abs(counts[0] - counts[1]) < 0.01 * counts[0]

@@ -6,7 +6,15 @@ import torch
 
 from spslam.datasets.base import RgbdFrame
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle, transform_points
-from spslam.slam.past import APART, Past, lattice_difference, surface_counts, turned, turned_differences
+from spslam.slam.past import (
+    APART,
+    Past,
+    lattice_difference,
+    surface_counts,
+    surface_shares,
+    turned,
+    turned_differences,
+)
 from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame
 from spslam.slam.rescue import surface_maps
 from spslam.slam.state import SlamState, pose_tensor
@@ -110,7 +118,7 @@ def test_without_a_known_frame_there_is_nothing(dataset, pixels):
 
 def conflict(past, pixels, pose, camera):
     vertices, _, intrinsics = surface_maps(pixels, camera)
-    return past.conflict(vertices, intrinsics, pose)
+    return surface_shares(*past.surface_counts(vertices, intrinsics, pose).tolist())
 
 
 def test_a_wrong_pose_looks_through_known_surface(dataset, pixels, device):
