@@ -154,7 +154,8 @@ class Room:
             else:
                 piece = self.pieces[number]
                 colors[rows] = _shaded(points[rows], piece.solid.normals(points[rows]), piece.material)
-        return np.clip(colors * 255 + 0.5, 0, 255).astype(np.uint8)
+        # A point on an edge may have no normal, hence no shade.
+        return np.clip(np.nan_to_num(colors) * 255 + 0.5, 0, 255).astype(np.uint8)
 
     def _shell_colors(self, points: np.ndarray) -> np.ndarray:
         normals = -self._shell.normals(points)
