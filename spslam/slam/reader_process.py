@@ -58,7 +58,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._process, self._connection = process, connection
         self._memory, self._blank, self._uploader = memory, blank, uploader
         self._in_use: deque[tuple[int, Upload]] = deque()
-        self._begun = False
+        self._begun = self._is_locked = False
 
     @classmethod
     def start(
@@ -108,7 +108,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         if not ready:
             self.close()
         elif self._uploader is not None:
-            self._uploader.lock_pages(self._memory)
+            self._is_locked = self._uploader.lock_pages(self._memory)
         return ready
 
     def __next__(self) -> PreparedFrame | DatasetError:
@@ -132,7 +132,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._process.wait()
         while self._in_use:
             self._in_use.popleft()[1].end.wait()
-        if self._uploader is not None:
+        if self._uploader is not None and self._is_locked:
             self._uploader.unlock_pages(self._memory)
 
     def _receive(self) -> PreparedFrame | DatasetError:

@@ -1,5 +1,6 @@
 """Frames' way to a CUDA device, beside whatever it does."""
 
+import contextlib
 import threading
 from dataclasses import dataclass
 
@@ -56,13 +57,20 @@ class Uploader:
             self._own.stream = torch.cuda.Stream(self.device)
         return self._own.stream
 
-    @staticmethod
-    def lock_pages(memory: torch.Tensor) -> None:
-        """Locks the pages of memory that this process only maps, so that copies out of it wait for nothing."""
-        # Where that is not allowed, copies are slower and nothing else changes.
-        torch.cuda.cudart().cudaHostRegister(memory.data_ptr(), memory.nbytes, 0)
+    def lock_pages(self, memory: torch.Tensor) -> bool:
+        """Locks the pages of memory that this process only maps, so that copies out of it wait for nothing.
+
+        Returns:
+            Whether that is allowed here; where not, copies are slower and nothing else changes.
+        """
+        runtime = torch.cuda.cudart()
+        if runtime.cudaHostRegister(memory.data_ptr(), memory.nbytes, 0) == runtime.cudaError.success:
+            return True
+        with contextlib.suppress(RuntimeError):
+            torch.zeros(1, device=self.device)  # takes the error that the next kernel would be blamed for
+        return False
 
     @staticmethod
     def unlock_pages(memory: torch.Tensor) -> None:
-        """Undoes `lock_pages`; all copies must be done."""
+        """Undoes `lock_pages` where that was done; all copies must have ended."""
         torch.cuda.cudart().cudaHostUnregister(memory.data_ptr())

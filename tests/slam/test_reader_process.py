@@ -14,8 +14,11 @@ import torch
 from spslam.errors import SpslamError
 from spslam.slam import reader_launch
 from spslam.slam.frame_feed import FrameFeed
+from spslam.slam.pixels import sample_frame
 from spslam.slam.reader_launch import end_spare, has_spare, launch_spare
 from spslam.slam.reader_process import ReaderProcess
+from spslam.slam.timeline import HostMark
+from spslam.slam.upload import Upload
 from tests.system.sequences import Recorded, settings
 
 CPU = torch.device("cpu")
@@ -67,6 +70,46 @@ def test_a_process_started_early_is_used_once():
         assert feed.prepare()._process.pid == pid
         assert [frame.index for frame in feed] == list(range(FRAMES))
     assert not has_spare()
+
+
+class LateUploader:
+    """As `Uploader`, without a device: copies end some frames later; notes what happens to the pages."""
+
+    def __init__(self, can_lock):
+        self.can_lock, self.notes, self.sent = can_lock, [], 0
+
+    def send(self, pixels):
+        self.sent += 1
+        return Upload(pixels.holding(pixels.buffer.clone()), pixels, HostMark(), LateMark(self, self.sent + 1))
+
+    def lock_pages(self, memory):
+        self.notes.append("lock")
+        return self.can_lock
+
+    def unlock_pages(self, memory):
+        self.notes.append("unlock")
+
+
+class LateMark(HostMark):
+    def __init__(self, uploader, ends_with):
+        super().__init__()
+        self.uploader, self.ends_with = uploader, ends_with
+
+    def has_passed(self):
+        return self.uploader.sent >= self.ends_with
+
+
+@pytest.mark.parametrize(("can_lock", "notes"), [(True, ["lock", "unlock"]), (False, ["lock"])])
+def test_slots_are_given_back_when_their_copies_have_ended(can_lock, notes):
+    dataset, config, uploader = Recorded(FRAMES), settings(), LateUploader(can_lock)
+    reader = ReaderProcess.start(dataset, config, start=0, workers=1, ahead=4, uploader=uploader)
+    assert reader.is_ready()
+    frames = list(reader)
+    assert [frame.index for frame in frames] == list(range(FRAMES))
+    for frame in frames:
+        want = sample_frame(dataset[frame.index], dataset.camera, config)
+        assert torch.equal(frame.pixels.pixels.buffer, want.buffer)
+    assert uploader.notes == notes
 
 
 def test_a_process_that_nobody_takes_is_ended():
