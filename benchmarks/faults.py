@@ -16,6 +16,7 @@ import torch
 
 from benchmarks import timing
 from spslam.benchmark.faults import FLAG_WITHIN, Outcome, plan, run_trials
+from spslam.cli.arguments import parse_frames
 from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.options import PRESETS
@@ -29,8 +30,7 @@ def main() -> None:
     args = _parser().parse_args()
     device = resolve_device(args.device)
     config = load_config(args.config, args.preset, [f"device={args.device}", *args.set])
-    frames = slice(*(int(part) if part else None for part in args.frames.split(":"))) if args.frames else None
-    dataset = open_sequence(config.dataset, args.data, frames)
+    dataset = open_sequence(config.dataset, args.data, args.frames)
     outcomes = []
     for outcome in run_trials(config, dataset, plan(dataset, args.trials, args.seed), device):
         outcomes.append(outcome)
@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", default="demo", help="configuration file or name")
     parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", help="START:STOP[:STEP]")
+    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--trials", type=int, default=10, help="of each fault")

@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 
 from benchmarks import timing
+from spslam.cli.arguments import parse_frames
 from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.slam.device import resolve_device
@@ -87,7 +88,7 @@ def run_preset(args: argparse.Namespace, preset: str) -> list[dict]:
     """The metrics of each run, with a digest of its trajectory and map."""
     overrides = [f"device={args.device}", "run.previews=0", *args.set]
     config = load_config(args.config, preset, overrides)
-    frames = slice(*(int(part) if part else None for part in args.frames.split(":"))) if args.frames else None
+    frames = parse_frames(args.frames) if args.frames else None
     runs = []
     for _ in range(args.repeats):
         with tempfile.TemporaryDirectory() as folder:

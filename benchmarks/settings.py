@@ -191,7 +191,8 @@ def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
     rescued = sum(report.result().rescued for report in reports)
     fps = len(dataset) / (time.perf_counter() - started)
     estimated = system.trajectory()
-    figures = {**ate(estimated.poses, truth), **rpe(estimated.poses, truth)}
+    known = estimated.truth_of_known(truth)
+    figures = {**ate(estimated.poses, known), **rpe(estimated.poses, known)}
     counts = {"frames": len(dataset), "lost": int(estimated.lost.sum()), "rescued": rescued, "fps": fps}
     environment = describe_environment(device)
     return {**asdict(job), **figures, **counts, **{k: environment[k] for k in ("device_name", "torch", "commit")}}

@@ -51,6 +51,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def truth_of_known(self, truth: np.ndarray) -> np.ndarray:
+        """True poses, float64 [F,4,4], with NaN for the lost frames: what errors are measured against."""
+        return np.where(self.lost[:, None, None], np.nan, truth)
+
     def save_tum(self, path: str | os.PathLike) -> None:
         """Write the TUM format, a line a frame: ``timestamp tx ty tz qx qy qz qw``, camera to world.
 

@@ -22,6 +22,13 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(loaded.lost, trajectory.lost)
 
 
+def test_errors_are_measured_where_the_pose_is_known():
+    truth, lost = make_trajectory(3).poses, [True, False, True]
+    known = Trajectory(np.arange(3.0), truth[::-1], lost).truth_of_known(truth)
+    np.testing.assert_array_equal(np.isnan(known).all((1, 2)), lost)
+    np.testing.assert_array_equal(known[1], truth[1])
+
+
 def test_lost_frames_have_no_pose_in_the_file(tmp_path):
     poses = make_trajectory(7).poses
     trajectory = Trajectory(np.arange(7) / 30, poses, [True, False, True, False, False, True, True])

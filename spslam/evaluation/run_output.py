@@ -86,7 +86,7 @@ class RunOutput:
     @property
     def known_truth(self) -> np.ndarray | None:
         """The true poses [F,4,4] of the frames whose pose the run knew, NaN for the others; None if none is known."""
-        return None if self.truth is None else np.where(self.trajectory.lost[:, None, None], np.nan, self.truth)
+        return None if self.truth is None else self.trajectory.truth_of_known(self.truth)
 
     def previews(self) -> list[Preview]:
         """The kept input frames, by row; ones that can't be read, or whose pose isn't known, are left out."""

@@ -5,7 +5,6 @@ import resource
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from spslam import __version__
@@ -63,7 +62,7 @@ def write_results(
         **_sizes(system),
     }
     if truth is not None:
-        known = np.where(lost[:, None, None], np.nan, truth[frames.indices.numpy()])
+        known = trajectory.truth_of_known(truth[frames.indices.numpy()])
         metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
     if mesh:
         tracked = trajectory.poses[~lost]
