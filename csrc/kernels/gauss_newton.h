@@ -32,23 +32,37 @@ SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pos
   return {offset + pose.translation, offset};
 }
 
-// Adds a residual (m) of weight 1 / (1 + (r / kernel)^2)^2 times `certainty` to sums of type T. slope is its derivative
-// by the surface point, offset the point seen from the camera centre that the increment turns about. How well the pose
-// fits, the cost and the sum of weights, is told without the certainty.
+// Weight of a residual by Geman and McClure: 1 / (1 + (r / kernel)^2)^2.
+SPS_INLINE float robust_weight(float residual, float kernel) {
+  const float ratio = residual / kernel;
+  const float root = 1.0f / (1.0f + ratio * ratio);
+  return root * root;
+}
+
+// Adds a residual (m) of a weight to the hessian and gradient in sums of type T, and nothing to the cost. slope is its
+// derivative by the surface point, offset the point seen from the camera centre that the increment turns about.
+template <class T>
+SPS_INLINE void add_weighted_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, T weight,
+                                      T* terms) {
+  const Vec3<float> torque = cross(offset, slope);
+  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
+  const T cost = terms[kNormalTerms - 1];
+  add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
+  terms[kNormalTerms - 1] = cost;
+}
+
+// Adds a residual (m) of its robust weight times `certainty`. How well the pose fits, the cost and the sum of weights,
+// is told without the certainty.
 template <class T>
 SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, float kernel,
                                     float certainty, T* terms) {
-  const Vec3<float> torque = cross(offset, slope);
-  const float ratio = residual / kernel;
-  const float root = 1.0f / (1.0f + ratio * ratio);
-  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
-  const T weight = static_cast<T>(root * root), r = static_cast<T>(residual);
-  const T cost = terms[kNormalTerms - 1] + weight * r * r;
-  add_normal_terms<T>(jacobian, r, static_cast<T>(certainty) * weight, terms);
-  terms[kNormalTerms - 1] = cost;
+  const T weight = static_cast<T>(robust_weight(residual, kernel)), r = static_cast<T>(residual);
+  const T certain = static_cast<T>(certainty) * weight;
+  add_weighted_residual(offset, residual, slope, certain, terms);
+  terms[kNormalTerms - 1] += weight * r * r;
   terms[kNormalTerms] += weight;
   terms[kNormalTerms + 1] += T(1);
-  terms[kNormalTerms + 2] += static_cast<T>(certainty) * weight;
+  terms[kNormalTerms + 2] += certain;
 }
 
 // The same of an inlier's SDF, which is normalised, and its gradient by the world point (1/m).

@@ -7,7 +7,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
-#include "kernels/optimizer.h"
+#include "kernels/gauss_newton.h"
 #include "kernels/pixel_record.h"
 #include "spslam/gauss_newton.h"
 
@@ -73,13 +73,8 @@ SPS_INLINE void add_intensity_residual(const ReferenceView& reference, const Pix
   const float x = by_u * k.fx * inverse_z, y = by_v * k.fy * inverse_z;
   const Vec3<float> by_seen{x, y, -(x * seen.x + y * seen.y) * inverse_z};
   const Vec3<float> slope = image.weight * (reference.pose.rotation * by_seen);
-  const Vec3<float> torque = cross(offset, slope);
-  const float ratio = difference / image.kernel;
-  const float root = 1.0f / (1.0f + ratio * ratio);
-  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
-  const T cost = terms[kNormalTerms - 1];
-  add_normal_terms<T>(jacobian, static_cast<T>(image.weight * difference), static_cast<T>(root * root), terms);
-  terms[kNormalTerms - 1] = cost;
+  add_weighted_residual(offset, image.weight * difference, slope,
+                        static_cast<T>(robust_weight(difference, image.kernel)), terms);
 }
 
 }  // namespace spslam
