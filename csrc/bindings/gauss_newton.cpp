@@ -34,8 +34,8 @@ ReferenceImage load_reference(const std::optional<Tensor>& cells, const std::opt
 std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
     std::vector<Tensor> tensors, std::vector<double> scalars, std::vector<std::int64_t> layout, Tensor pixels,
     Tensor pose, std::vector<double> intrinsics, std::int64_t num_pixels, std::int64_t iterations, double truncation,
-    double kernel_start, double kernel_end, double damping, std::int64_t seed, std::int64_t stream, std::int64_t frame,
-    double noise_depth, std::optional<Tensor> reference, std::optional<Tensor> reference_pose,
+    double kernel_start, double kernel_end, double kernel_judge, double damping, std::int64_t seed, std::int64_t stream,
+    std::int64_t frame, double noise_depth, std::optional<Tensor> reference, std::optional<Tensor> reference_pose,
     std::vector<double> reference_intrinsics, double intensity_weight, double intensity_kernel, bool tf32) {
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
             "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
@@ -57,6 +57,7 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
       static_cast<float>(truncation),
       static_cast<float>(kernel_start),
       static_cast<float>(kernel_end),
+      static_cast<float>(kernel_judge),
       damping,
       philox_key(seed, stream, frame, 0),
       static_cast<float>(noise_depth),
@@ -99,9 +100,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
   m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor pose, float[] intrinsics, int num_pixels, int iterations, float truncation, "
-        "float kernel_start, float kernel_end, float damping, int seed, int stream, int frame, float noise_depth, "
-        "Tensor? reference, Tensor? reference_pose, float[] reference_intrinsics, float intensity_weight, "
-        "float intensity_kernel, bool tf32=True) -> (Tensor, Tensor, Tensor)");
+        "float kernel_start, float kernel_end, float kernel_judge, float damping, int seed, int stream, int frame, "
+        "float noise_depth, Tensor? reference, Tensor? reference_pose, float[] reference_intrinsics, "
+        "float intensity_weight, float intensity_kernel, bool tf32=True) -> (Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
         "-> (Tensor, Tensor, Tensor, Tensor)");

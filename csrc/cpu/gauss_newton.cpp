@@ -13,7 +13,9 @@ constexpr std::int64_t kPixelGrain = 2 * kTileRows;
 
 struct Measurement {
   Intrinsics camera;
-  float truncation, kernel, noise_depth;
+  float truncation;
+  KernelWidths kernel;
+  float noise_depth;
   ReferenceView reference;
 };
 
@@ -94,8 +96,7 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
       return pixels +
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
-    const Measurement measure{options.intrinsics, options.truncation,
-                              annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations),
+    const Measurement measure{options.intrinsics, options.truncation, tracking_kernel(options, iteration),
                               options.noise_depth, load_reference(options.reference)};
     sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
                terms);
@@ -112,7 +113,7 @@ void gauss_newton_poses<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
                              float* cost, float* inliers) {
   const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
   double* partials = static_cast<double*>(workspace);
-  const Measurement measure{intrinsics, truncation, kernel, 0.0f, {}};
+  const Measurement measure{intrinsics, truncation, {kernel, kernel}, 0.0f, {}};
   // Frames run side by side; within one, the loop over its pixels is nested and so runs in place.
   const std::int64_t share = chunk_count(pixels_per_frame, kPixelGrain) * kTrackingTerms;
   parallel_for(frames, 1, [&](std::int64_t begin, std::int64_t end) {

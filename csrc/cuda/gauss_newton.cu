@@ -49,7 +49,9 @@ struct PixelSource {
 
 struct Measurement {
   Intrinsics camera;
-  float truncation, kernel, noise_depth;
+  float truncation;
+  KernelWidths kernel;
+  float noise_depth;
   ReferenceView reference;
 };
 
@@ -163,8 +165,7 @@ __global__ void __launch_bounds__(kThreads)
   const ReferenceView reference = load_reference(options.reference);
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
-    const Measurement measure{options.intrinsics, options.truncation,
-                              annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations),
+    const Measurement measure{options.intrinsics, options.truncation, tracking_kernel(options, iteration),
                               options.noise_depth, reference};
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
@@ -258,8 +259,8 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
     const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
-    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, {intrinsics, truncation, kernel, 0.0f, {}},
-                                                   partials);
+    const Measurement measure{intrinsics, truncation, {kernel, kernel}, 0.0f, {}};
+    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, measure, partials);
   }
   store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, hessian,
                                                                        gradient, cost, inliers);

@@ -15,11 +15,16 @@
 
 namespace spslam {
 
-// And the sum of weights, the number of inliers, the sum of weights times certainties.
+// And the sum of judging weights, the number of inliers, the sum of weights times certainties.
 constexpr int kTrackingTerms = kNormalTerms + 3;
 // Beyond this the decoder's tanh is saturated and its slope says nothing about where the surface is.
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
+
+// Widths (m) of the robust kernel: of the weights that move the pose, and of those that tell how well it fits.
+struct KernelWidths {
+  float step, judge;
+};
 
 struct SurfacePoint {
   Vec3<float> world;   // m
@@ -52,23 +57,23 @@ SPS_INLINE void add_weighted_residual(const Vec3<float>& offset, float residual,
 }
 
 // Adds a residual (m) of its robust weight times `certainty`. How well the pose fits, the cost and the sum of weights,
-// is told without the certainty.
+// is told by the judging width and without the certainty.
 template <class T>
-SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, float kernel,
-                                    float certainty, T* terms) {
-  const T weight = static_cast<T>(robust_weight(residual, kernel)), r = static_cast<T>(residual);
-  const T certain = static_cast<T>(certainty) * weight;
-  add_weighted_residual(offset, residual, slope, certain, terms);
-  terms[kNormalTerms - 1] += weight * r * r;
-  terms[kNormalTerms] += weight;
+SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope,
+                                    const KernelWidths& kernel, float certainty, T* terms) {
+  const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel.step));
+  const T judged = static_cast<T>(robust_weight(residual, kernel.judge)), r = static_cast<T>(residual);
+  add_weighted_residual(offset, residual, slope, weight, terms);
+  terms[kNormalTerms - 1] += judged * r * r;
+  terms[kNormalTerms] += judged;
   terms[kNormalTerms + 1] += T(1);
-  terms[kNormalTerms + 2] += certain;
+  terms[kNormalTerms + 2] += weight;
 }
 
 // The same of an inlier's SDF, which is normalised, and its gradient by the world point (1/m).
 template <class T>
 SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
-                                      float truncation, float kernel, float certainty, T* terms) {
+                                      float truncation, const KernelWidths& kernel, float certainty, T* terms) {
   add_robust_residual(offset, sdf * truncation, truncation * gradient, kernel, certainty, terms);
 }
 
@@ -92,6 +97,12 @@ SPS_INLINE float annealed_kernel(float start, float end, std::int64_t iteration,
   return start * std::pow(end / start, progress < 1.0f ? progress : 1.0f);
 }
 
+// Both widths in an iteration of tracking; what is judged by is that of the step where options name none.
+SPS_INLINE KernelWidths tracking_kernel(const TrackingOptions& options, std::int64_t iteration) {
+  const float step = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
+  return {step, options.kernel_judge > 0.0f ? options.kernel_judge : step};
+}
+
 // Weighted mean squared residual, m^2.
 SPS_INLINE double tracking_cost(const double* terms) {
   const double weights = terms[kNormalTerms];
@@ -99,7 +110,8 @@ SPS_INLINE double tracking_cost(const double* terms) {
 }
 
 // Solves the normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad), hessian what the matrix would
-// be if the mean certainty were 1, so that it tells how the pose is held and not how far away the surface is.
+// be if pixels weighed on average what they are judged by, without certainties, so that it tells how the pose is held
+// and neither how far away the surface is nor how narrow the kernel.
 SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, float* steps, float* hessian) {
   double h[36], g[6], cost, delta[6];
   store_normal_terms<double>(terms, h, g, &cost);

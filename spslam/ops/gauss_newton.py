@@ -76,6 +76,7 @@ def track_gauss_newton(
     seed: int,
     stream: int,
     frame: int,
+    kernel_judge: float | None = None,
     noise_depth: float = 0.0,
     reference: ReferenceImage | None = None,
     tf32: bool = True,
@@ -100,6 +101,8 @@ def track_gauss_newton(
         kernel_end: last width, m.
         damping: relative Levenberg damping.
         seed, stream, frame: keys of the draws, see `philox_uniform`.
+        kernel_judge: width of the kernel that the statistics are told by, m, so that poses are judged alike whatever
+            kernel finds them; None takes the iteration's own.
         noise_depth: depth z0 at which noise that grows with z^2 is as large as that of the map, m; pixels weigh
             1 / (1 + (z / z0)^4) of what they would. 0 weighs near and far alike.
         reference: an earlier frame to compare colours with; None uses the surface alone. It takes no part in what the
@@ -110,9 +113,10 @@ def track_gauss_newton(
     Returns:
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of pixels on
         mapped surface, the norms of the step in translation (m) and rotation (rad), and the mean weight over all pixels
-        (0 for those off the map), each before the iteration's step; float32 [6, 6] H of the last iteration, as it would
-        be if the weights by depth were 1 on average. The same to the bit every time on one device, and for any number
-        of CPU threads.
+        (0 for those off the map), each before the iteration's step and with the weights of `kernel_judge`; float32
+        [6, 6] H of the last iteration, scaled as if pixels weighed on average what those weights are, whatever they
+        weigh by their depth and the iteration's kernel. The same to the bit every time on one device, and for any
+        number of CPU threads.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -142,6 +146,7 @@ def track_gauss_newton(
         "be positive",
         (kernel_start, kernel_end),
     )
+    check(kernel_judge is None or kernel_judge > 0, name, "kernel_judge", "be positive", kernel_judge)
     check(damping >= 0, name, "damping", "be at least 0", damping)
     check(noise_depth >= 0, name, "noise_depth", "be at least 0", noise_depth)
     image: tuple[torch.Tensor | None, torch.Tensor | None, list[float], float, float] = (None, None, [], 0.0, 1.0)
@@ -158,6 +163,7 @@ def track_gauss_newton(
         truncation,
         kernel_start,
         kernel_end,
+        kernel_judge or 0.0,
         damping,
         seed,
         stream,

@@ -5,11 +5,12 @@ A logistic model of four measures, fitted to right poses of clean runs and to wh
 
     ln odds = -7.3 - 10 support - 2.1 lg(information) + 3.6 jump + 23 conflict
 
-support is the mean robust weight of the frame's pixels, information the smallest eigenvalue of the normal equations a
-pixel (how well the worst direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5
-degrees) from where the motion model put the camera, conflict the share of the surface known from other frames that it
-would have to look through. Support counts for more on a map with holes, as small images or few points leave it, and
-information below 0.002, the least of clean runs, twice as much.
+support is the mean robust weight of the frame's pixels by a kernel of 2 cm, whatever width tracking ends with;
+information the smallest eigenvalue of the normal equations a pixel, scaled as if by those weights (how well the worst
+direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5 degrees) from where the
+motion model put the camera, conflict the share of the surface known from other frames that it would have to look
+through. Support counts for more on a map with holes, as small images or few points leave it, and information below
+0.002, the least of clean runs, twice as much.
 What is not known takes part as a number between right and wrong.
 """
 
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 CONSTANT, PER_SUPPORT, PER_INFORMATION, PER_JUMP, PER_CONFLICT = -7.3, -10.0, -2.1, 3.6, 23.0
+JUDGING_KERNEL_M = 0.02  # of the weights behind support and information
 JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
 FIRM_INFORMATION = 0.002  # or more, in clean runs; with less, a pose slides where little holds it
@@ -33,9 +35,9 @@ class Fit:
     """How a pose fits; NaN where something was not measured.
 
     Attributes:
-        residual_cm: weighted root mean squared distance of the pixels to the mapped surface.
+        residual_cm: root mean squared distance of the pixels to the mapped surface, weighted as in `support`.
         inlier_share: share of the pixels that fall on mapped surface.
-        support: mean robust weight of all pixels, from 0 (none fits the map) to 1 (all do).
+        support: mean robust weight (`JUDGING_KERNEL_M`) of all pixels, from 0 (none fits the map) to 1 (all do).
         information: smallest eigenvalue of the normal equations a pixel, 1.
         jump_cm, jump_deg: distance and angle to the pose that was expected.
         conflict: share of the surface in view, as other frames know it, that the frame looks through.

@@ -9,7 +9,7 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
-from spslam.slam.loss_decision import Fit, information, jump
+from spslam.slam.loss_decision import JUDGING_KERNEL_M, Fit, information, jump
 from spslam.slam.optimization import render_options
 from spslam.slam.past import Past, surface_shares
 from spslam.slam.pixels import FramePixels
@@ -167,6 +167,7 @@ class Tracker:
             truncation=scene.settings.truncation_m,
             kernel_start=kernel_start_m,
             kernel_end=tracking.kernel_end_m,
+            kernel_judge=JUDGING_KERNEL_M,
             damping=tracking.damping,
             seed=self.config.seed,
             stream=ops.Stream.TRACKING_PIXELS,
@@ -263,7 +264,7 @@ class Tracker:
             last.pose[None],
             self.intrinsics,
             truncation=scene.settings.truncation_m,
-            kernel=tracking.kernel_end_m,
+            kernel=JUDGING_KERNEL_M,
         )
         return inlier_share
 

@@ -136,6 +136,8 @@ def test_arguments_are_named(generator):
     records = corner_pixels(POSE, generator)
     with pytest.raises(ValueError, match="track_gauss_newton: iterations must be at least 1, got 0"):
         ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
+    with pytest.raises(ValueError, match="track_gauss_newton: kernel_judge must be positive, got 0"):
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **OPTIONS, frame=0, kernel_judge=0)
     with pytest.raises(ValueError, match=r"predict_pose: before must have shape \[7\], got \[8\]"):
         ops.predict_pose(torch.zeros(8), torch.zeros(7))
     with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):
@@ -145,7 +147,7 @@ def test_arguments_are_named(generator):
 def test_opcheck(device, generator):
     scene = make_scene(generator, random_decoder=False)
     records, pose = corner_pixels(POSE, generator, 50), pose7(POSE)
-    arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4, 0, 1, 0, 1.0)
+    arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.03, 1e-4, 0, 1, 0, 1.0)
     call = (*scene.arguments(), *arguments, None, None, [], 0.3, 0.4)
     opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)
     opcheck(torch.ops.spslam.predict_pose.default, (pose, pose), device)

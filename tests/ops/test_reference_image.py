@@ -1,4 +1,4 @@
-"""Tracking beyond the plain surface: pixels weighed by their depth, and colours compared with an earlier frame."""
+"""Tracking beyond the plain surface: pixels weighed by depth, a kernel to judge by, colours of an earlier frame."""
 
 import numpy as np
 import pytest
@@ -37,6 +37,36 @@ def test_far_pixels_weigh_less(device, generator, noise_depth):
     assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=2e-3 * want.abs().max())
     assert stats[0, 0].item() == pytest.approx(float((weight * residual**2).sum() / weight.sum()), rel=1e-3)
     assert stats[0, 4].item() == pytest.approx(float(weight.mean()), rel=2e-3)
+
+
+@pytest.mark.parametrize("noise_depth", [0.0, 2.0])
+def test_a_pose_is_judged_by_a_kernel_of_its_own(device, generator, noise_depth):
+    """The step is that of the iteration's kernel; the fit and the size of the equations are those of the other."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    records = corner_pixels(POSE, generator, 400)
+    drawn = _drawn(records)
+    residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
+    judged = surface_equations(scene, drawn, 0.05)[2]
+    depth = camera_points(drawn)[:, 2]
+    certain = weight / (1 + (depth / noise_depth) ** 4) if noise_depth else weight
+    arguments = scene, records.to(device), pose7(POSE, device), INTRINSICS
+    options = dict(**ONE_STEP, **KEY, noise_depth=noise_depth, tf32=False)
+    pose, plain, _ = ops.track_gauss_newton(*arguments, **options)
+    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, **options, kernel_judge=0.05)
+    assert torch.equal(pose, same_pose)
+    assert torch.equal(plain[:, 1:4], stats[:, 1:4])
+    assert stats[0, 0].item() == pytest.approx(float((judged * residual**2).sum() / judged.sum()), rel=1e-3)
+    assert stats[0, 4].item() == pytest.approx(float(judged.mean()), rel=2e-3)
+    want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * judged.sum() / certain.sum()
+    assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=2e-3 * want.abs().max())
+
+
+def test_the_iterations_own_kernel_judges_where_none_is_named(device, generator):
+    scene = make_scene(generator, random_decoder=True, device=device)
+    arguments = scene, corner_pixels(POSE, generator, 400).to(device), pose7(POSE, device), INTRINSICS
+    plain = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY)
+    named = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY, kernel_judge=ONE_STEP["kernel_end"])
+    assert all(torch.equal(one, other) for one, other in zip(plain, named, strict=True))
 
 
 CELL_PX = 2
@@ -167,7 +197,7 @@ def test_bad_references_are_named(generator):
 
 def test_opcheck_with_a_reference(generator):
     scene, reference = make_scene(generator, random_decoder=False), _reference(POSE)
-    arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 1e-4)
+    arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.02, 1e-4)
     image = (reference.cells, reference.pose, list(reference.intrinsics), 0.3, 0.4)
     call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image)
     torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)

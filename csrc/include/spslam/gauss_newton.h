@@ -10,7 +10,7 @@
 namespace spslam {
 
 constexpr int kPoseSize = 7;  // unit quaternion (w, x, y, z), translation (m)
-// cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean robust weight over all pixels
+// cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean judging weight over all pixels
 constexpr int kTrackingStatSize = 5;
 
 // A small grey image of an earlier frame, which tracking compares colours with; none where height is 0.
@@ -28,6 +28,7 @@ struct TrackingOptions {
   std::int64_t num_pixels, iterations;
   float truncation;                // m
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
+  float kernel_judge;              // m, width of the kernel of cost and mean weight; 0: the iteration's own
   double damping;
   PhiloxKey key;      // its iteration is replaced by the running one
   float noise_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
