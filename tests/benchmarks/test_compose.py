@@ -7,8 +7,8 @@ import torch
 
 from benchmarks.compose import OPS, TORCH, compose_render_step
 from spslam import ops
-from tests.ops.scenes import make_scene
-from tests.ops.test_render_step import OPTIONS, _gradients, _rays
+from tests.ops.scenes import OPTIONS, make_scene
+from tests.ops.step_inputs import gradient_buffers, noisy_rays
 from tests.reference.render_step import render_step
 
 # Both are float64; they differ in the rounding of 1 / cell size, once.
@@ -23,11 +23,11 @@ def _double(gradients):
 @pytest.mark.parametrize("compact", [False, True])
 @pytest.mark.parametrize("change", [{}, dict(cosine_targets=False), dict(weight_rgb=0.0)], ids=str)
 def test_equals_the_reference(parts, compact, change, device, generator):
-    scene, rays = make_scene(generator, random_decoder=True, device=device), _rays(generator, device=device)
+    scene, rays = make_scene(generator, random_decoder=True, device=device), noisy_rays(generator, device=device)
     options = replace(OPTIONS, **change)
     want_losses, want = render_step(scene, rays, options)
     want_losses[1] *= options.weight_rgb > 0
-    gradients = _double(_gradients(scene))
+    gradients = _double(gradient_buffers(scene))
     step = compose_render_step(scene, rays, options, gradients, parts, compact, torch.float64)
     torch.testing.assert_close(step.losses.cpu(), want_losses, rtol=TOLERANCE, atol=TOLERANCE)
     got = dict(
@@ -49,18 +49,18 @@ def test_equals_the_reference(parts, compact, change, device, generator):
 
 @pytest.mark.parametrize("parts", [OPS, TORCH])
 def test_frozen_parts_get_no_gradient(parts, device, generator):
-    scene, rays = make_scene(generator, random_decoder=True, device=device), _rays(generator, device=device)
+    scene, rays = make_scene(generator, random_decoder=True, device=device), noisy_rays(generator, device=device)
     tracking = compose_render_step(scene, rays, OPTIONS, None, parts)
     assert tracking.grad_geometry is None and tracking.grad_color is None
     fused = ops.render_step(scene, rays, replace(OPTIONS, precision="fp32"))
     torch.testing.assert_close(tracking.losses, fused.losses, rtol=1e-4, atol=1e-6)
     mapping = compose_render_step(
-        scene, rays, replace(OPTIONS, pose_gradient=False), replace(_gradients(scene), embeddings=None), parts
+        scene, rays, replace(OPTIONS, pose_gradient=False), replace(gradient_buffers(scene), embeddings=None), parts
     )
     assert mapping.grad_poses is None and mapping.grad_geometry is None and mapping.grad_color is not None
 
 
 def test_no_rays(device, generator):
-    scene, rays = make_scene(generator, random_decoder=True, device=device), _rays(generator, device=device)
+    scene, rays = make_scene(generator, random_decoder=True, device=device), noisy_rays(generator, device=device)
     none = replace(rays, pixels=rays.pixels[:0], ray_frames=rays.ray_frames[:0])
-    assert not compose_render_step(scene, none, OPTIONS, _gradients(scene), OPS).losses.any()
+    assert not compose_render_step(scene, none, OPTIONS, gradient_buffers(scene), OPS).losses.any()
