@@ -124,4 +124,13 @@ class LaunchGraph {
   int device_ = -1, builds_ = 0;
 };
 
+// As the graph if there is one to keep them in, else one after the other.
+inline void run_launches(const KernelLaunches& launches, LaunchGraph* graph, cudaStream_t stream) {
+  if (graph) {
+    graph->run(launches, stream);
+  } else {
+    run_launches(launches, stream);
+  }
+}
+
 }  // namespace spslam

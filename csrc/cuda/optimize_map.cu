@@ -118,13 +118,8 @@ std::int64_t optimize_map_workspace_size(Cuda device, const MapOptimization& cal
 template <>
 void optimize_map(Cuda device, const MapOptimization& call, void* workspace, LaunchGraph* graph) {
   if (!fused_covers(call)) return OptimizeMapLaunch<Cuda>(device, call, workspace).run();
-  const KernelLaunches launches = MapLaunches(call, FusedMapBuffers(workspace, call)).all();
-  const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
-  if (graph) {
-    graph->run(launches, stream);
-  } else {
-    run_launches(launches, stream);
-  }
+  run_launches(MapLaunches(call, FusedMapBuffers(workspace, call)).all(), graph,
+               static_cast<cudaStream_t>(device.stream));
 }
 
 }  // namespace spslam

@@ -112,13 +112,8 @@ std::int64_t track_adam_workspace_size(Cuda device, const PoseTracking& call) {
 template <>
 void track_adam(Cuda device, const PoseTracking& call, void* workspace, LaunchGraph* graph) {
   if (!fused::covers(call.scene, call.options)) return TrackAdamLaunch<Cuda>(device, call, workspace).run();
-  const KernelLaunches launches = fused_launches(call, FusedTrackBuffers(workspace, call));
-  const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
-  if (graph) {
-    graph->run(launches, stream);
-  } else {
-    run_launches(launches, stream);
-  }
+  run_launches(fused_launches(call, FusedTrackBuffers(workspace, call)), graph,
+               static_cast<cudaStream_t>(device.stream));
 }
 
 }  // namespace spslam
