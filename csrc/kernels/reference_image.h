@@ -26,9 +26,11 @@ SPS_INLINE ReferenceView load_reference(const ReferenceImage& image) {
   return {image, image.height > 0 ? load_pose(image.pose) : Pose<float>{}};
 }
 
-// Rec. 601 luma of a colour in [0, 1].
+// Intensity of a colour in [0, 1].
 SPS_INLINE float luma(const float* color) {
-  return 0.299f * color[0] + 0.587f * color[1] + 0.114f * color[2];
+  constexpr float kRed = kLumaWeights[0] / 1000.0f, kGreen = kLumaWeights[1] / 1000.0f,
+                  kBlue = kLumaWeights[2] / 1000.0f;
+  return kRed * color[0] + kGreen * color[1] + kBlue * color[2];
 }
 
 struct ReferenceCorner {

@@ -4,7 +4,13 @@ from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_n
 from spslam.ops.covisibility import frame_overlap, select_covisible_frames
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
-from spslam.ops.gauss_newton import ReferenceImage, gauss_newton_poses, predict_pose, track_gauss_newton
+from spslam.ops.gauss_newton import (
+    LUMA_WEIGHTS,
+    ReferenceImage,
+    gauss_newton_poses,
+    predict_pose,
+    track_gauss_newton,
+)
 from spslam.ops.hash_table import VoxelHash, VoxelLimitError
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.launch_graph import LaunchGraph
@@ -33,6 +39,7 @@ __all__ = [
     "CPU_ISA",
     "CUDA_OFF_REASON",
     "ENCODER_PARAMETERS",
+    "LUMA_WEIGHTS",
     "Activation",
     "AdamMoments",
     "AdamTable",

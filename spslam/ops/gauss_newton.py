@@ -17,6 +17,9 @@ from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
+# What red, green and blue count for in a reference's intensity (Rec. 601), in thousandths; the kernel's own.
+LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
+
 
 def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     """The pose after two given ones if the camera goes on as it went, T1 T0^-1 T1; reads nothing back to the host.
@@ -46,8 +49,8 @@ class ReferenceImage(NamedTuple):
     """A small grey image of an earlier frame, to compare colours with.
 
     Attributes:
-        cells: float32 [H, W, 2] intensity in [0, 1] (0.299 r + 0.587 g + 0.114 b) and depth (m, 0 where unknown). A
-            point is compared where it falls between four cells whose depth agrees with its own to a tenth.
+        cells: float32 [H, W, 2] intensity in [0, 1] (`LUMA_WEIGHTS`) and depth (m, 0 where unknown). A point is
+            compared where it falls between four cells whose depth agrees with its own to a tenth.
         pose: float32 [7] T_world_camera of the frame, unit quaternion (w, x, y, z) and translation (m).
         intrinsics: in cells: those of s x s pixels have focal lengths f / s and principal point (c + 1/2) / s - 1/2.
         weight: m that an intensity difference of 1 counts as.

@@ -7,8 +7,7 @@ from spslam.camera import Camera
 from spslam.slam.cell_grid import CellGrid
 from spslam.slam.pixels import unpack_points
 
-LUMA = (299, 587, 114)  # thousandths of red, green, blue: Rec. 601
-LUMA_OF_WHITE = 255 * sum(LUMA)
+LUMA_OF_WHITE = 255 * sum(ops.LUMA_WEIGHTS)
 DEPTH_STEP_M = 1e-4
 
 
@@ -34,8 +33,9 @@ def reference_cells(records: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 def _luma(records: torch.Tensor) -> torch.Tensor:
-    red, green, blue = ((records[:, 2] >> shift) & 0xFF for shift in (0, 8, 16))
-    return LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+    channels = ((records[:, 2] >> shift) & 0xFF for shift in (0, 8, 16))
+    red, green, blue = (weight * channel for weight, channel in zip(ops.LUMA_WEIGHTS, channels, strict=True))
+    return red + green + blue
 
 
 def _depth_steps(records: torch.Tensor, camera: Camera) -> torch.Tensor:

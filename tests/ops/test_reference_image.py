@@ -143,6 +143,24 @@ def test_colour_equations_are_those_of_autograd(device, generator):
     assert stats[0, [0, 1, 4]].tolist() == [0, 0, 0]
 
 
+def test_colours_count_by_their_luma(device, generator):
+    """Rec. 601's: a colour of the same luma as a grey gives the same equations."""
+    assert ops.LUMA_WEIGHTS == (299, 587, 114)
+    red, green, blue = 11, 1, -34  # that weigh nothing together
+    grey = _painted(corner_pixels(POSE, generator, 400))
+    level = grey[:, 2] & 0xFF
+    coloured = torch.stack([grey[:, 0], grey[:, 1], (level + red) | (level + green) << 8 | (level + blue) << 16], 1)
+    reference, scene = _reference(moved_pose(POSE, 0.01, 0.03), device), ops.SceneView.empty(device=device)
+    (pose, _, hessian), (want_pose, _, want) = (
+        ops.track_gauss_newton(
+            scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, reference=reference
+        )
+        for records in (coloured, grey)
+    )
+    torch.testing.assert_close(pose, want_pose, rtol=0, atol=1e-6)
+    assert torch.allclose(hessian, want, rtol=0, atol=1e-5 * float(want.abs().max()))
+
+
 def test_colours_alone_find_the_pose(device, generator):
     """Three painted walls, of which nothing is mapped."""
     reference = _reference(POSE, device)

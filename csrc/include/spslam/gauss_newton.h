@@ -13,6 +13,10 @@ constexpr int kPoseSize = 7;  // unit quaternion (w, x, y, z), translation (m)
 // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean judging weight over all pixels
 constexpr int kTrackingStatSize = 5;
 
+// What red, green and blue count for in an intensity (Rec. 601), in thousandths: whole numbers, so that means over many
+// pixels can be summed exactly. Python reads them by the op luma_weights.
+constexpr std::int64_t kLumaWeights[3] = {299, 587, 114};
+
 // A small grey image of an earlier frame, which tracking compares colours with; none where height is 0.
 struct ReferenceImage {
   const float* cells;  // [height, width, 2] intensity in [0, 1], depth (m; 0 where unknown)
