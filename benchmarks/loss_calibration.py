@@ -21,6 +21,7 @@ from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.geometry import rotation_angle
 from spslam.options import PRESETS
+from spslam.slam.likeness import POINTS, brightness_sums, likeness
 from spslam.slam.loss_decision import JUMP_CM, JUMP_DEG, LEAST_INFORMATION, MOST_CONFLICT, Fit
 from spslam.slam.past import surface_shares
 from spslam.slam.pixels import FramePixels, sample_frame
@@ -31,7 +32,7 @@ from spslam.slam.tracker import Tracker
 
 EVERY, FIRST, STARTS = 3, 6, 5  # frames whose wrong starts are tried, from which frame on, and how many
 WRONG_CM, WRONG_DEG = 6.0, 4.0
-COLUMNS = ("support", "information", "jump_cm", "jump_deg", "conflict")
+COLUMNS = ("support", "information", "jump_cm", "jump_deg", "conflict", "likeness")
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 RIDGE = 3e-3
 
@@ -73,12 +74,14 @@ def measure(args: argparse.Namespace) -> dict[str, np.ndarray]:
 def fit_from(
     system: SlamSystem, tracker: Tracker, pixels: FramePixels, start: torch.Tensor, number: int
 ) -> tuple[Fit, np.ndarray]:
-    """What tracking makes of a start alone, with its conflict, and the pose."""
+    """What tracking makes of a start alone, with its conflict and likeness, and the pose."""
     result = tracker.track(system.state.scene, pixels, start, number)
     alignment = IcpAlignment(pixels, system.camera)
     counts = system.past.surface_counts(alignment.vertices, alignment.intrinsics, result.pose)
     conflict, hidden = surface_shares(*counts.tolist())
-    return replace(result.fit, conflict=conflict, hidden=hidden), matrix(result.pose)
+    sums = brightness_sums(system.state.scene, pixels.records[:POINTS], result.pose, system.camera)
+    fit = replace(result.fit, conflict=conflict, hidden=hidden, likeness=likeness(*sums.tolist()))
+    return fit, matrix(result.pose)
 
 
 def row(fit: Fit) -> list[float]:
@@ -93,9 +96,10 @@ def is_apart(pose: np.ndarray, other: np.ndarray) -> bool:
 
 
 def judge(right: np.ndarray, wrong: np.ndarray) -> None:
-    """Prints the doubt of both at the first look, with conflict, and after a loss; and fitted coefficients."""
+    """Prints the doubt of both at the first look, at the second, and after a loss; and fitted coefficients."""
     print(f"{len(right)} right poses, {len(wrong)} wrong ones")
-    looks = {"first look": {"conflict": math.nan}, "with conflict": {}, "after loss": {"jump_cm": math.nan}}
+    unseen = {"conflict": math.nan, "likeness": math.nan}
+    looks = {"first look": unseen, "second look": {}, "after loss": {"jump_cm": math.nan}}
     for name, unknown in looks.items():
         doubts = [np.array([replace(as_fit(line), **unknown).doubt for line in table]) for table in (right, wrong)]
         quantiles = " ".join(f"{value:.3f}" for value in np.quantile(doubts[0], QUANTILES))
@@ -113,7 +117,7 @@ def as_fit(line: np.ndarray) -> Fit:
 def coefficients(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
     """Logistic regression by Newton's method, both kinds of pose weighing the same, the slopes held back a little."""
     table = np.concatenate([right, wrong])
-    support, information, jump_cm, jump_deg, conflict = table.T
+    support, information, jump_cm, jump_deg, conflict = table.T[:5]
     jump = np.log1p(jump_cm / JUMP_CM + jump_deg / JUMP_DEG)
     lg = np.log10(np.maximum(information, LEAST_INFORMATION))
     features = np.stack([support, lg, jump, np.minimum(conflict, MOST_CONFLICT)], 1)

@@ -148,7 +148,7 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
     DatasetError
         When a frame before a fault is called lost, for then there is nothing to compare with, or no truth is known.
     """
-    truth = _true_poses(dataset)
+    truth = true_poses(dataset)
     system = SlamSystem(config, dataset.camera, truth[0], device)
     with tempfile.TemporaryDirectory() as folder:
         for trial in sorted(trials, key=lambda trial: trial.place):
@@ -157,24 +157,24 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
                     raise DatasetError(
                         f"{dataset.name}: frame {len(system.state.frames) - 1} of a clean run is called lost"
                     )
-            yield try_fault(_copy(system, truth[0], Path(folder) / "state"), dataset, trial)
+            yield try_fault(copy_of(system, truth[0], Path(folder) / "state"), dataset, trial)
 
 
 def try_fault(system: SlamSystem, dataset: RgbdDataset, trial: Trial) -> Outcome:
     """One trial on a system that has seen `trial.place` frames; it is used up."""
-    random, truth = np.random.default_rng(trial.seed), _true_poses(dataset)
+    random, truth = np.random.default_rng(trial.seed), true_poses(dataset)
     voxels = system.state.scene.volume.num_voxels
     lost, wrong = [], []
     for shown in trial.during:
         report = system.process(_spoilt(dataset, shown, random))
-        apart_cm, apart_deg = _apart(system.state.frames.matrices(-1)[0], _expected(system, truth, trial, shown.index))
+        apart_cm, apart_deg = _error(system, truth, trial.place, shown.index)
         lost.append(report.lost)
         wrong.append(shown.change is not None or apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
     added = system.state.scene.volume.num_voxels - voxels if any(wrong) else 0
     errors = []
     for shown in trial.back:
         report = system.process(_spoilt(dataset, shown, random))
-        apart_cm, apart_deg = _apart(system.state.frames.matrices(-1)[0], _expected(system, truth, trial, shown.index))
+        apart_cm, apart_deg = _error(system, truth, trial.place, shown.index)
         lost.append(report.lost)
         wrong.append(apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
         errors.append(np.inf if report.lost or apart_deg > FOUND_DEG else apart_cm)
@@ -200,31 +200,47 @@ def _spoilt(dataset: RgbdDataset, shown: Shown, random: np.random.Generator) -> 
     return frame
 
 
-def _expected(system: SlamSystem, truth: np.ndarray, trial: Trial, index: int) -> np.ndarray:
+def _error(system: SlamSystem, truth: np.ndarray, place: int, index: int) -> tuple[float, float]:
+    """Distance (cm) and angle (degrees) of the last frame's pose from where the map has the camera of a frame."""
+    return apart(system.state.frames.matrices(-1)[0], expected_pose(system, truth, place, index))
+
+
+def expected_pose(system: SlamSystem, truth: np.ndarray, place: int, index: int) -> np.ndarray:
     """Where the map has the camera of a frame: carried by the true motion from the mapped frame that is nearest to it.
 
     So neither drift of the map nor error of the truth over longer ways takes part.
+
+    Args:
+        system: that has seen `place` frames of the run.
+        truth: float64 [F, 4, 4] of the data set.
+        place: rows of the run.
+        index: of the frame in the data set.
+
+    Returns:
+        float64 [4, 4] T_world_camera.
     """
-    mapped = truth[: STEP * trial.place : STEP]
+    mapped = truth[: STEP * place : STEP]
     turned = rotation_angle(np.swapaxes(mapped[:, :3, :3], 1, 2) @ truth[index, :3, :3])
     nearest = int(np.argmin(np.linalg.norm(mapped[:, :3, 3] - truth[index, :3, 3], axis=1) + turned))
     return system.state.frames.matrices()[nearest] @ inverse(mapped[nearest]) @ truth[index]
 
 
-def _apart(pose: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+def apart(pose: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     """Distance (cm) and angle (degrees) between two poses [4, 4]."""
     angle = rotation_angle(pose[:3, :3].T @ other[:3, :3])
     return 100 * float(np.linalg.norm(pose[:3, 3] - other[:3, 3])), float(np.degrees(angle))
 
 
-def _true_poses(dataset: RgbdDataset) -> np.ndarray:
+def true_poses(dataset: RgbdDataset) -> np.ndarray:
+    """float64 [F, 4, 4]; a `DatasetError` where they are not known."""
     poses = dataset.poses()
     if poses is None:
         raise DatasetError(f"{dataset.name}: must have true poses to try faults on, got none")
     return poses
 
 
-def _copy(system: SlamSystem, first_pose: np.ndarray, path: Path) -> SlamSystem:
+def copy_of(system: SlamSystem, first_pose: np.ndarray, path: Path) -> SlamSystem:
+    """A system with the same state, which goes by way of a file at `path`."""
     write_snapshot(path, take_snapshot(system.state, system.config, {}, copy=False))
     copy = SlamSystem(system.config, system.camera, first_pose, system.device)
     load_checkpoint(path, copy.state, copy.config)

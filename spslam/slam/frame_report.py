@@ -30,6 +30,7 @@ class FrameReport:
         conflict: share of the surface other frames know that it looks through; None where that was not asked.
         hidden: share of that surface that something nearer hides; None where that was not asked.
         coverage: share of the last trusted frame's pixels on mapped surface; None where that was not asked.
+        likeness: correlation of its brightness with the map's colours; None where that was not asked, or is not known.
         doubt: probability from these that its pose is wrong; None where it was not tracked.
         rescued: whether its pose comes from a start that projective ICP found.
         relocalised: whether that start was a stored frame that looks alike.
@@ -60,6 +61,7 @@ class FrameReport:
     conflict: float | None
     hidden: float | None
     coverage: float | None
+    likeness: float | None
     doubt: float | None
     rescued: bool
     relocalised: bool

@@ -1,16 +1,17 @@
 """Whether a pose is to be trusted: the odds that it is wrong, from all that its fit to the map says.
 
-A logistic model of four measures, fitted to right poses of clean runs and to what tracking makes of wrong starts
+A logistic model of five measures, fitted to right poses of clean runs and to what tracking makes of wrong starts
 (docs/loss.md has the figures and the command):
 
-    ln odds = -7.3 - 10 support - 2.1 lg(information) + 3.6 jump + 23 conflict
+    ln odds = -7.3 - 10 support - 2.1 lg(information) + 3.6 jump + 23 conflict + 20 max(0.25 - likeness, 0)
 
 support is the mean robust weight of the frame's pixels by a kernel of 2 cm, whatever width tracking ends with;
 information the smallest eigenvalue of the normal equations a pixel, scaled as if by those weights (how well the worst
 direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5 degrees) from where the
 motion model put the camera, conflict the share of the surface known from other frames that it would have to look
 through. Support counts for more on a map with holes, as small images or few points leave it, and information below
-0.002, the least of clean runs, twice as much.
+0.002, the least of clean runs, twice as much. likeness is the correlation of the picture's brightness with that of the
+map's colours; right poses have 0.26 or more, and only less counts.
 What is not known takes part as a number between right and wrong.
 """
 
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 CONSTANT, PER_SUPPORT, PER_INFORMATION, PER_JUMP, PER_CONFLICT = -7.3, -10.0, -2.1, 3.6, 23.0
+PER_UNLIKENESS, LEAST_LIKENESS = 20.0, 0.25  # or more, of right poses
 JUDGING_KERNEL_M = 0.02  # of the weights behind support and information
 JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
@@ -44,6 +46,7 @@ class Fit:
         hidden: share of it that something nearer hides from the frame; no sign of a wrong pose.
         coverage: share of the last trusted frame's pixels on mapped surface. Where images are small or points are few
             the map has holes, and no pose has more support than this.
+        likeness: correlation of the brightness of its pixels with the map's colours.
     """
 
     residual_cm: float = math.nan
@@ -55,6 +58,7 @@ class Fit:
     conflict: float = math.nan
     hidden: float = math.nan
     coverage: float = math.nan
+    likeness: float = math.nan
 
     @property
     def is_obstructed(self) -> bool:
@@ -73,6 +77,7 @@ class Fit:
             + PER_INFORMATION * self._lg_information
             + PER_JUMP * (UNKNOWN_JUMP if math.isnan(jump) else jump)
             + PER_CONFLICT * (UNKNOWN_CONFLICT if math.isnan(self.conflict) else min(self.conflict, MOST_CONFLICT))
+            + PER_UNLIKENESS * self._unlikeness
         )
         return 1 / (1 + math.exp(-odds))
 
@@ -81,6 +86,11 @@ class Fit:
         """The logarithm of the information, which falls twice as fast below that of any clean run."""
         lg = math.log10(max(self.information, LEAST_INFORMATION))
         return lg + min(lg - math.log10(FIRM_INFORMATION), 0.0)
+
+    @property
+    def _unlikeness(self) -> float:
+        """What is missing of the least likeness of right poses."""
+        return 0.0 if math.isnan(self.likeness) else max(LEAST_LIKENESS - self.likeness, 0.0)
 
     @property
     def _support_of_covered(self) -> float:

@@ -261,12 +261,12 @@ def _lattice_points(lattices: torch.Tensor, camera: Camera) -> tuple[torch.Tenso
 
 def _in_camera(points: torch.Tensor, poses: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     """Points [F, N, 3] of cameras at `poses` [F, 7] in the axes of the one at `pose` [7]."""
-    world = points @ _rotations(poses[:, :4]).transpose(1, 2) + poses[:, None, 4:]
-    return (world - pose[4:]) @ _rotations(pose[None, :4])
+    world = points @ rotations(poses[:, :4]).transpose(1, 2) + poses[:, None, 4:]
+    return (world - pose[4:]) @ rotations(pose[None, :4])
 
 
-def _rotations(quaternions: torch.Tensor) -> torch.Tensor:
-    """Matrices [F, 3, 3] of unit quaternions [F, 4]: v + 2 w (q x v) + 2 q x (q x v) for the axes v."""
+def rotations(quaternions: torch.Tensor) -> torch.Tensor:
+    """Matrices [F, 3, 3] of unit quaternions (w, x, y, z) [F, 4]: v + 2 w (q x v) + 2 q x (q x v) for the axes v."""
     w, q = quaternions[:, :1, None], quaternions[:, 1:]
     axes = torch.eye(3, dtype=q.dtype, device=q.device).expand(len(q), 3, 3)
     once = torch.linalg.cross(q[:, None].expand_as(axes), axes)

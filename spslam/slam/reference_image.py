@@ -23,16 +23,17 @@ def reference_cells(records: torch.Tensor, camera: Camera) -> torch.Tensor:
         takes them; sums of integers, so the same on every run.
     """
     grid = CellGrid.of(camera)
-    values = torch.stack([torch.ones_like(records[:, 0]), _luma(records), _depth_steps(records, camera)], 1)
+    values = torch.stack([torch.ones_like(records[:, 0]), luma(records), _depth_steps(records, camera)], 1)
     sums = records.new_zeros(grid.rows * grid.columns, 3, dtype=torch.int64)
     sums.index_add_(0, grid.cells(records), values.long())
-    count, luma, depth = sums.double().unbind(1)
+    count, brightness, depth = sums.double().unbind(1)
     count = count.clamp(min=1)
-    cells = torch.stack([luma / (count * LUMA_OF_WHITE), depth * (DEPTH_STEP_M / count)], 1)
+    cells = torch.stack([brightness / (count * LUMA_OF_WHITE), depth * (DEPTH_STEP_M / count)], 1)
     return cells.float().view(grid.rows, grid.columns, 2)
 
 
-def _luma(records: torch.Tensor) -> torch.Tensor:
+def luma(records: torch.Tensor) -> torch.Tensor:
+    """Brightness of packed pixels int32 [P, 3], in units of which white has `LUMA_OF_WHITE`: int32 [P]."""
     channels = ((records[:, 2] >> shift) & 0xFF for shift in (0, 8, 16))
     red, green, blue = (weight * channel for weight, channel in zip(ops.LUMA_WEIGHTS, channels, strict=True))
     return red + green + blue

@@ -113,6 +113,7 @@ class SlamSystem:
             "conflict": _known(tracked.fit.conflict),
             "hidden": _known(tracked.fit.hidden),
             "coverage": _known(tracked.fit.coverage),
+            "likeness": _known(tracked.fit.likeness),
             "doubt": _known(tracked.fit.doubt),
             "rescued": tracked.rescued,
             "relocalised": tracked.relocalised,

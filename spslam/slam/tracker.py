@@ -11,11 +11,12 @@ from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.loss_decision import JUDGING_KERNEL_M, Fit, information, jump
 from spslam.slam.optimization import render_options
-from spslam.slam.past import Past, surface_shares
+from spslam.slam.past import Past
 from spslam.slam.pixels import FramePixels
 from spslam.slam.reference_image import ReferenceKeeper
 from spslam.slam.rescue import IcpAlignment
 from spslam.slam.state import FrameTable
+from spslam.slam.verifier import Verifier
 
 AGREEING = 4  # frames in a row whose likely poses agree are found
 AGREE_CM, AGREE_DEG = 5.0, 4.0  # from one frame to the next
@@ -56,6 +57,7 @@ class Tracker:
         self.camera = camera
         self.intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self._graph = ops.LaunchGraph()
+        self._verifier = Verifier(config, camera)
         weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
         self._references = ReferenceKeeper(camera, weight_m, kernel) if weight_m > 0 else None
         self._reference: ops.ReferenceImage | None = None
@@ -216,13 +218,13 @@ class Tracker:
         best = self._best(scene, pixels, starts, start, frame, best)
         # After lost frames whose poses agree, the way to where the camera was is not that from the start.
         if past.frames_lost <= SHORT_LOSS and not past.agreeing:
-            best = self._verified(scene, alignment, past, best)
+            best = self._verified(scene, alignment, past, best, pixels.records)
             if not best.lost:
                 return best
         alike = past.similar(pixels, tracking.relocalise_frames)
         starts = [alignment.pose(other.frame, other.start) for other in alike]
         found = self._best(scene, pixels, starts, start, frame, best)
-        found = self._found_again(self._verified(scene, alignment, past, found), past)
+        found = self._found_again(self._verified(scene, alignment, past, found, pixels.records), past)
         return replace(found, relocalised=found.pose is not best.pose and not found.lost)
 
     def _best(
@@ -244,29 +246,17 @@ class Tracker:
                 best = replace(again, rescued=True)
         return replace(best, iterations=iterations)
 
-    def _verified(self, scene: Scene, alignment: IcpAlignment, past: Past, result: TrackingResult) -> TrackingResult:
-        """The result, judged anew with what it would look through of other frames' surface, and the map's holes."""
-        counts = past.surface_counts(alignment.vertices, alignment.intrinsics, result.pose)
-        # A doubtful frame's second wait for the device.
-        seen, through, hidden, coverage = torch.cat([counts, self._coverage(scene, past)]).tolist()
-        conflict, hidden = surface_shares(seen, through, hidden)
-        fit = replace(result.fit, conflict=conflict, hidden=hidden, coverage=coverage)
+    def _verified(
+        self,
+        scene: Scene,
+        alignment: IcpAlignment,
+        past: Past,
+        result: TrackingResult,
+        records: torch.Tensor | None = None,
+    ) -> TrackingResult:
+        """The result, judged anew with what else is known; by its colours too where its pixel records are given."""
+        fit = self._verifier.verified(result.fit, result.pose, scene, alignment, past, records)
         return replace(result, fit=fit, lost=self._is_lost(fit))
-
-    def _coverage(self, scene: Scene, past: Past) -> torch.Tensor:
-        """Share of the last trusted frame's pixels on mapped surface, float32 [1]; NaN where there is no such frame."""
-        last, tracking = past.last(), self.config.tracking
-        if last is None:
-            return torch.full((1,), math.nan, device=scene.device)
-        _, _, _, inlier_share = ops.gauss_newton_poses(
-            scene.view(),
-            last.records[None, : tracking.pixels],
-            last.pose[None],
-            self.intrinsics,
-            truncation=scene.settings.truncation_m,
-            kernel=JUDGING_KERNEL_M,
-        )
-        return inlier_share
 
     def _found_again(self, result: TrackingResult, past: Past) -> TrackingResult:
         """The result, judged as that of a camera that may be anywhere: of all places some are always alike.

@@ -58,8 +58,8 @@ def test_a_report_is_done_with_the_frames_last_mark():
     known = {
         "frame": 3, "index": 4, "timestamp": 0.1, "lost": False, "valid_depth": 0.9, "tracking_iterations": 8,
         "residual_cm": 0.2, "inliers": 0.8, "support": 0.7, "information": 0.01, "jump_cm": 0.3,
-        "jump_deg": 0.2, "conflict": None, "hidden": None, "coverage": None, "doubt": 0.01, "rescued": False,
-        "relocalised": False, "mapping_iterations": 5, "voxels": 100, "decode_ms": 6.0,
+        "jump_deg": 0.2, "conflict": None, "hidden": None, "coverage": None, "likeness": None, "doubt": 0.01,
+        "rescued": False, "relocalised": False, "mapping_iterations": 5, "voxels": 100, "decode_ms": 6.0,
     }  # fmt: skip
     marks = mapped_frame(done=At(22, passed=False))
     pending = PendingReport(known, marks, 0.0, torch.tensor(0.25))

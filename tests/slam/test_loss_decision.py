@@ -22,11 +22,12 @@ def test_a_good_fit_leaves_no_doubt_and_a_bad_one_no_trust():
     assert Fit(1.2, 0.15, 0.06, 0.0005, 18.0, 5.0, 0.6).doubt > 0.999
 
 
-@pytest.mark.parametrize(
-    "worse", [{"support": 0.4}, {"information": 0.001}, {"jump_cm": 20.0}, {"jump_deg": 10.0}, {"conflict": 0.2}]
-)
-def test_each_measure_raises_the_doubt(worse):
-    assert replace(GOOD, **worse).doubt > 2 * GOOD.doubt
+WORSE = {"support": 0.4, "information": 0.001, "jump_cm": 20.0, "jump_deg": 10.0, "conflict": 0.2, "likeness": 0.1}
+
+
+@pytest.mark.parametrize("measure", WORSE)
+def test_each_measure_raises_the_doubt(measure):
+    assert replace(GOOD, **{measure: WORSE[measure]}).doubt > 2 * GOOD.doubt
 
 
 def test_support_is_held_against_what_the_map_covers():
@@ -36,6 +37,15 @@ def test_support_is_held_against_what_the_map_covers():
     assert replace(sparse, coverage=0.0).doubt == sparse.doubt
     # A wrong pose has no more on a map with holes.
     assert replace(GOOD, support=0.05, information=0.0005, jump_cm=18.0, conflict=0.3, coverage=0.4).doubt > 0.99
+
+
+def test_no_likeness_of_right_poses_makes_a_difference():
+    for likeness in (0.26, 0.9, math.nan):
+        assert replace(GOOD, likeness=likeness).doubt == GOOD.doubt
+    # A plain thing before the lens that fits a wall.
+    wall = Fit(1.0, 0.95, 0.8, 0.002, math.nan, math.nan, 0.002)
+    assert wall.doubt < 0.02
+    assert replace(wall, likeness=0.0).doubt > 0.5
 
 
 def test_what_is_not_known_lies_between_right_and_wrong():
