@@ -40,6 +40,7 @@ from spslam.options import PRESETS
 from spslam.slam.loss_decision import Fit
 from spslam.slam.pixels import sample_frame
 from spslam.slam.system import SlamSystem
+from spslam.slam.tracker import AGREEING_DOUBT
 
 PLACES, FIRST_PLACE = 4, 0.25  # of the sequence
 LOST_FRAMES = 6
@@ -60,8 +61,8 @@ def main() -> None:
         table = np.concatenate([np.load(path)["table"] for path in args.saved])
     if args.save:
         np.savez(args.save, table=table)
-    tracking = load_config(args.config, args.preset, args.set).tracking
-    judge(table, (tracking.relocalise_below, tracking.doubtful_above))
+    at_once = load_config(args.config, args.preset, args.set).tracking.relocalise_below
+    judge(table, (at_once, AGREEING_DOUBT))
 
 
 def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:

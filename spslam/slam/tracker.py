@@ -20,7 +20,8 @@ from spslam.slam.verifier import Verifier
 
 AGREEING = 4  # frames in a row whose likely poses agree are found
 AGREE_CM, AGREE_DEG = 5.0, 4.0  # from one frame to the next
-AGREEING_INFORMATION = 0.004  # of each: a plane agrees with itself wherever it is laid
+AGREEING_DOUBT = 0.1  # of each at most
+AGREEING_INFORMATION = 0.004  # of each at least: a plane agrees with itself wherever it is laid
 MAPPED_SUPPORT = 0.7  # a frame to be mapped that has less may have something before the lens
 SHORT_LOSS = 5  # frames: for as long the camera cannot be far from where it was
 RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
@@ -269,7 +270,7 @@ class Tracker:
         fit = replace(result.fit, jump_cm=math.nan, jump_deg=math.nan)
         if fit.doubt <= tracking.relocalise_below and not self._is_lost(fit):
             return replace(result, fit=fit, lost=False, agreeing=0)
-        likely = fit.doubt <= tracking.doubtful_above and fit.information >= AGREEING_INFORMATION
+        likely = fit.doubt <= AGREEING_DOUBT and fit.information >= AGREEING_INFORMATION
         agreeing = int(likely and not self._is_lost(fit)) * (1 + past.agreeing * int(agrees))
         if agreeing >= AGREEING:
             return replace(result, fit=fit, lost=False, agreeing=0)
