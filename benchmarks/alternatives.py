@@ -3,6 +3,7 @@
 python -m benchmarks.alternatives --device cpu --threads 2
 python -m benchmarks.alternatives --cpu-time     on a machine that others use: the CPU time of one thread
 python -m benchmarks.alternatives --device cuda  by the wall clock, launches included, and by the GPU's clock
+python -m benchmarks.alternatives --op mlp       one of them
 """
 
 import functools
@@ -140,31 +141,46 @@ def clocks_of(device: torch.device, rounds: int, clock: Callable[[], float]) -> 
     return clocks
 
 
-def main() -> None:
-    parser = timing.arguments("ops against their best alternatives")
-    parser.add_argument(
-        "--cpu-time", action="store_true", help="time of one CPU thread, whatever else the machine does"
-    )
-    args = parser.parse_args()
-    device = torch.device(args.device)
-    timing.use_threads(1 if args.cpu_time else args.threads)
-    clocks = clocks_of(device, args.rounds, time.process_time if args.cpu_time else time.perf_counter)
-    generator = torch.Generator().manual_seed(0)
+def measured(generator: torch.Generator, device: torch.device, clocks: Clocks, op: str) -> list[dict[str, object]]:
+    """The rows of all ops whose name contains `op`."""
     rows: list[dict[str, object]] = []
     for name, contenders, differentiable in suites(generator, device):
+        if op not in name:
+            continue
         forward = {key: composable.forward(*pair) for key, pair in contenders.items()}
         rows += rows_of(name, "forward", forward, clocks)
         if differentiable:
             both = {key: composable.forward_and_backward(*pair, differentiable) for key, pair in contenders.items()}
             rows += rows_of(name, "forward + backward", both, clocks)
-    named = {
+    for name, functions in without_gradient(generator, device).items():
+        if op in name:
+            rows += rows_of(name, "forward", functions, clocks)
+    return rows
+
+
+def without_gradient(generator: torch.Generator, device: torch.device) -> dict[str, dict[str, Callable]]:
+    """The ops that are not differentiable, with their alternatives."""
+    return {
         f"sparse_adam_, {map_ops.TOUCHED} of {map_ops.ROWS} rows": map_ops.adam(generator, device),
         "normal equations and solution": map_ops.gauss_newton_step(generator, device),
         **map_ops.hash_contenders(generator, device),
         "marching_cubes, sphere in 256^3": map_ops.marching_cubes(device),
     }
-    for name, functions in named.items():
-        rows += rows_of(name, "forward", functions, clocks)
+
+
+def main() -> None:
+    parser = timing.arguments("ops against their best alternatives")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="time of one CPU thread, whatever else the machine does"
+    )
+    parser.add_argument("--op", default="", help="only ops whose name contains this")
+    args = parser.parse_args()
+    device = torch.device(args.device)
+    timing.use_threads(1 if args.cpu_time else args.threads)
+    clocks = clocks_of(device, args.rounds, time.process_time if args.cpu_time else time.perf_counter)
+    rows = measured(torch.Generator().manual_seed(0), device, clocks, args.op)
+    if not rows:
+        parser.error(f"argument --op: no op's name contains {args.op}")
     timing.report(f"{room.FRAMES} frames, {composable.RAYS} rays", rows, device, args.json)
 
 

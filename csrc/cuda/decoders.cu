@@ -1,104 +1,137 @@
-// One thread a unit: layer after layer through global memory.
-#include "core/for_each.h"
-#include "kernels/decoders.h"
+// One kernel for all layers, a tile of rows a block, where the network fits into a block's shared memory; else one
+// layer after the other.
+#include "core/cuda_check.cuh"
+#include "cuda/fused/column_sums.cuh"
+#include "cuda/mlp_layers.cuh"
+#include "cuda/mlp_tile.cuh"
 
 namespace spslam {
 namespace {
 
-// Samples whose parameter gradients one thread adds up, and the most partial sums a parameter has.
-constexpr std::int64_t kMinGradientChunk = 256, kMaxGradientChunks = 256;
+using namespace mlp_tile;
 
-std::int64_t gradient_chunk(std::int64_t n) {
-  const std::int64_t share = chunk_count(n, kMaxGradientChunks);
-  return share > kMinGradientChunk ? share : kMinGradientChunk;
-}
+constexpr int kMaxThreads = kMaxWarps * kWarp;
+// Some blocks on each processor of an H100; fewer where each leaves sums to be added up.
+constexpr std::int64_t kMaxBlocks = 1056, kMaxGradientBlocks = 396;
 
-// out[n, o] = relu or activation of w[o] . x[n] + b[o]
 template <class T>
-void layer(Cuda device, std::int64_t n, const T* x, std::int64_t inputs, const T* w, const T* b, std::int64_t outputs,
-           bool rectify, MlpActivation activation, T* out) {
-  for_each(device, n * outputs, [=] __device__(std::int64_t i) {
-    const std::int64_t row = i / outputs, o = i % outputs;
-    const T y = unit(w + o * inputs, x + row * inputs, inputs, b[o]);
-    out[i] = rectify ? rectified(y) : activate(activation, y);
-  });
-}
+struct Network {
+  Layout layout;
+  MlpActivation activation;
+  const T* params;
+  const T* input;
+  std::int64_t n;
 
-// out[n, i] = sum_o g[n, o] w[o, i], through the ReLU before it where `active` is given.
-template <class T>
-void layer_backward(Cuda device, std::int64_t n, const T* g, std::int64_t outputs, const T* w, std::int64_t inputs,
-                    const T* active, T* out) {
-  for_each(device, n * inputs, [=] __device__(std::int64_t i) {
-    const std::int64_t row = i / inputs, column = i % inputs;
-    const T grad = input_gradient(g + row * outputs, w + column, outputs, inputs);
-    out[i] = active ? rectified_gradient(active[i], grad) : grad;
-  });
-}
-
-// Partial gradients of a layer's weights and biases: thread (chunk, o, i) sums over the samples of a chunk, in order.
-template <class T>
-void layer_weight_gradients(Cuda device, std::int64_t n, const T* g, std::int64_t outputs, const T* x,
-                            std::int64_t inputs, std::int64_t num_params, T* weights, T* biases) {
-  const std::int64_t chunk = gradient_chunk(n), columns = inputs + 1;
-  for_each(device, chunk_count(n, chunk) * outputs * columns, [=] __device__(std::int64_t i) {
-    const std::int64_t c = i / (outputs * columns), o = i / columns % outputs, column = i % columns;
-    const std::int64_t end = (c + 1) * chunk < n ? (c + 1) * chunk : n;
-    T sum = 0;
-    for (std::int64_t row = c * chunk; row < end; ++row) {
-      sum += g[row * outputs + o] * (column < inputs ? x[row * inputs + column] : T(1));
+  // Calls f(first row, rows) for each of the block's tiles.
+  template <class F>
+  __device__ void for_each_tile(const F& f) const {
+    const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * kRows<T>;
+    for (std::int64_t first = static_cast<std::int64_t>(blockIdx.x) * kRows<T>; first < n; first += stride) {
+      f(first, static_cast<int>(n - first < kRows<T> ? n - first : kRows<T>));
     }
-    T* out = column < inputs ? weights + o * inputs + column : biases + o;
-    out[c * num_params] = sum;
+  }
+};
+
+extern __shared__ __align__(kVectorBytes) unsigned char shared_memory[];
+
+template <class T>
+__global__ void __launch_bounds__(kMaxThreads) forward_kernel(const __grid_constant__ Network<T> network, T* out) {
+  const Layout& layout = network.layout;
+  Tile<T> tile(layout, shared_memory);
+  tile.load_network(network.params);
+  network.for_each_tile([&](std::int64_t first, int rows) {
+    tile.load_rows(network.input + first * layout.inputs(), rows);
+    tile.forward();
+    tile.store_outputs(network.activation, out + first * layout.outputs(), rows);
   });
+}
+
+// Sums of the block's tiles into a row of partials [blocks, num_params].
+template <class T>
+__global__ void __launch_bounds__(kMaxThreads)
+    backward_kernel(const __grid_constant__ Network<T> network, const T* grad, T* grad_input, T* partials) {
+  const Layout& layout = network.layout;
+  Tile<T> tile(layout, shared_memory);
+  tile.load_network(network.params);
+  tile.clear_sums();
+  network.for_each_tile([&](std::int64_t first, int rows) {
+    tile.load_rows(network.input + first * layout.inputs(), rows);
+    tile.forward();
+    tile.activation_backward(network.activation, grad + first * layout.outputs(), rows);
+    tile.backward(partials != nullptr, grad_input != nullptr);
+    if (grad_input) tile.store_input_gradients(grad_input + first * layout.inputs(), rows);
+  });
+  if (partials) tile.store_sums(partials + static_cast<std::int64_t>(blockIdx.x) * layout.num_params);
+}
+
+template <class T>
+__global__ void __launch_bounds__(fused::kSumThreads)
+    sum_kernel(const T* partials, int blocks, int num_params, T* grad_params) {
+  __shared__ T shared[fused::kSumWarps][kWarp];
+  const int column = blockIdx.x * kWarp + threadIdx.x % kWarp, last = num_params - 1;
+  const T sum = fused::sum_column(partials + (column < last ? column : last), num_params, blocks, shared);
+  if (threadIdx.x < kWarp && column < num_params) grad_params[column] = sum;
+}
+
+// Whether a tile, its network and, if asked for, their gradients find room, whatever the type of their elements.
+bool fits(const MlpShape& shape, bool gradients) {
+  constexpr std::int64_t kMaxWidth = 1024;
+  if (shape.input > kMaxWidth || shape.hidden > kMaxWidth || shape.output > kMaxWidth) return false;
+  int device = 0, available = 0;
+  SPS_CUDA_CHECK(cudaGetDevice(&device));
+  SPS_CUDA_CHECK(cudaDeviceGetAttribute(&available, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
+  return make_layout<double>(shape, gradients).template bytes<double>() <= available;
+}
+
+std::int64_t num_blocks(std::int64_t tiles, std::int64_t max_blocks) {
+  const std::int64_t rounds = chunk_count(tiles, max_blocks);
+  return rounds > 0 ? chunk_count(tiles, rounds) : 0;
+}
+
+template <class T, class... Arguments, class... Values>
+void launch(Cuda device, void (*kernel)(Network<T>, Arguments...), std::int64_t blocks, const Network<T>& network,
+            Values... values) {
+  if (blocks == 0) return;
+  const int bytes = network.layout.template bytes<T>();
+  SPS_CUDA_CHECK(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes));
+  kernel<<<static_cast<int>(blocks), network.layout.warps() * kWarp, bytes, static_cast<cudaStream_t>(device.stream)>>>(
+      network, values...);
 }
 
 }  // namespace
 
 template <>
 std::int64_t mlp_workspace_size(Cuda, const MlpShape& shape, std::int64_t n) {
-  return 2 * n * shape.hidden;
+  return fits(shape, false) ? 0 : mlp_layers::workspace_size(shape, n);
 }
 template <>
 std::int64_t mlp_backward_workspace_size(Cuda, const MlpShape& shape, std::int64_t n) {
-  return n * (4 * shape.hidden + shape.output) + chunk_count(n, gradient_chunk(n)) * shape.num_params();
+  if (!fits(shape, true)) return mlp_layers::backward_workspace_size(shape, n);
+  return num_blocks(chunk_count(n, kRows<double>), kMaxGradientBlocks) * shape.num_params();
 }
 
 template <class Device, class T>
 void mlp(Device device, const MlpShape& shape, const T* input, std::int64_t n, const T* params, T* workspace, T* out) {
-  const MlpOffsets at = shape.offsets();
-  T *h1 = workspace, *h2 = h1 + n * shape.hidden;
-  layer(device, n, input, shape.input, params + at.w1, params + at.b1, shape.hidden, true, shape.activation, h1);
-  layer(device, n, h1, shape.hidden, params + at.w2, params + at.b2, shape.hidden, true, shape.activation, h2);
-  layer(device, n, h2, shape.hidden, params + at.w3, params + at.b3, shape.output, false, shape.activation, out);
+  if (!fits(shape, false)) return mlp_layers::forward(device, shape, input, n, params, workspace, out);
+  const Network<T> network{make_layout<T>(shape, false), shape.activation, params, input, n};
+  launch(device, forward_kernel<T>, num_blocks(chunk_count(n, kRows<T>), kMaxBlocks), network, out);
 }
 
 template <class Device, class T>
 void mlp_backward(Device device, const MlpShape& shape, const T* grad, const T* input, std::int64_t n, const T* params,
                   T* workspace, T* grad_input, T* grad_params) {
-  const MlpOffsets at = shape.offsets();
-  const std::int64_t units = n * shape.hidden, num_params = shape.num_params();
-  T *h1 = workspace, *h2 = h1 + units, *g1 = h2 + units, *g2 = g1 + units, *g3 = g2 + units,
-    *partials = g3 + n * shape.output;
-  mlp(device, shape, input, n, params, workspace, g3);
-  for_each(device, n * shape.output,
-           [=] __device__(std::int64_t i) { g3[i] = grad[i] * activation_slope(shape.activation, g3[i]); });
-  layer_backward(device, n, g3, shape.output, params + at.w3, shape.hidden, h2, g2);
-  layer_backward(device, n, g2, shape.hidden, params + at.w2, shape.hidden, h1, g1);
-  if (grad_input) {
-    layer_backward(device, n, g1, shape.hidden, params + at.w1, shape.input, static_cast<const T*>(nullptr),
-                   grad_input);
+  if (!fits(shape, true)) {
+    return mlp_layers::backward(device, shape, grad, input, n, params, workspace, grad_input, grad_params);
   }
+  const Network<T> network{make_layout<T>(shape, true), shape.activation, params, input, n};
+  const std::int64_t blocks = num_blocks(chunk_count(n, kRows<T>), kMaxGradientBlocks);
+  T* partials = grad_params ? workspace : nullptr;
+  launch(device, backward_kernel<T>, blocks, network, grad, grad_input, partials);
   if (!grad_params) return;
-  layer_weight_gradients(device, n, g1, shape.hidden, input, shape.input, num_params, partials + at.w1,
-                         partials + at.b1);
-  layer_weight_gradients(device, n, g2, shape.hidden, h1, shape.hidden, num_params, partials + at.w2, partials + at.b2);
-  layer_weight_gradients(device, n, g3, shape.output, h2, shape.hidden, num_params, partials + at.w3, partials + at.b3);
-  const std::int64_t chunks = chunk_count(n, gradient_chunk(n));
-  for_each(device, num_params, [=] __device__(std::int64_t i) {
-    T sum = 0;
-    for (std::int64_t c = 0; c < chunks; ++c) sum += partials[c * num_params + i];
-    grad_params[i] = sum;
-  });
+  const int num_params = network.layout.num_params;
+  sum_kernel<<<static_cast<int>(chunk_count(num_params, kWarp)), fused::kSumThreads, 0,
+               static_cast<cudaStream_t>(device.stream)>>>(workspace, static_cast<int>(blocks), num_params,
+                                                           grad_params);
 }
 
 #define SPS_INSTANTIATE_DECODERS(T)                                                            \

@@ -41,9 +41,9 @@ __global__ void __launch_bounds__(fused::kSumThreads) finish_kernel(const __grid
   __shared__ float shared[kSumWarps][kWarp];
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, unit = blockIdx.x;
   if (unit < kColumnUnits) {
-    const float sum = sum_column(a.partials, a.blocks, unit, shared);
-    constexpr int kGeometryParams = static_cast<int>(kGeometryDecoder.num_params());
     const int column = unit * kWarp + lane;
+    const float sum = sum_column(a.partials + column, kPartialSize, a.blocks, shared);
+    constexpr int kGeometryParams = static_cast<int>(kGeometryDecoder.num_params());
     if (warp != 0) return;
     if (column < kGeometryParams) {
       if (a.geometry) a.geometry[column] = sum;

@@ -39,7 +39,8 @@ def mlp(
     """A network input -> hidden -> hidden -> output with ReLU between its three linear layers.
 
     y = a(W3 relu(W2 relu(W1 x + b1) + b2) + b3), the decoders of equations (2) and (4). Every layer is computed on
-    tiles of samples held in the cache; nothing but the result is kept for the gradient, which runs the network again.
+    tiles of samples held in the cache, on CUDA in a block's shared memory where there is room; nothing but the result
+    is kept for the gradient, which runs the network again.
 
     Args:
         input: float32 or float64 [N, I].

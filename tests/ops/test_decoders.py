@@ -7,14 +7,15 @@ import torch
 
 from spslam import ops
 
-# (inputs, hidden, outputs): the two decoders, the prior's encoder, and widths that fill no vector.
-SHAPES = [(11, 32, 1), (32, 32, 3), (6, 64, 8), (3, 5, 2), (17, 33, 4)]
+# (inputs, hidden, outputs): the two decoders, the prior's encoder, widths that fill no vector, and one that a block's
+# shared memory has no room for.
+SHAPES = [(11, 32, 1), (32, 32, 3), (6, 64, 8), (3, 5, 2), (17, 33, 4), (9, 200, 12)]
 ACTIVATIONS = {
     ops.Activation.NONE: torch.nn.Identity,
     ops.Activation.TANH: torch.nn.Tanh,
     ops.Activation.SIGMOID: torch.nn.Sigmoid,
 }
-# Sums of up to 64 float32 products in another order, through three layers.
+# Sums of up to 200 float32 products in another order, through three layers.
 FLOAT32_TOLERANCE = dict(rtol=1e-4, atol=1e-5)
 FLOAT64_TOLERANCE = dict(rtol=1e-11, atol=1e-12)
 
@@ -47,6 +48,34 @@ def test_forward_and_gradients_match_torch(device, dtype, shape, activation):
     torch.testing.assert_close(got_x, want_grads[0], **tolerance)
     scale = 1500**0.5  # of a parameter's gradient, a sum over the samples
     torch.testing.assert_close(got_params / scale, _flat(want_grads[1:]) / scale, **tolerance)
+
+
+def test_more_rows_than_are_under_way_at_once(device):
+    torch.manual_seed(3)
+    rows, shape = 150_001, (3, 5, 2)
+    module = _module(shape, ops.Activation.TANH, torch.float32, device)
+    x = torch.randn(rows, shape[0], device=device, requires_grad=True)
+    params, grad = _flat(module.parameters()).requires_grad_(), torch.randn(rows, shape[2], device=device)
+    want = module.double()(x.double())
+    want_grads = torch.autograd.grad(want, [x, *module.parameters()], grad.double())
+    got = ops.mlp(x, params, shape[1], shape[2], ops.Activation.TANH)
+    got_x, got_params = torch.autograd.grad(got, [x, params], grad)
+    torch.testing.assert_close(got.double(), want, **FLOAT32_TOLERANCE)
+    torch.testing.assert_close(got_x, want_grads[0], **FLOAT32_TOLERANCE)
+    torch.testing.assert_close(got_params.double() / rows**0.5, _flat(want_grads[1:]) / rows**0.5, **FLOAT32_TOLERANCE)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_same_bits_from_run_to_run(device, shape):
+    torch.manual_seed(4)
+    x = torch.randn(20_011, shape[0], device=device, requires_grad=True)
+    params = torch.randn(ops.mlp_num_params(*shape), device=device, requires_grad=True)
+    results = []
+    for _ in range(3):
+        out = ops.mlp(x, params, shape[1], shape[2])
+        results.append([out, *torch.autograd.grad(out.square().sum(), [x, params])])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

@@ -2,30 +2,13 @@
 #pragma once
 
 #include "cuda/fused/arguments.cuh"
+#include "cuda/fused/column_sums.cuh"
 #include "cuda/fused/fragment.cuh"
 
 namespace spslam::fused {
 
-constexpr int kSumThreads = 256, kSumWarps = kSumThreads / kWarp;
-
 // Units of work of a block of kSumThreads: columns of partials a warp wide, and frames a warp each.
 constexpr int kColumnUnits = kPartialSize / kWarp;
-
-// Column 32 * unit + lane over all blocks, in warp 0; warp w adds blocks w, w + 8, .. first. All threads take part.
-__device__ __forceinline__ float sum_column(const float* partials, int blocks, int unit, float (*shared)[kWarp]) {
-  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  float sum = 0.0f;
-#pragma unroll 8
-  for (int b = warp; b < blocks; b += kSumWarps) {
-    sum += __ldcg(partials + static_cast<std::int64_t>(b) * kPartialSize + unit * kWarp + lane);
-  }
-  __syncthreads();  // the unit before may still be read
-  shared[warp][lane] = sum;
-  __syncthreads();
-  float total = 0.0f;
-  for (int w = 0; w < kSumWarps; ++w) total += shared[w][lane];
-  return total;
-}
 
 // The five losses from the sum of term k in lane first + k.
 __device__ __forceinline__ void store_losses(float sum, int first, int lane, const LossWeights& weights,

@@ -40,10 +40,10 @@ __device__ __forceinline__ void step_parameter(const AdamTarget& t, std::int64_t
 // A warp wide share of the decoders' parameters and of the loss terms.
 __device__ __forceinline__ void step_column(const MapUpdateArguments& a, int unit, float (*shared)[kWarp]) {
   const int lane = threadIdx.x % kWarp;
-  const float sum = sum_column(a.partials, a.blocks, unit, shared);
+  const int column = unit * kWarp + lane;
+  const float sum = sum_column(a.partials + column, kPartialSize, a.blocks, shared);
   if (threadIdx.x >= kWarp) return;
   constexpr int kGeometryParams = static_cast<int>(kGeometryDecoder.num_params());
-  const int column = unit * kWarp + lane;
   if (column < kGeometryParams) {
     if (a.geometry.exp_avg) step_parameter(a.geometry, column, sum);
   } else if (column < kNumParams) {
