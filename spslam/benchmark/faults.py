@@ -96,7 +96,7 @@ class Outcome:
         wrong_unflagged: frames whose pose was wrong and not called lost, in all.
         recovered_after: frames of the way back until the first known pose within 3 cm; None where there was none.
         error_cm: distance from where the camera is at the end; infinite where it is lost.
-        voxels_added: by mapping while the fault lasted.
+        voxels_added: by mapping frames of the fault whose pose was wrong.
     """
 
     trial: Trial
@@ -163,14 +163,14 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
 def try_fault(system: SlamSystem, dataset: RgbdDataset, trial: Trial) -> Outcome:
     """One trial on a system that has seen `trial.place` frames; it is used up."""
     random, truth = np.random.default_rng(trial.seed), true_poses(dataset)
-    voxels = system.state.scene.volume.num_voxels
-    lost, wrong = [], []
+    lost, wrong, added = [], [], 0
     for shown in trial.during:
+        voxels = system.state.scene.volume.num_voxels
         report = system.process(_spoilt(dataset, shown, random))
         apart_cm, apart_deg = _error(system, truth, trial.place, shown.index)
         lost.append(report.lost)
         wrong.append(shown.change is not None or apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
-    added = system.state.scene.volume.num_voxels - voxels if any(wrong) else 0
+        added += system.state.scene.volume.num_voxels - voxels if wrong[-1] else 0
     errors = []
     for shown in trial.back:
         report = system.process(_spoilt(dataset, shown, random))

@@ -39,10 +39,11 @@ def test_the_map_is_not_touched_while_lost(outcomes):
 RECORDINGS = {"7scenes": "7scenes-redkitchen", "synthetic_rgbd": "synthetic-grey-white-room"}
 
 
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_faults_in_recordings(name):
+def test_faults_in_recordings(name, preset):
     data = shared_data(RECORDINGS[name])
-    config = load_config(name, "fast", ["device=cpu"])
+    config = load_config(name, preset, ["device=cpu"])
     dataset = open_sequence(config.dataset, data, slice(0, 160))
     for outcome in run_trials(config, dataset, plan(dataset, 1, 0), torch.device("cpu")):
         assert outcome.passed, outcome
