@@ -58,12 +58,15 @@ def system(dataset):
 
 
 def likeness_of(system, frame, pose):
-    records = sample_frame(frame, system.camera, system.config).records
+    records = sample_frame(frame, system.camera, system.config).records.to(system.device)
     return likeness(*brightness_sums(system.state.scene, records, pose, system.camera).tolist())
 
 
-def test_a_frame_is_like_the_map_where_it_is_and_not_in_other_colours(dataset, system):
-    frame, pose = dataset[9], system.state.frames.poses[9]
+def test_a_frame_is_like_the_map_where_it_is_and_not_in_other_colours(dataset, device):
+    system = SlamSystem(settings(), dataset.camera, dataset.poses()[0], device)
+    for i in range(2):
+        system.process(dataset[i])
+    frame, pose = dataset[1], system.state.frames.poses[1]
     assert likeness_of(system, frame, pose) > 0.7
     frame.color[:] = frame.color // 3 + 20
     assert likeness_of(system, frame, pose) > 0.7
