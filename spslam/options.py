@@ -133,6 +133,10 @@ class TrackingOptions(Section):
         ge=0,
     )
     color_kernel: float = _option("gauss_newton: width of the robust kernel of brightness, of which white is 1", gt=0)
+    depth_views: bool = _option(
+        "gauss_newton: hold a frame also against the depth images of the last one, one 10 and one 40 frames back"
+    )
+    view_kernel_m: float = _option("width of the robust kernel of these distances in the last iteration", "m", gt=0)
     rescue: bool = _option(
         "start anew from projective ICP where a frame fits the map badly; with adam only where it is lost"
     )

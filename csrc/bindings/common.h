@@ -101,6 +101,10 @@ template <>
 struct ScalarTypeOf<std::uint8_t> {
   static constexpr ScalarType value = ScalarType::Byte;
 };
+template <>
+struct ScalarTypeOf<std::uint16_t> {
+  static constexpr ScalarType value = ScalarType::UInt16;
+};
 
 // Read access. The tensor must be contiguous: take it through contiguous() first.
 template <class T>

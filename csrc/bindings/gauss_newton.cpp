@@ -31,12 +31,42 @@ ReferenceImage load_reference(const std::optional<Tensor>& cells, const std::opt
           static_cast<float>(kernel)};
 }
 
+// None without images. Row 2 k of `rows` is view k's image, row 2 k + 1 its pose.
+DepthViews load_views(const std::optional<Tensor>& images, const std::optional<Tensor>& poses,
+                      const std::vector<std::int64_t>& rows, const std::vector<double>& intrinsics, double unit,
+                      double kernel_end) {
+  if (!images || !poses || rows.empty()) return {};
+  SPS_CHECK(images->dim() == 3 && poses->dim() == 2 && poses->size(1) == kPoseSize && unit > 0.0 && kernel_end > 0.0,
+            "track_gauss_newton: views must have shape [R, H, W], their poses [F, 7]");
+  SPS_CHECK(rows.size() % 2 == 0 && rows.size() <= 2 * kMaxDepthViews, "track_gauss_newton: at most 8 views");
+  DepthViews views{data<std::uint16_t>(*images),
+                   data<float>(*poses),
+                   images->size(1),
+                   images->size(2),
+                   load_intrinsics(intrinsics),
+                   static_cast<float>(unit),
+                   static_cast<float>(kernel_end),
+                   static_cast<int>(rows.size() / 2),
+                   {},
+                   {}};
+  for (int k = 0; k < views.count; ++k) {
+    views.image_rows[k] = rows[2 * k];
+    views.pose_rows[k] = rows[2 * k + 1];
+    SPS_CHECK(views.image_rows[k] >= 0 && views.image_rows[k] < images->size(0) && views.pose_rows[k] >= 0 &&
+                  views.pose_rows[k] < poses->size(0),
+              "track_gauss_newton: a view names an image or a pose that is not there");
+  }
+  return views;
+}
+
 std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
     std::vector<Tensor> tensors, std::vector<double> scalars, std::vector<std::int64_t> layout, Tensor pixels,
     Tensor pose, std::vector<double> intrinsics, std::int64_t num_pixels, std::int64_t iterations, double truncation,
     double kernel_start, double kernel_end, double kernel_judge, double damping, std::int64_t seed, std::int64_t stream,
     std::int64_t frame, double noise_depth, std::optional<Tensor> reference, std::optional<Tensor> reference_pose,
-    std::vector<double> reference_intrinsics, double intensity_weight, double intensity_kernel, bool tf32) {
+    std::vector<double> reference_intrinsics, double intensity_weight, double intensity_kernel,
+    std::optional<Tensor> views, std::optional<Tensor> view_poses, std::vector<std::int64_t> view_rows,
+    std::vector<double> view_intrinsics, double view_unit, double view_kernel_end, bool tf32) {
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
             "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
@@ -46,6 +76,8 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
   pixels = torch::stable::contiguous(pixels);
   if (reference) reference = torch::stable::contiguous(*reference);
   if (reference_pose) reference_pose = torch::stable::contiguous(*reference_pose);
+  if (views) views = torch::stable::contiguous(*views);
+  if (view_poses) view_poses = torch::stable::contiguous(*view_poses);
   Tensor result = torch::stable::clone(torch::stable::contiguous(pose));
   Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
@@ -62,6 +94,7 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
       philox_key(seed, stream, frame, 0),
       static_cast<float>(noise_depth),
       load_reference(reference, reference_pose, reference_intrinsics, intensity_weight, intensity_kernel),
+      load_views(views, view_poses, view_rows, view_intrinsics, view_unit, view_kernel_end),
       tf32};
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
                              workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
@@ -102,7 +135,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
         ", Tensor pixels, Tensor pose, float[] intrinsics, int num_pixels, int iterations, float truncation, "
         "float kernel_start, float kernel_end, float kernel_judge, float damping, int seed, int stream, int frame, "
         "float noise_depth, Tensor? reference, Tensor? reference_pose, float[] reference_intrinsics, "
-        "float intensity_weight, float intensity_kernel, bool tf32=True) -> (Tensor, Tensor, Tensor)");
+        "float intensity_weight, float intensity_kernel, Tensor? views, Tensor? view_poses, int[] view_rows, "
+        "float[] view_intrinsics, float view_unit, float view_kernel_end, bool tf32=True) -> (Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
         "-> (Tensor, Tensor, Tensor, Tensor)");

@@ -2,6 +2,7 @@
 
 #include "core/for_each.h"
 #include "cpu/scene_tile.h"
+#include "kernels/depth_views.h"
 #include "kernels/gauss_newton.h"
 #include "kernels/reference_image.h"
 
@@ -17,7 +18,18 @@ struct Measurement {
   KernelWidths kernel;
   float noise_depth;
   ReferenceView reference;
+  DepthViews views;
+  DepthView view[kMaxDepthViews];
 };
+
+// terms: of the map and, from kTrackingTerms on, of the views.
+void add_views(const Measurement& measure, const SurfacePoint& point, float certainty, const MapResidual& map,
+               double* terms) {
+  for (int k = 0; k < measure.views.count; ++k) {
+    add_depth_view_residual(measure.views, measure.view[k], point.world, point.offset, measure.kernel.view, certainty,
+                            map, terms + kTrackingTerms);
+  }
+}
 
 // Sums over pixels [begin, end), whose records `record(i)` gives.
 template <class Record>
@@ -25,15 +37,19 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
                 const Pose<float>& pose, std::int64_t begin, std::int64_t end, const Record& record, double* terms) {
   const Intrinsics& camera = measure.camera;
   GeometryTile tile(net);
-  Vec3<float> offsets[kTileRows], gradients[kTileRows];
+  SurfacePoint points[kTileRows];
+  Vec3<float> gradients[kTileRows];
   float sdf[kTileRows], certainty[kTileRows];
   const float inverse_voxel = 1.0f / scene.voxel_size;
   const auto flush = [&] {
     tile.decode(sdf);
     tile.position_gradient(scene, gradients);
     for (std::int64_t i = 0; i < tile.size(); ++i) {
-      if (!is_tracking_inlier(1.0f, true, sdf[i])) continue;
-      add_tracking_residual(offsets[i], sdf[i], gradients[i], measure.truncation, measure.kernel, certainty[i], terms);
+      const bool known = is_tracking_inlier(1.0f, true, sdf[i]);
+      add_views(measure, points[i], certainty[i], {sdf[i] * measure.truncation, known}, terms);
+      if (!known) continue;
+      add_tracking_residual(points[i].offset, sdf[i], gradients[i], measure.truncation, measure.kernel, certainty[i],
+                            terms);
     }
     tile.clear();
   };
@@ -45,27 +61,31 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
       add_intensity_residual(measure.reference, pixel, point.world, point.offset, terms);
     }
     const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
-    if (!cell.corner_ids) continue;
-    offsets[tile.size()] = point.offset;
-    certainty[tile.size()] = depth_certainty(pixel.depth, measure.noise_depth);
+    const float certain = depth_certainty(pixel.depth, measure.noise_depth);
+    if (!cell.corner_ids) {
+      add_views(measure, point, certain, {0.0f, false}, terms);
+      continue;
+    }
+    points[tile.size()] = point;
+    certainty[tile.size()] = certain;
     tile.add(scene, point.world, cell);
     if (tile.full()) flush();
   }
   if (tile.size()) flush();
 }
 
-// terms[kTrackingTerms] = sums over all n pixels, chunk by chunk in order, whatever the number of threads.
+// terms[kJointTerms] = sums over all n pixels, chunk by chunk in order, whatever the number of threads.
 template <class Record>
 void sum_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measurement& measure,
                 const Pose<float>& pose, std::int64_t n, const Record& record, double* partials, double* terms) {
   parallel_chunks(n, kPixelGrain, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {
-    double* own = partials + chunk * kTrackingTerms;
-    for (int t = 0; t < kTrackingTerms; ++t) own[t] = 0.0;
+    double* own = partials + chunk * kJointTerms;
+    for (int t = 0; t < kJointTerms; ++t) own[t] = 0.0;
     add_pixels(scene, net, measure, pose, begin, end, record, own);
   });
-  for (int t = 0; t < kTrackingTerms; ++t) terms[t] = 0.0;
+  for (int t = 0; t < kJointTerms; ++t) terms[t] = 0.0;
   for (std::int64_t chunk = 0; chunk < chunk_count(n, kPixelGrain); ++chunk) {
-    for (int t = 0; t < kTrackingTerms; ++t) terms[t] += partials[chunk * kTrackingTerms + t];
+    for (int t = 0; t < kJointTerms; ++t) terms[t] += partials[chunk * kJointTerms + t];
   }
 }
 
@@ -79,7 +99,7 @@ void predict_pose<Cpu>(Cpu device, const float* before, const float* last, float
 template <>
 std::int64_t gauss_newton_workspace_size<Cpu>(Cpu, std::int64_t frames, std::int64_t pixels) {
   const std::int64_t chunks = chunk_count(pixels, kPixelGrain);
-  return (frames > 0 ? frames : 1) * (chunks > 0 ? chunks : 1) * kTrackingTerms *
+  return (frames > 0 ? frames : 1) * (chunks > 0 ? chunks : 1) * kJointTerms *
          static_cast<std::int64_t>(sizeof(double));
 }
 
@@ -88,7 +108,15 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
                              const TrackingOptions& options, void* workspace, float* pose, float* stats,
                              float* hessian) {
   const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
-  double terms[kTrackingTerms];
+  double terms[kJointTerms], joint[kNormalTerms];
+  Measurement measure{options.intrinsics,
+                      options.truncation,
+                      {},
+                      options.noise_depth,
+                      load_reference(options.reference),
+                      options.views,
+                      {}};
+  for (int k = 0; k < options.views.count; ++k) measure.view[k] = load_depth_view(options.views, k);
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     PhiloxKey key = options.key;
     key.iteration = static_cast<std::uint32_t>(iteration);
@@ -96,13 +124,13 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
       return pixels +
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
-    const Measurement measure{options.intrinsics, options.truncation, tracking_kernel(options, iteration),
-                              options.noise_depth, load_reference(options.reference)};
+    measure.kernel = tracking_kernel(options, iteration);
     sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
                terms);
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, options.num_pixels, own_stats);
-    tracking_step(terms, options.damping, pose, own_stats + 2, hessian);
+    join_view_terms(terms, terms + kTrackingTerms, options.views.count, joint);
+    tracking_step(terms, joint, options.damping, pose, own_stats + 2, hessian);
   }
 }
 
@@ -113,13 +141,13 @@ void gauss_newton_poses<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
                              float* cost, float* inliers) {
   const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
   double* partials = static_cast<double*>(workspace);
-  const Measurement measure{intrinsics, truncation, {kernel, kernel}, 0.0f, {}};
+  const Measurement measure{intrinsics, truncation, {kernel, kernel, kernel}, 0.0f, {}, {}, {}};
   // Frames run side by side; within one, the loop over its pixels is nested and so runs in place.
-  const std::int64_t share = chunk_count(pixels_per_frame, kPixelGrain) * kTrackingTerms;
+  const std::int64_t share = chunk_count(pixels_per_frame, kPixelGrain) * kJointTerms;
   parallel_for(frames, 1, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t f = begin; f < end; ++f) {
       const auto record = [&](std::int64_t i) { return pixels + kPixelWords * (f * pixels_per_frame + i); };
-      double terms[kTrackingTerms], total;
+      double terms[kJointTerms], total;
       sum_pixels(scene, net, measure, load_pose(poses + kPoseSize * f), pixels_per_frame, record, partials + f * share,
                  terms);
       double h[36], g[6];

@@ -44,6 +44,21 @@ void write_lattice(const RgbdImage& image, std::int32_t step, PaddedDepth& depth
   }
 }
 
+void write_view(const RgbdImage& image, const PixelSampling& sampling, PaddedDepth& depth, std::uint16_t* view) {
+  const std::int32_t step = sampling.view_step;
+  if (step == 0) return;
+  const float per_unit = 1.0f / sampling.view_unit;
+  for (std::int32_t v = 0; v < image.height; v += step) {
+    const float* row = depth.row(v);
+    const std::int32_t columns = view_size(image.width, step);
+    SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) {
+      const float units = row[c * step] * per_unit + 0.5f;
+      view[c] = static_cast<std::uint16_t>(units < 65536.0f ? static_cast<std::int32_t>(units) : 0);
+    }
+    view += columns;
+  }
+}
+
 // Draws pixels [first, first + n) of the frame.
 void draw_batch(const RgbdImage& image, PaddedDepth& depth, const std::int32_t* valid, std::int64_t num_valid,
                 PhiloxKey key, const PixelSampling& sampling, std::int64_t first, int n, const SampledPixels& out) {
@@ -77,6 +92,7 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
   std::int32_t* valid = scratch.valid.reserve(static_cast<std::int64_t>(image.width) * image.height + 1);
   const std::int64_t num_valid = list_valid(image, sampling, depth, valid);
   write_lattice(image, sampling.lattice_step, depth, out.lattice);
+  write_view(image, sampling, depth, out.view);
   if (num_valid == 0) {
     std::fill(out.records, out.records + kPixelWords * sampling.count, 0);
     std::fill(out.normals, out.normals + 3 * sampling.count, 0.0f);

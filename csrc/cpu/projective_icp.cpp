@@ -37,7 +37,7 @@ void projective_icp<Cpu>(Cpu, const float* points, std::int64_t num_points, cons
     }
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, num_points, own_stats);
-    tracking_step(terms, options.damping, pose, own_stats + 2, hessian);
+    tracking_step(terms, terms, options.damping, pose, own_stats + 2, hessian);
   }
 }
 

@@ -8,6 +8,7 @@
 #include "core/for_each.h"
 #include "cuda/geometry_fragments.cuh"
 #include "cuda/warp_sums.cuh"
+#include "kernels/depth_views.h"
 #include "kernels/gauss_newton.h"
 #include "kernels/reference_image.h"
 #include "spslam/gauss_newton.h"
@@ -20,8 +21,10 @@ constexpr int kThreads = kWarps * kWarp;
 constexpr int kBlockPixels = kWarps * fused::kTileRows;
 // A barrier of the whole grid needs all blocks resident at once: few enough for the smallest device.
 constexpr std::int64_t kMaxTrackingBlocks = 16;
-constexpr int kPaddedTerms = kWarp;  // kTrackingTerms, one a lane
-static_assert(kTrackingTerms <= kPaddedTerms, "one lane a term");
+constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kViewTerms, one a lane
+static_assert(kTrackingTerms <= kPaddedTerms && kViewTerms <= kPaddedTerms, "one lane a term");
+constexpr int kSets = 2;  // of terms: the map's, the views'
+constexpr int kSums = kSets * kPaddedTerms;
 
 std::int64_t block_count(std::int64_t pixels) {
   return (pixels + kBlockPixels - 1) / kBlockPixels;
@@ -53,13 +56,15 @@ struct Measurement {
   KernelWidths kernel;
   float noise_depth;
   ReferenceView reference;
+  DepthViews views;
+  const DepthView* view;  // in shared memory
 };
 
-// Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms.
+// Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms of the map and of the views.
 template <Precision kPrecision>
 __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Measurement& measure, const Pose<float>& pose, const Pixel& pixel,
-                                               int lane, float* terms) {
+                                               int lane, float* terms, float* view_terms) {
   const Intrinsics& k = measure.camera;
   const SurfacePoint point = surface_point(pixel, pose, k.fx, k.fy, k.cx, k.cy);
   std::int32_t voxel = kNoVoxel;
@@ -70,10 +75,14 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   }
   Vec3<float> gradient;
   const float sdf = geometry_tile(scene, network, point.world, cell.local, voxel, lane, gradient);
-  // Two lanes bring the same pixel; one adds it.
-  const bool adds = lane % 4 < 2;
-  if (adds && is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf)) {
-    const float certainty = depth_certainty(pixel.depth, measure.noise_depth);
+  // Two lanes bring the same pixel; one adds it, and they share the views.
+  const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
+  const float certainty = depth_certainty(pixel.depth, measure.noise_depth);
+  for (int v = lane % 4 / 2; v < measure.views.count && pixel.depth > 0.0f; v += 2) {
+    add_depth_view_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view, certainty,
+                            {sdf * measure.truncation, known}, view_terms);
+  }
+  if (adds && known) {
     add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, certainty, terms);
   }
   if (adds && measure.reference.image.height > 0) {
@@ -115,35 +124,39 @@ class PixelQueue {
   Pixel next_;
 };
 
-// Sums over the pixels of a frame that this block takes; thread t < 32 returns term t.
+// Sums over the pixels of a frame that this block takes: thread t < kSums returns term t % 32 of set t / 32.
 template <Precision kPrecision>
 __device__ __forceinline__ double sum_block(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                             const Measurement& measure, const Pose<float>& pose, PixelQueue& queue,
-                                            float (&sums)[kWarps][kPaddedTerms]) {
+                                            float (&sums)[kWarps][kSums]) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  float terms[kPaddedTerms] = {};
-  for (Pixel pixel; queue.pop(pixel);) add_pixel_tile(scene, network, measure, pose, pixel, lane, terms);
+  float terms[kPaddedTerms] = {}, view_terms[kPaddedTerms] = {};
+  for (Pixel pixel; queue.pop(pixel);) {
+    add_pixel_tile(scene, network, measure, pose, pixel, lane, terms, view_terms);
+  }
   sums[warp][lane] = transpose_sum(terms, lane);
+  sums[warp][kPaddedTerms + lane] = transpose_sum(view_terms, lane);
   __syncthreads();
   double sum = 0.0;
-  if (warp == 0) {
-    for (int w = 0; w < kWarps; ++w) sum += static_cast<double>(sums[w][lane]);
+  if (threadIdx.x < kSums) {
+    for (int w = 0; w < kWarps; ++w) sum += static_cast<double>(sums[w][threadIdx.x]);
   }
   return sum;
 }
 
-// terms[t] = sum over blocks of partials[block][t], each warp a strided share, the shares added in order.
-__device__ void add_partials(const double* partials, std::int64_t blocks, double (&shares)[kWarps][kPaddedTerms],
+// terms[t] = sum over blocks of partials[block][t], t < kSums; each half of the block a strided share, the shares added
+// in order.
+__device__ void add_partials(const double* partials, std::int64_t blocks, double (&shares)[kThreads / kSums][kSums],
                              double* terms) {
-  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  const int term = threadIdx.x % kSums, share = threadIdx.x / kSums;
   double sum = 0.0;
-  for (std::int64_t b = warp; b < blocks; b += kWarps) sum += __ldcg(partials + b * kPaddedTerms + lane);
-  shares[warp][lane] = sum;
+  for (std::int64_t b = share; b < blocks; b += kThreads / kSums) sum += __ldcg(partials + b * kSums + term);
+  shares[share][term] = sum;
   __syncthreads();
-  if (warp == 0) {
+  if (share == 0) {
     double total = 0.0;
-    for (int w = 0; w < kWarps; ++w) total += shares[w][lane];
-    terms[lane] = total;
+    for (int s = 0; s < kThreads / kSums; ++s) total += shares[s][term];
+    terms[term] = total;
   }
   __syncthreads();
 }
@@ -155,25 +168,36 @@ __global__ void __launch_bounds__(kThreads)
   // Devices without matrix units for tf32 compute in float32 all the same.
   constexpr Precision kUsed = fused::kArchitecture < fused::kTensorArchitecture ? Precision::kFp32 : kPrecision;
   __shared__ GeometryNetwork<kUsed> network;
-  __shared__ float sums[kWarps][kPaddedTerms];
-  __shared__ double shares[kWarps][kPaddedTerms], terms[kPaddedTerms];
+  __shared__ float sums[kWarps][kSums];
+  __shared__ double shares[kThreads / kSums][kSums], terms[kSums], joint[kNormalTerms];
+  __shared__ DepthView view[kMaxDepthViews];
   __shared__ float own_pose[kPoseSize], own_stats[kTrackingStatSize], own_hessian[36];
   network.load(scene.geometry_params);
   if (threadIdx.x < kPoseSize) own_pose[threadIdx.x] = pose[threadIdx.x];
   const PhiloxKey key{options.key.seed, options.key.stream, options.key.frame, 0};
   PixelQueue queue({pixels, num_records, options.num_pixels, true, key}, 0);
   const ReferenceView reference = load_reference(options.reference);
+  const int views = options.views.count;
+  if (threadIdx.x < views) view[threadIdx.x] = load_depth_view(options.views, threadIdx.x);
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
-    const Measurement measure{options.intrinsics, options.truncation, tracking_kernel(options, iteration),
-                              options.noise_depth, reference};
+    const Measurement measure{options.intrinsics,
+                              options.truncation,
+                              tracking_kernel(options, iteration),
+                              options.noise_depth,
+                              reference,
+                              options.views,
+                              view};
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
-    double* shared_sums = partials + (iteration % 2) * gridDim.x * kPaddedTerms;
-    if (threadIdx.x < kPaddedTerms) __stcg(shared_sums + blockIdx.x * kPaddedTerms + threadIdx.x, sum);
+    double* shared_sums = partials + (iteration % 2) * gridDim.x * kSums;
+    if (threadIdx.x < kSums) __stcg(shared_sums + blockIdx.x * kSums + threadIdx.x, sum);
     cooperative_groups::this_grid().sync();
     add_partials(shared_sums, gridDim.x, shares, terms);
-    if (threadIdx.x == 0) tracking_step(terms, options.damping, own_pose, own_stats + 2, own_hessian);
+    if (threadIdx.x == 0) {
+      join_view_terms(terms, terms + kPaddedTerms, views, joint);
+      tracking_step(terms, joint, options.damping, own_pose, own_stats + 2, own_hessian);
+    }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
     __syncthreads();
     if (blockIdx.x == 0 && threadIdx.x < kTrackingStatSize) {
@@ -189,23 +213,21 @@ __global__ void __launch_bounds__(kThreads)
 __global__ void __launch_bounds__(kThreads)
     residual_kernel(SceneView scene, PixelSource source, const float* poses, Measurement measure, double* partials) {
   __shared__ GeometryNetwork<Precision::kFp32> network;
-  __shared__ float sums[kWarps][kPaddedTerms];
+  __shared__ float sums[kWarps][kSums];
   network.load(scene.geometry_params);
   __syncthreads();
   const std::int64_t frame = blockIdx.y;
   PixelQueue queue(source, frame);
   const double sum = sum_block(scene, network, measure, load_pose(poses + kPoseSize * frame), queue, sums);
-  if (threadIdx.x < kPaddedTerms) {
-    partials[(frame * gridDim.x + blockIdx.x) * kPaddedTerms + threadIdx.x] = sum;
-  }
+  if (threadIdx.x < kSums) partials[(frame * gridDim.x + blockIdx.x) * kSums + threadIdx.x] = sum;
 }
 
 __global__ void __launch_bounds__(kThreads)
     store_kernel(const double* partials, std::int64_t blocks, std::int64_t num_pixels, float* hessian, float* gradient,
                  float* cost, float* inliers) {
-  __shared__ double shares[kWarps][kPaddedTerms], terms[kPaddedTerms];
+  __shared__ double shares[kThreads / kSums][kSums], terms[kSums];
   const std::int64_t frame = blockIdx.x;
-  add_partials(partials + frame * blocks * kPaddedTerms, blocks, shares, terms);
+  add_partials(partials + frame * blocks * kSums, blocks, shares, terms);
   if (threadIdx.x != 0) return;
   double h[36], g[6], total;
   store_normal_terms<double>(terms, h, g, &total);
@@ -225,7 +247,7 @@ void predict_pose<Cuda>(Cuda device, const float* before, const float* last, flo
 template <>
 std::int64_t gauss_newton_workspace_size<Cuda>(Cuda, std::int64_t frames, std::int64_t pixels) {
   const std::int64_t sets = std::max<std::int64_t>(frames * block_count(pixels), 2 * tracking_block_count(pixels));
-  return std::max<std::int64_t>(sets, 1) * kPaddedTerms * static_cast<std::int64_t>(sizeof(double));
+  return std::max<std::int64_t>(sets, 1) * kSums * static_cast<std::int64_t>(sizeof(double));
 }
 
 template <>
@@ -259,7 +281,7 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
     const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
-    const Measurement measure{intrinsics, truncation, {kernel, kernel}, 0.0f, {}};
+    const Measurement measure{intrinsics, truncation, {kernel, kernel, kernel}, 0.0f, {}, {}, nullptr};
     residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, measure, partials);
   }
   store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, hessian,

@@ -24,6 +24,7 @@ constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
 // Widths (m) of the robust kernel: of the weights that move the pose, and of those that tell how well it fits.
 struct KernelWidths {
   float step, judge;
+  float view;  // of earlier frames' depth images
 };
 
 struct SurfacePoint {
@@ -97,10 +98,13 @@ SPS_INLINE float annealed_kernel(float start, float end, std::int64_t iteration,
   return start * std::pow(end / start, progress < 1.0f ? progress : 1.0f);
 }
 
-// Both widths in an iteration of tracking; what is judged by is that of the step where options name none.
+// The widths in an iteration of tracking; what is judged by is that of the step where options name none.
 SPS_INLINE KernelWidths tracking_kernel(const TrackingOptions& options, std::int64_t iteration) {
   const float step = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
-  return {step, options.kernel_judge > 0.0f ? options.kernel_judge : step};
+  const float view = options.views.count > 0 ? annealed_kernel(options.kernel_start, options.views.kernel_end,
+                                                               iteration, options.iterations)
+                                             : step;
+  return {step, options.kernel_judge > 0.0f ? options.kernel_judge : step, view};
 }
 
 // Weighted mean squared residual, m^2.
@@ -109,12 +113,13 @@ SPS_INLINE double tracking_cost(const double* terms) {
   return weights > 1e-6 ? terms[kNormalTerms - 1] / weights : 0.0;
 }
 
-// Solves the normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad), hessian what the matrix would
-// be if pixels weighed on average what they are judged by, without certainties, so that it tells how the pose is held
-// and neither how far away the surface is nor how narrow the kernel.
-SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, float* steps, float* hessian) {
+// Solves the joint normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad), hessian what the map's
+// matrix would be if pixels weighed on average what they are judged by, without certainties, so that it tells how the
+// pose is held and neither how far away the surface is nor how narrow the kernel.
+SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, float* pose, float* steps,
+                              float* hessian) {
   double h[36], g[6], cost, delta[6];
-  store_normal_terms<double>(terms, h, g, &cost);
+  store_normal_terms<double>(joint, h, g, &cost);
   double trace = 0.0;
   for (int a = 0; a < 6; ++a) trace += h[a * 7];
   // The absolute part keeps directions that no pixel sees from moving.
@@ -132,6 +137,7 @@ SPS_INLINE void tracking_step(const double* terms, double damping, float* pose, 
   steps[0] = std::sqrt(dot(dt, dt));
   steps[1] = std::sqrt(dot(domega, domega));
   const double certain = terms[kNormalTerms + 2], share = certain > 0.0 ? terms[kNormalTerms] / certain : 1.0;
+  store_normal_terms<double>(terms, h, g, &cost);
   for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(share * h[i]);
 }
 

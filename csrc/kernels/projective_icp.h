@@ -30,7 +30,7 @@ SPS_INLINE void add_icp_residual(const SurfaceMaps& target, const float* point, 
   if (!(vertex.z > 0.0f) || !(dot(normal, normal) > 0.0f)) return;
   const Vec3<float> difference = moved - vertex;
   if (!(dot(difference, difference) < max_distance * max_distance)) return;
-  add_robust_residual(offset, dot(normal, difference), normal, {kernel, kernel}, 1.0f, terms);
+  add_robust_residual(offset, dot(normal, difference), normal, {kernel, kernel, kernel}, 1.0f, terms);
 }
 
 }  // namespace spslam

@@ -5,8 +5,16 @@ A pixel of depth z is the world point x = R (z d) + t. Its residual is r = trunc
 exp(domega) about its centre, so that dr = truncation * grad s . (dt + domega x (x - t)).
 
 Where the noise of depth grows with z^2, as for structured light and stereo, a residual's inverse variance falls as
-1 / (1 + (z / z0)^4). A reference image adds, pixel by pixel, what direct methods minimise (Kerl et al. 2013): the
-intensity I of an earlier frame where x falls in it, less the pixel's own, times a weight in metres.
+1 / (1 + (z / z0)^4).
+
+Earlier frames' depth images add, view by view, the signed distance of x from the surface seen there,
+(z' q(u', v') - 1) / |grad|, q being the inverse depth between four pixels, which on a plane is linear in the image.
+Beside the mean of the views' equations, those of the map count c = (v_views / v_map)^2 in [1e-3, 4], v being the
+weighted mean squared residuals where both are known: squared, as the map's error is alike for neighbouring pixels and,
+unlike a sensor's noise, does not average out.
+
+A reference image adds, pixel by pixel, what direct methods minimise (Kerl et al. 2013): the intensity I of an earlier
+frame where x falls in it, less the pixel's own, times a weight in metres.
 """
 
 from typing import NamedTuple
@@ -19,6 +27,9 @@ from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 # What red, green and blue count for in a reference's intensity (Rec. 601), in thousandths; the kernel's own.
 LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
+
+
+_MAX_VIEWS = 8
 
 
 def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
@@ -64,6 +75,27 @@ class ReferenceImage(NamedTuple):
     kernel: float
 
 
+class DepthViews(NamedTuple):
+    """Depth images of earlier frames, to hold a frame's surface against.
+
+    Attributes:
+        images: uint16 [R, H, W] depth in `unit`, 0 where unknown. A point is compared where it falls between four
+            pixels with depth whose inverses spread less than 3 %.
+        unit: m.
+        poses: float32 [F, 7] T_world_camera, unit quaternions (w, x, y, z) and translations (m).
+        rows: of each view, at most 8, the row of its image and the row of its pose.
+        intrinsics: of the images, px.
+        kernel_end: last width of the robust kernel of these distances, m; the first is that of the map's.
+    """
+
+    images: torch.Tensor
+    unit: float
+    poses: torch.Tensor
+    rows: tuple[tuple[int, int], ...]
+    intrinsics: Intrinsics
+    kernel_end: float
+
+
 def track_gauss_newton(
     scene: SceneView,
     pixels: torch.Tensor,
@@ -82,6 +114,7 @@ def track_gauss_newton(
     kernel_judge: float | None = None,
     noise_depth: float = 0.0,
     reference: ReferenceImage | None = None,
+    views: DepthViews | None = None,
     tf32: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Tracks one frame against a frozen scene; all iterations in one call, on CUDA in one kernel that never stops for
@@ -110,6 +143,7 @@ def track_gauss_newton(
             1 / (1 + (z / z0)^4) of what they would. 0 weighs near and far alike.
         reference: an earlier frame to compare colours with; None uses the surface alone. It takes no part in what the
             statistics say.
+        views: earlier frames' depth images; None uses the map alone. They take no part in what statistics and H say.
         tf32: on CUDA devices from sm_80 on, let tensor cores multiply in the decoder, with factors rounded to 10 bits
             of mantissa: under 0.1 mm of SDF. Elsewhere, and without it, everything is float32.
 
@@ -156,6 +190,12 @@ def track_gauss_newton(
     if reference is not None:
         _check_reference(name, reference, like=scene.embeddings)
         image = (reference.cells, reference.pose, list(reference.intrinsics), reference.weight, reference.kernel)
+    earlier: tuple[torch.Tensor | None, torch.Tensor | None, list[int], list[float], float, float]
+    earlier = (None, None, [], [], 1.0, 1.0)
+    if views is not None:
+        _check_views(name, views, like=scene.embeddings)
+        rows = [row for pair in views.rows for row in pair]
+        earlier = (views.images, views.poses, rows, list(views.intrinsics), views.unit, views.kernel_end)
     return torch.ops.spslam.track_gauss_newton(
         *scene.arguments(),
         pixels,
@@ -173,6 +213,7 @@ def track_gauss_newton(
         frame,
         noise_depth,
         *image,
+        *earlier,
         tf32,
     )
 
@@ -183,6 +224,18 @@ def _check_reference(name: str, reference: ReferenceImage, like: torch.Tensor) -
     check_intrinsics(name, reference.intrinsics, "reference.intrinsics")
     check(reference.weight >= 0, name, "reference.weight", "be at least 0", reference.weight)
     check(reference.kernel > 0, name, "reference.kernel", "be positive", reference.kernel)
+
+
+def _check_views(name: str, views: DepthViews, like: torch.Tensor) -> None:
+    check_tensor(name, "views.images", views.images, ("R", "H", "W"), torch.uint16, like=like)
+    check_tensor(name, "views.poses", views.poses, ("F", 7), torch.float32, like=like)
+    check_intrinsics(name, views.intrinsics, "views.intrinsics")
+    check(views.unit > 0, name, "views.unit", "be positive", views.unit)
+    check(views.kernel_end > 0, name, "views.kernel_end", "be positive", views.kernel_end)
+    check(len(views.rows) <= _MAX_VIEWS, name, "views.rows", f"be at most {_MAX_VIEWS}", len(views.rows))
+    for image, pose in views.rows:
+        inside = 0 <= image < len(views.images) and 0 <= pose < len(views.poses)
+        check(inside, name, "views.rows", "name images and poses that are there", (image, pose))
 
 
 def gauss_newton_poses(

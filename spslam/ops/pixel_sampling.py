@@ -20,6 +20,8 @@ class PixelSampling:
         min_depth, max_depth: pixels nearer or farther, m, are not drawn.
         step_px, max_jump: of the normals, see `depth_normals`.
         lattice_step: distance of the lattice's pixels, px; the first lies at half of it.
+        view_step: distance of the view's pixels, px; the first lies at 0. With 0 there is no view.
+        view_unit: m, of the view's depth.
     """
 
     count: int
@@ -28,11 +30,21 @@ class PixelSampling:
     step_px: int
     max_jump: float
     lattice_step: int
+    view_step: int = 0
+    view_unit: float = 1e-3
 
     def lattice_shape(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of the lattice of an image."""
         first, step = self.lattice_step // 2, self.lattice_step
         return len(range(first, height, step)), len(range(first, width, step))
+
+    def view_shape(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the view of an image; 0 and 0 where there is none."""
+        return _view_size(height, self.view_step), _view_size(width, self.view_step)
+
+
+def _view_size(size: int, step: int) -> int:
+    return -(-size // step) if step > 0 else 0
 
 
 def sample_frame_pixels(
@@ -62,9 +74,11 @@ def sample_frame_pixels(
         seed, stream, frame: key of the draw, as in `philox_uniform`.
 
     Returns:
-        buffer int32 [3 P + 3 P + ceil(h w / 2)]: the records [P, 3], the normals [P, 3] as the bits of float32, and
-        float16 depth [h, w] (m, 0 where invalid) at every `lattice_step`-th pixel, two a word; and the number of valid
-        pixels. Where that is 0, records and normals are 0. The same bits on every run.
+        buffer int32 [3 P + 3 P + ceil(h w / 2) + ceil(h' w' / 2)]: the records [P, 3], the normals [P, 3] as the bits
+        of float32, float16 depth [h, w] (m, 0 where invalid) at every `lattice_step`-th pixel, two a word, and the
+        view, uint16 depth [h', w'] in `view_unit` m, rounded (0 where invalid or beyond 65535) at every `view_step`-th
+        pixel, two a word; and the number of valid pixels. Where that is 0, records and normals are 0. The same bits on
+        every run.
 
     Raises:
         ValueError: wrong shapes or devices, or a number out of range.
@@ -92,6 +106,8 @@ def sample_frame_pixels(
     check(1 <= sampling.step_px <= _MAX_SIDE, name, "step_px", "be in [1, 65535]", sampling.step_px)
     check(sampling.max_jump > 0, name, "max_jump", "be positive", sampling.max_jump)
     check(1 <= sampling.lattice_step <= _MAX_SIDE, name, "lattice_step", "be in [1, 65535]", sampling.lattice_step)
+    check(0 <= sampling.view_step <= _MAX_SIDE, name, "view_step", "be in [0, 65535]", sampling.view_step)
+    check(sampling.view_unit > 0, name, "view_unit", "be positive", sampling.view_unit)
     buffer, num_valid = torch.ops.spslam.sample_frame_pixels(
         depth,
         color,
@@ -105,6 +121,8 @@ def sample_frame_pixels(
         sampling.step_px,
         sampling.max_jump,
         sampling.lattice_step,
+        sampling.view_step,
+        sampling.view_unit,
         seed,
         stream,
         frame,
@@ -153,6 +171,7 @@ def _(records, normals, pose, fx, fy, cx, cy):
 
 
 @torch.library.register_fake("spslam::sample_frame_pixels")
-def _(depth, color, fx, fy, cx, cy, count, min_depth, max_depth, step_px, max_jump, lattice_step, *key):
+def _(depth, color, fx, fy, cx, cy, count, min_depth, max_depth, step_px, max_jump, lattice_step, view_step, *rest):
     height, width = (max(0, -((lattice_step // 2 - size) // lattice_step)) for size in depth.shape)
-    return depth.new_empty((6 * count + (height * width + 1) // 2,), dtype=torch.int32), 0
+    view = _view_size(depth.shape[0], view_step) * _view_size(depth.shape[1], view_step)
+    return depth.new_empty((6 * count + (height * width + 1) // 2 + (view + 1) // 2,), dtype=torch.int32), 0

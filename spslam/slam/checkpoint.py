@@ -62,6 +62,8 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
         **_prefixed("frames.", state.frames.tensors()),
         **_prefixed("pixels.", {"records": state.pixels.records, "has_pixels": state.pixels.has_pixels}),
     }
+    if state.views is not None:
+        tensors.update(_prefixed("views.", state.views.tensors()))
     # Moments that the next mapping call resets anyway need no place.
     if not config.mapping.reset_moments:
         for name, moments in state.moments.items():
@@ -121,6 +123,8 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
     state.scene.load_state_dict(_section(tensors, "scene."))
     state.frames.load_state_dict(_section(tensors, "frames."))
     state.pixels.load_state_dict(_section(tensors, "pixels."))
+    if state.views is not None:
+        state.views.load_state_dict(_section(tensors, "views."))
     device = state.scene.device
     state.moments = {
         name.removesuffix(".first"): Moments.of(

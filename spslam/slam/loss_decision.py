@@ -10,7 +10,7 @@ information the smallest eigenvalue of the normal equations a pixel, scaled as i
 direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5 degrees) from where the
 motion model put the camera, conflict the share of the surface known from other frames that it would have to look
 through. Support counts for more on a map with holes, as small images or few points leave it, and information below
-0.002, the least of clean runs, twice as much. likeness is the correlation of the picture's brightness with that of the
+0.002, the least of clean runs, two and a half times as much. likeness is the correlation of the picture's brightness with that of the
 map's colours; right poses have 0.26 or more, and only less counts.
 What is not known takes part as a number between right and wrong.
 """
@@ -83,9 +83,9 @@ class Fit:
 
     @property
     def _lg_information(self) -> float:
-        """The logarithm of the information, which falls twice as fast below that of any clean run."""
+        """The logarithm of the information, which falls two and a half times as fast below that of any clean run."""
         lg = math.log10(max(self.information, LEAST_INFORMATION))
-        return lg + min(lg - math.log10(FIRM_INFORMATION), 0.0)
+        return lg + 1.5 * min(lg - math.log10(FIRM_INFORMATION), 0.0)
 
     @property
     def _unlikeness(self) -> float:

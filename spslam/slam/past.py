@@ -90,6 +90,13 @@ class Past:
                 return row, self._frame(row)
         return None
 
+    def depth_views(self) -> ops.DepthViews | None:
+        """Earlier depth images to hold the next frame against; None where there is none of known pose."""
+        state = self._state
+        if state.views is None:
+            return None
+        return state.views.views(len(state.frames), state.frames.lost, state.frames.poses)
+
     def similar(self, pixels: FramePixels, count: int) -> list[Alike]:
         """Frames whose coarse depth is most like that of the given pixels, the likest first; at most `count`.
 

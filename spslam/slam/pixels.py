@@ -5,7 +5,7 @@ c is the foreshortening n . d times 128 (n the surface normal, d the ray directi
 turns a depth difference along the ray into a distance to the surface's tangent plane.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
+from spslam.slam.depth_views import UNITS, view_step
 
 LATTICE_STEP_PX = 16
 
@@ -24,15 +25,18 @@ class FramePixels:
     """What tracking and mapping need of a frame, in one buffer, so that an upload is one copy.
 
     Attributes:
-        buffer: int32 words of the records, the normals and the lattice, as `ops.sample_frame_pixels` returns them.
+        buffer: int32 words of the records, the normals, the lattice and the view, as `ops.sample_frame_pixels` returns
+            them.
         capacity: records that the buffer holds; without depth they are 0 and none of them counts.
         lattice_shape: rows and columns of the lattice.
+        view_shape: rows and columns of the view; 0 and 0 without one.
         valid_share: share of the image's pixels with usable depth.
     """
 
     buffer: torch.Tensor
     capacity: int
     lattice_shape: tuple[int, int]
+    view_shape: tuple[int, int]
     valid_share: float
 
     @property
@@ -56,13 +60,20 @@ class FramePixels:
         rows, columns = self.lattice_shape
         return self.buffer[6 * self.capacity :].view(torch.float16)[: rows * columns].view(rows, columns)
 
+    @cached_property
+    def view(self) -> torch.Tensor:
+        """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown, for tracking; a view."""
+        rows, columns = self.view_shape
+        words = self.buffer[len(self.buffer) - -(-rows * columns // 2) :]
+        return words.view(torch.uint16)[: rows * columns].view(rows, columns)
+
     def to(self, device: torch.device, non_blocking: bool = False) -> "FramePixels":
         """The same on another device; one copy."""
         return self.holding(self.buffer.to(device, non_blocking=non_blocking))
 
     def holding(self, buffer: torch.Tensor) -> "FramePixels":
         """The same in another buffer, to which the words were copied."""
-        return FramePixels(buffer, self.capacity, self.lattice_shape, self.valid_share)
+        return replace(self, buffer=buffer)
 
 
 def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixels:
@@ -73,7 +84,7 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
         camera: pinhole intrinsics of the frame.
         config: sections `dataset` (depth range), `pixels` and `prior` (normals).
     """
-    sampling = _sampling(config)
+    sampling = _sampling(camera, config)
     buffer, num_valid = ops.sample_frame_pixels(
         torch.from_numpy(np.ascontiguousarray(frame.depth, np.float32)),
         torch.from_numpy(np.ascontiguousarray(frame.color)),
@@ -86,19 +97,20 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
         ops.Stream.PIXEL_DATABASE,
         frame.index,
     )
-    shape = sampling.lattice_shape(*frame.depth.shape)
-    return FramePixels(buffer, sampling.count, shape, num_valid / frame.depth.size)
+    size = frame.depth.shape
+    shapes = sampling.lattice_shape(*size), sampling.view_shape(*size)
+    return FramePixels(buffer, sampling.count, *shapes, num_valid / frame.depth.size)
 
 
 def blank_pixels(camera: Camera, config: Config) -> FramePixels:
     """What `sample_frame` makes of a frame without depth."""
-    sampling = _sampling(config)
-    rows, columns = sampling.lattice_shape(camera.height, camera.width)
-    words = 6 * sampling.count + -(-rows * columns // 2)
-    return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, (rows, columns), 0.0)
+    sampling = _sampling(camera, config)
+    shapes = [shape(camera.height, camera.width) for shape in (sampling.lattice_shape, sampling.view_shape)]
+    words = 6 * sampling.count + sum(-(-rows * columns // 2) for rows, columns in shapes)
+    return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, *shapes, 0.0)
 
 
-def _sampling(config: Config) -> ops.PixelSampling:
+def _sampling(camera: Camera, config: Config) -> ops.PixelSampling:
     return ops.PixelSampling(
         count=config.pixels.per_frame,
         min_depth=config.dataset.min_depth_m,
@@ -106,6 +118,8 @@ def _sampling(config: Config) -> ops.PixelSampling:
         step_px=config.prior.normal_step_px,
         max_jump=config.prior.max_jump,
         lattice_step=LATTICE_STEP_PX,
+        view_step=view_step(camera) if config.tracking.depth_views else 0,
+        view_unit=config.dataset.max_depth_m / UNITS,
     )
 
 

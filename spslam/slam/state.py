@@ -12,6 +12,7 @@ from spslam.config import Config
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import resize_rows
+from spslam.slam.depth_views import DepthViewStore
 from spslam.slam.pixel_database import PixelDatabase
 from spslam.slam.pixels import LATTICE_STEP_PX
 
@@ -170,6 +171,7 @@ class SlamState:
         scene: the map.
         frames: poses and bookkeeping of every frame.
         pixels: pixel records of every frame.
+        views: depth images of some earlier frames; None where tracking does not use them.
         moments: optimiser state by parameter name.
         steps: Adam steps since the moments were last reset.
         stamp: number of mapping iterations ever done; marks rows touched by the current one.
@@ -179,6 +181,7 @@ class SlamState:
     scene: Scene
     frames: FrameTable
     pixels: PixelDatabase
+    views: DepthViewStore | None = None
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
     stamp: int = 0
@@ -210,7 +213,9 @@ class SlamState:
         origin = torch.from_numpy(np.asarray(first_pose)[:3, 3].copy())
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
         pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device, config.pixels.keyframe_every)
-        return cls(scene, FrameTable(camera, device), pixels)
+        tracking, depth_m = config.tracking, config.dataset.max_depth_m
+        views = DepthViewStore(camera, depth_m, tracking.view_kernel_m, device) if tracking.depth_views else None
+        return cls(scene, FrameTable(camera, device), pixels, views)
 
 
 def pose_tensor(matrix: np.ndarray, device: torch.device) -> torch.Tensor:

@@ -92,6 +92,8 @@ class SlamSystem:
         obstructed = tracked.fit.is_obstructed
         # What is before the lens is no part of the scene: neither mapped now nor drawn from later.
         self.state.pixels.add(pixels.records[:0] if obstructed else pixels.records)
+        if self.state.views is not None and not obstructed and not tracked.lost:
+            self.state.views.add(number, pixels.view)
         mapped = not obstructed and self._is_mapping_frame(number)
         self.state.unmapped = not mapped
         iterations, losses = self._map(pixels, marks) if mapped else (0, None)

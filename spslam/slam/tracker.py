@@ -62,6 +62,7 @@ class Tracker:
         weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
         self._references = ReferenceKeeper(camera, weight_m, kernel) if weight_m > 0 else None
         self._reference: ops.ReferenceImage | None = None
+        self._views: ops.DepthViews | None = None
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
@@ -94,6 +95,7 @@ class Tracker:
         if self.is_blind(pixels):
             return TrackingResult(start.clone(), 0, Fit(), lost=True)
         self._reference = self._mapped_view(past)
+        self._views = past.depth_views() if past else None
         adam = self.config.tracking.optimizer == "adam"
         find = self._track_adam if adam else self._track_gauss_newton
         result = find(scene, pixels.records, start, frame, self._iterations(frame))
@@ -177,6 +179,7 @@ class Tracker:
             frame=frame,
             noise_depth=tracking.noise_depth_m,
             reference=self._reference,
+            views=self._views,
         )
         # The frame's one wait for the device.
         numbers = torch.cat([expected, pose, stats[-1], hessian.view(-1)]).tolist()

@@ -13,7 +13,7 @@ from tests.ops.arguments import opcheck
 from tests.reference import pixel_sampling as reference
 
 CAMERA = (61.0, 59.5, 33.2, 21.7)
-SAMPLING = ops.PixelSampling(1000, min_depth=0.1, max_depth=6.0, step_px=3, max_jump=0.05, lattice_step=16)
+SAMPLING = ops.PixelSampling(1000, min_depth=0.1, max_depth=6.0, step_px=3, max_jump=0.05, lattice_step=16, view_step=2)
 # Float32 points within some metres.
 POINT_TOLERANCE_M = 2e-6
 KEY = (2**33 + 5, ops.Stream.PIXEL_DATABASE, 17)
@@ -32,23 +32,25 @@ def frame(generator, height=50, width=70, noise=0.004):
 
 
 def split(buffer, sampling, shape):
-    """Records, normals and lattice as the buffer holds them."""
-    words, rest = buffer.split([6 * sampling.count, len(buffer) - 6 * sampling.count])
+    """Records, normals, lattice and view as the buffer holds them."""
+    (h, w), (rows, columns) = sampling.lattice_shape(*shape), sampling.view_shape(*shape)
+    words, lattice, view = buffer.split([6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2])
     records, normals = words.view(2, sampling.count, 3)
-    rows, columns = sampling.lattice_shape(*shape)
-    lattice = rest.view(torch.float16)
-    assert len(lattice) - rows * columns in (0, 1)
-    return records, normals.view(torch.float32), lattice[: rows * columns].view(rows, columns)
+    lattice, view = lattice.view(torch.float16), view.view(torch.uint16)
+    assert not lattice[h * w :].any()
+    assert not view[rows * columns :].any()
+    return records, normals.view(torch.float32), lattice[: h * w].view(h, w), view[: rows * columns].view(rows, columns)
 
 
 def check_against_numpy(depth, color, sampling):
     buffer, num_valid = ops.sample_frame_pixels(depth, color, *CAMERA, sampling, *KEY)
-    records, normals, lattice = split(buffer, sampling, depth.shape)
+    records, normals, lattice, view = split(buffer, sampling, depth.shape)
     want = reference.sample_frame_pixels(depth.numpy(), color.numpy(), *CAMERA, sampling, *KEY)
-    assert num_valid == want[3]
+    assert num_valid == want[4]
     np.testing.assert_array_equal(records.numpy(), want[0])
     np.testing.assert_array_equal(normals.numpy(), want[1])
     np.testing.assert_array_equal(lattice.numpy(), want[2])
+    np.testing.assert_array_equal(view.numpy(), want[3])
     return records, normals
 
 
@@ -70,6 +72,11 @@ def test_pixels_are_those_of_numpy(noise, generator):
         {"lattice_step": 1},
         {"lattice_step": 7},
         {"lattice_step": 500},
+        {"view_step": 0},
+        {"view_step": 1},
+        {"view_step": 7, "lattice_step": 7},
+        {"view_step": 500},
+        {"view_step": 1, "view_unit": 2e-5},
         {"step_px": 1},
         {"step_px": 30},
         {"max_jump": 10.0},
@@ -164,6 +171,8 @@ def test_wrong_arguments_are_named(generator):
         ({"min_depth": -1.0}, "min_depth must be at least 0, got -1.0"),
         ({"step_px": 0}, r"step_px must be in \[1, 65535\], got 0"),
         ({"max_jump": 0.0}, "max_jump must be positive, got 0.0"),
+        ({"view_step": -1}, r"view_step must be in \[0, 65535\], got -1"),
+        ({"view_unit": 0.0}, "view_unit must be positive, got 0.0"),
         ({"lattice_step": 0}, r"lattice_step must be in \[1, 65535\], got 0"),
         ({"fx": 0.0}, "fx must be positive, got 0.0"),
         ({"color": color[1:]}, r"color must have shape \[50, 70, 3\], got \[49, 70, 3\]"),
@@ -179,7 +188,7 @@ def test_wrong_arguments_are_named(generator):
 
 def test_opcheck(generator):
     depth, color = frame(generator)
-    numbers = (100, 0.1, 6.0, 3, 0.05, 16, 7, 0, 3)
+    numbers = (100, 0.1, 6.0, 3, 0.05, 16, 2, 1e-3, 7, 0, 3)
     torch.library.opcheck(
         torch.ops.spslam.sample_frame_pixels,
         (depth, color, *CAMERA, *numbers),
@@ -195,7 +204,7 @@ def test_opcheck_of_unprojection(device):
 def test_unprojection_is_the_formula(device, generator):
     depth, color = frame(generator)
     buffer, _ = ops.sample_frame_pixels(depth, color, *CAMERA, SAMPLING, *KEY)
-    records, normals, _ = split(buffer, SAMPLING, depth.shape)
+    records, normals, _, _ = split(buffer, SAMPLING, depth.shape)
     pose = torch.tensor([0.7, -0.3, 0.5, 0.2, 1.5, -2.0, 0.3])  # not of unit length
     rotation = torch.from_numpy(quaternion_to_matrix(pose[:4].double().numpy() / pose[:4].double().norm().item()))
     u, v = records[:, 0] & 0xFFFF, records[:, 0] >> 16

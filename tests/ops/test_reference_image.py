@@ -7,7 +7,16 @@ import torch
 from spslam import ops
 from spslam.geometry import pose7_to_matrix, rotation_angle
 from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
-from tests.ops.tracking_scene import OPTIONS, POSE, camera_points, moved_points, moved_pose, pose7, surface_equations
+from tests.ops.tracking_scene import (
+    OPTIONS,
+    POSE,
+    camera_points,
+    corner_depth,
+    moved_points,
+    moved_pose,
+    pose7,
+    surface_equations,
+)
 
 ONE_STEP = dict(
     num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0, seed=3
@@ -74,15 +83,13 @@ CELL_PX = 2
 
 def _reference(pose, device="cpu", weight=0.3):
     """The corner, painted with smooth waves, as a camera at `pose` (float64 [4, 4]) sees it in cells."""
-    rows, columns = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
     intrinsics = ops.Intrinsics(INTRINSICS.fx / CELL_PX, INTRINSICS.fy / CELL_PX, 15.5, 11.5)
+    depth = corner_depth(pose, intrinsics, 24, 32)
+    v, u = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
     rays = torch.stack(
-        [(columns - intrinsics.cx) / intrinsics.fx, (rows - intrinsics.cy) / intrinsics.fy, torch.ones(24, 32)], -1
+        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, torch.ones(24, 32)], -1
     )
-    directions = rays.double() @ torch.from_numpy(pose[:3, :3]).T
-    walls = torch.tensor([0.9, 0.5, 1.1], dtype=torch.float64) - torch.from_numpy(pose[:3, 3])
-    depth = torch.where(directions > 1e-6, walls / directions, torch.inf).min(-1).values
-    points = directions * depth[..., None] + torch.from_numpy(pose[:3, 3])
+    points = rays.double() @ torch.from_numpy(pose[:3, :3]).T * depth[..., None] + torch.from_numpy(pose[:3, 3])
     cells = torch.stack([_paint(points), depth], -1).float().to(device)
     return ops.ReferenceImage(cells, pose7(pose, device), intrinsics, weight, kernel=0.4)
 
@@ -217,5 +224,5 @@ def test_opcheck_with_a_reference(generator):
     scene, reference = make_scene(generator, random_decoder=False), _reference(POSE)
     arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.02, 1e-4)
     image = (reference.cells, reference.pose, list(reference.intrinsics), 0.3, 0.4)
-    call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image)
+    call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image, None, None, [], [], 1.0, 1.0)
     torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)

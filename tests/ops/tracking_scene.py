@@ -46,6 +46,15 @@ def moved_points(local, increment):
     return local @ (rotation_exp(increment[3:]) @ rotation).T + translation + increment[:3]
 
 
+def corner_depth(pose, camera, rows, columns):
+    """float64 [rows, columns] depth (m) of the corner's walls as a camera at `pose` (float64 [4, 4]) sees them."""
+    v, u = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones(rows, columns)], -1)
+    directions = rays.double() @ torch.from_numpy(pose[:3, :3]).T
+    walls = torch.tensor([0.9, 0.5, 1.1], dtype=torch.float64) - torch.from_numpy(pose[:3, 3])
+    return torch.where(directions > 1e-6, walls / directions, torch.inf).min(-1).values
+
+
 def surface_equations(scene, records, kernel):
     """Residual [P], Jacobian [P, 6] through the SDF's own gradient, weight [P] and inliers [P] at POSE, all float64."""
     local, zero = camera_points(records), torch.zeros(6, dtype=torch.float64)

@@ -32,6 +32,9 @@ def dataset():
     return Recorded(12)
 
 
+MOVING_POSES = ("mapping.optimize_poses=true", "mapping.pose_rate=0.001")
+
+
 def processed(dataset, count, *overrides, preset=None):
     system = SlamSystem(settings(*overrides, preset=preset), dataset.camera, dataset.poses()[0])
     for i in range(count):
@@ -114,7 +117,7 @@ def test_a_lost_frame_does_not_touch_the_map(dataset):
 
 
 def test_the_first_pose_is_held_and_others_move(dataset):
-    system = processed(dataset, 6, "mapping.every=100", "mapping.pose_rate=0.001")
+    system = processed(dataset, 6, "mapping.every=100", *MOVING_POSES)
     before = system.state.frames.poses.clone()
     system.mapper.optimize(system.state, 3)
     after = system.state.frames.poses
@@ -196,7 +199,7 @@ def test_a_state_without_frames_is_usable_for_nothing(dataset):
 
 
 def test_with_keyframes_mapping_moves_theirs_and_the_newest_pose_alone(dataset):
-    system = processed(dataset, 10, "pixels.keyframe_every=4", "mapping.every=5", "mapping.iterations=0")
+    system = processed(dataset, 10, "pixels.keyframe_every=4", "mapping.iterations=0", *MOVING_POSES)
     before = system.state.frames.poses.clone()
     system.mapper.optimize(system.state, 3)
     moved = (system.state.frames.poses != before).any(1)

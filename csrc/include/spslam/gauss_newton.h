@@ -27,6 +27,20 @@ struct ReferenceImage {
   float kernel;           // width of the robust kernel, intensity
 };
 
+constexpr int kMaxDepthViews = 8;
+
+// Depth images of earlier frames, which tracking holds surface points against; none where count is 0.
+struct DepthViews {
+  const std::uint16_t* images;  // [R, height, width] depth in `unit`, 0 where unknown
+  const float* poses;           // [F, 7] T_world_camera
+  std::int64_t height, width;
+  Intrinsics intrinsics;  // of the images
+  float unit;             // m
+  float kernel_end;       // m, width of the robust kernel at the last iterations
+  int count;
+  std::int64_t image_rows[kMaxDepthViews], pose_rows[kMaxDepthViews];  // of each view
+};
+
 struct TrackingOptions {
   Intrinsics intrinsics;
   std::int64_t num_pixels, iterations;
@@ -37,6 +51,7 @@ struct TrackingOptions {
   PhiloxKey key;      // its iteration is replaced by the running one
   float noise_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
   ReferenceImage reference;
+  DepthViews views;
   bool tf32;  // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
 };
 

@@ -1,0 +1,105 @@
+// The maths of aligning a frame with earlier frames' depth images: how far a surface point lies from what was seen
+// there.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/macros.h"
+#include "core/vec.h"
+#include "kernels/gauss_newton.h"
+#include "spslam/gauss_newton.h"
+
+namespace spslam {
+
+// And the sum of weights; of pairs where the map is known too, the map's weighted squares and sum of weights. The
+// cost's place holds the weighted squares of such pairs.
+constexpr int kViewTerms = kNormalTerms + 3;
+// Four pixels whose inverse depths spread more than this share have an edge between them.
+constexpr float kMaxViewSpread = 0.03f;
+constexpr float kMinViewDepth = 0.05f;  // m
+// The map weighs this much at least and at most, against one view's pixel.
+constexpr double kMinMapShare = 1e-3, kMaxMapShare = 4.0;
+
+// Of the map and, after them, of the views.
+constexpr int kJointTerms = kTrackingTerms + kViewTerms;
+
+// An earlier frame with its pose read.
+struct DepthView {
+  const std::uint16_t* image;
+  Pose<float> pose;
+};
+
+SPS_INLINE DepthView load_depth_view(const DepthViews& views, int k) {
+  return {views.images + views.image_rows[k] * views.height * views.width,
+          load_pose(views.poses + kPoseSize * views.pose_rows[k])};
+}
+
+// The map's residual (m) at a pixel, where the map knows the surface.
+struct MapResidual {
+  float value;
+  bool known;
+};
+
+// Adds a world point's signed distance (m) from the surface that an earlier frame saw, beyond it positive, to terms of
+// type T; nothing where the point falls off the image or between pixels that have no depth or an edge. The inverse
+// depth q of a plane is linear in the image, so z q(u, v) - 1 is linear in the point, and by its slope a distance.
+template <class T>
+SPS_INLINE void add_depth_view_residual(const DepthViews& views, const DepthView& view, const Vec3<float>& world,
+                                        const Vec3<float>& offset, float kernel, float certainty,
+                                        const MapResidual& map, T* terms) {
+  const float* r = view.pose.rotation.m;
+  const Vec3<float> from = world - view.pose.translation;
+  const Vec3<float> seen{r[0] * from.x + r[3] * from.y + r[6] * from.z, r[1] * from.x + r[4] * from.y + r[7] * from.z,
+                         r[2] * from.x + r[5] * from.y + r[8] * from.z};
+  if (!(seen.z > kMinViewDepth)) return;
+  const Intrinsics& k = views.intrinsics;
+  const float inverse_z = 1.0f / seen.z;
+  const float u = seen.x * inverse_z * k.fx + k.cx, v = seen.y * inverse_z * k.fy + k.cy;
+  if (!(u >= 0.0f && v >= 0.0f && u < static_cast<float>(views.width - 1) && v < static_cast<float>(views.height - 1)))
+    return;
+  const float left = std::floor(u), top = std::floor(v), a = u - left, b = v - top;
+  const std::uint16_t* row =
+      view.image + static_cast<std::int64_t>(top) * views.width + static_cast<std::int64_t>(left);
+  const std::uint16_t d00 = row[0], d01 = row[1], d10 = row[views.width], d11 = row[views.width + 1];
+  if (d00 == 0 || d01 == 0 || d10 == 0 || d11 == 0) return;
+  const float q00 = 1.0f / (views.unit * d00), q01 = 1.0f / (views.unit * d01);
+  const float q10 = 1.0f / (views.unit * d10), q11 = 1.0f / (views.unit * d11);
+  const float most = std::fmax(std::fmax(q00, q01), std::fmax(q10, q11));
+  const float least = std::fmin(std::fmin(q00, q01), std::fmin(q10, q11));
+  if (!(most - least < kMaxViewSpread * most)) return;
+  const float upper = q00 + a * (q01 - q00), lower = q10 + a * (q11 - q10);
+  const float by_u = (1.0f - b) * (q01 - q00) + b * (q11 - q10), by_v = lower - upper;
+  const float q = upper + b * by_v;
+  const float x = by_u * k.fx, y = by_v * k.fy;
+  const Vec3<float> gradient{x, y, q - (x * seen.x + y * seen.y) * inverse_z};
+  const float inverse_slope = 1.0f / std::fmax(std::sqrt(dot(gradient, gradient)), 1e-6f);
+  const float residual = (seen.z * q - 1.0f) * inverse_slope;
+  const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel));
+  add_weighted_residual(offset, residual, view.pose.rotation * (inverse_slope * gradient), weight, terms);
+  if (!map.known) return;
+  const T of_map = static_cast<T>(certainty) * static_cast<T>(robust_weight(map.value, kernel));
+  const T squared = static_cast<T>(residual) * static_cast<T>(residual);
+  terms[kNormalTerms - 1] += weight * squared;
+  terms[kNormalTerms] += weight;
+  terms[kNormalTerms + 1] += of_map * static_cast<T>(map.value) * static_cast<T>(map.value);
+  terms[kNormalTerms + 2] += of_map;
+}
+
+// What the map's equations count against the mean of the views': the square of the ratio of variances, as the map's
+// error, unlike a sensor's noise, is alike for neighbouring pixels and does not average out. 1 without common pixels.
+SPS_INLINE double map_share(const double* views) {
+  const double of_views = views[kNormalTerms], of_map = views[kNormalTerms + 2];
+  if (!(of_views > 1e-6 && of_map > 1e-6)) return 1.0;
+  const double ratio = views[kNormalTerms - 1] / of_views / (views[kNormalTerms + 1] / of_map + 1e-12);
+  const double share = ratio * ratio;
+  return share < kMinMapShare ? kMinMapShare : share < kMaxMapShare ? share : kMaxMapShare;
+}
+
+// The equations that the step is solved from: those of the map times its share, and the mean of the views'.
+SPS_INLINE void join_view_terms(const double* map, const double* views, int count, double* joint) {
+  const double share = count > 0 ? map_share(views) : 1.0, of_view = count > 0 ? 1.0 / count : 0.0;
+  for (int t = 0; t < kNormalTerms; ++t) joint[t] = count > 0 ? share * map[t] + of_view * views[t] : map[t];
+}
+
+}  // namespace spslam
