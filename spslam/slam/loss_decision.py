@@ -10,8 +10,8 @@ information the smallest eigenvalue of the normal equations a pixel, scaled as i
 direction is held; m and rad about the camera), jump = ln(1 + distance / 5 cm + angle / 2.5 degrees) from where the
 motion model put the camera, conflict the share of the surface known from other frames that it would have to look
 through. Support counts for more on a map with holes, as small images or few points leave it, and information below
-0.002, the least of clean runs, two and a half times as much. likeness is the correlation of the picture's brightness with that of the
-map's colours; right poses have 0.26 or more, and only less counts.
+0.002, the least of clean runs, two and a half times as much. likeness is the correlation of the picture's brightness
+with that of the map's colours; right poses have 0.26 or more, and only less counts.
 What is not known takes part as a number between right and wrong.
 """
 

@@ -105,7 +105,8 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
 def blank_pixels(camera: Camera, config: Config) -> FramePixels:
     """What `sample_frame` makes of a frame without depth."""
     sampling = _sampling(camera, config)
-    shapes = [shape(camera.height, camera.width) for shape in (sampling.lattice_shape, sampling.view_shape)]
+    size = camera.height, camera.width
+    shapes = sampling.lattice_shape(*size), sampling.view_shape(*size)
     words = 6 * sampling.count + sum(-(-rows * columns // 2) for rows, columns in shapes)
     return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, *shapes, 0.0)
 
