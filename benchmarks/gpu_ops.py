@@ -74,7 +74,7 @@ def icp_rows(rays: ops.RayBatch, rounds: int) -> list[dict[str, object]]:
     camera = Camera(room.WIDTH, room.HEIGHT, *rays.intrinsics)
     normals = torch.tensor([0.0, 0.0, -1.0], device=rays.pixels.device).expand(len(rays.pixels), 3)
     buffer = torch.cat([rays.pixels.flatten(), normals.contiguous().view(torch.int32).flatten()])
-    pixels = FramePixels(buffer, len(rays.pixels), (0, 0), 1.0)
+    pixels = FramePixels(buffer, len(rays.pixels), (0, 0), (0, 0), 1.0)
     vertices, map_normals, intrinsics = surface_maps(pixels, camera)
     points = unpack_points(rays.pixels[:POINTS], camera)
     start = torch.tensor([1.0, 0, 0, 0, 0, 0, 0.05], device=points.device)
