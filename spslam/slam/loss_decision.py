@@ -26,6 +26,7 @@ JUDGING_KERNEL_M = 0.02  # of the weights behind support and information
 JUMP_CM, JUMP_DEG = 5.0, 2.5
 LEAST_INFORMATION = 1e-6
 FIRM_INFORMATION = 0.002  # or more, in clean runs; with less, a pose slides where little holds it
+PER_WEAK_INFORMATION = 2.5  # as much as above that
 MOST_CONFLICT = 0.3  # beyond it one wrong pose is as wrong as another
 UNKNOWN_JUMP, UNKNOWN_CONFLICT = 1.3, 0.11
 USUAL_COVERAGE = 0.9  # or more, in the runs of the calibration
@@ -85,7 +86,7 @@ class Fit:
     def _lg_information(self) -> float:
         """The logarithm of the information, which falls two and a half times as fast below that of any clean run."""
         lg = math.log10(max(self.information, LEAST_INFORMATION))
-        return lg + 1.5 * min(lg - math.log10(FIRM_INFORMATION), 0.0)
+        return lg + (PER_WEAK_INFORMATION - 1) * min(lg - math.log10(FIRM_INFORMATION), 0.0)
 
     @property
     def _unlikeness(self) -> float:

@@ -14,6 +14,7 @@ def test_coefficients_of_made_up_poses():
             random.exponential(3, 20000),
             random.exponential(2, 20000),
             random.uniform(0, 0.3, 20000),
+            random.uniform(-1, 1, 20000),  # likeness takes no part in the fit
         ],
         axis=1,
     )
