@@ -125,11 +125,12 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
     measure.kernel = tracking_kernel(options, iteration);
+    measure.views.count = views_in_use(options.views, iteration);
     sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
                terms);
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, options.num_pixels, own_stats);
-    join_view_terms(terms, terms + kTrackingTerms, options.views.count, joint);
+    join_view_terms(terms, terms + kTrackingTerms, measure.views.count, joint);
     tracking_step(terms, joint, options.damping, pose, own_stats + 2, hessian);
   }
 }

@@ -58,6 +58,7 @@ struct Measurement {
   ReferenceView reference;
   DepthViews views;
   const DepthView* view;  // in shared memory
+  int num_views;          // that take part
 };
 
 // Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms of the map and of the views.
@@ -78,7 +79,7 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   // Two lanes bring the same pixel; one adds it, and they share the views.
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
   const float certainty = depth_certainty(pixel.depth, measure.noise_depth);
-  for (int v = lane % 4 / 2; v < measure.views.count && pixel.depth > 0.0f; v += 2) {
+  for (int v = lane % 4 / 2; v < measure.num_views && pixel.depth > 0.0f; v += 2) {
     add_depth_view_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view, certainty,
                             {sdf * measure.truncation, known}, view_terms);
   }
@@ -177,17 +178,18 @@ __global__ void __launch_bounds__(kThreads)
   const PhiloxKey key{options.key.seed, options.key.stream, options.key.frame, 0};
   PixelQueue queue({pixels, num_records, options.num_pixels, true, key}, 0);
   const ReferenceView reference = load_reference(options.reference);
-  const int views = options.views.count;
-  if (threadIdx.x < views) view[threadIdx.x] = load_depth_view(options.views, threadIdx.x);
+  if (threadIdx.x < options.views.count) view[threadIdx.x] = load_depth_view(options.views, threadIdx.x);
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
+    const int num_views = views_in_use(options.views, iteration);
     const Measurement measure{options.intrinsics,
                               options.truncation,
                               tracking_kernel(options, iteration),
                               options.noise_depth,
                               reference,
                               options.views,
-                              view};
+                              view,
+                              num_views};
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
     double* shared_sums = partials + (iteration % 2) * gridDim.x * kSums;
@@ -195,7 +197,7 @@ __global__ void __launch_bounds__(kThreads)
     cooperative_groups::this_grid().sync();
     add_partials(shared_sums, gridDim.x, shares, terms);
     if (threadIdx.x == 0) {
-      join_view_terms(terms, terms + kPaddedTerms, views, joint);
+      join_view_terms(terms, terms + kPaddedTerms, num_views, joint);
       tracking_step(terms, joint, options.damping, own_pose, own_stats + 2, own_hessian);
     }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
@@ -281,7 +283,7 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
     const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
-    const Measurement measure{intrinsics, truncation, {kernel, kernel, kernel}, 0.0f, {}, {}, nullptr};
+    const Measurement measure{intrinsics, truncation, {kernel, kernel, kernel}, 0.0f, {}, {}, nullptr, 0};
     residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, measure, partials);
   }
   store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, hessian,

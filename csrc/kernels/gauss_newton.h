@@ -107,6 +107,11 @@ SPS_INLINE KernelWidths tracking_kernel(const TrackingOptions& options, std::int
   return {step, options.kernel_judge > 0.0f ? options.kernel_judge : step, view};
 }
 
+// How many views take part in an iteration.
+SPS_INLINE int views_in_use(const DepthViews& views, std::int64_t iteration) {
+  return iteration >= views.first_iteration ? views.count : 0;
+}
+
 // Weighted mean squared residual, m^2.
 SPS_INLINE double tracking_cost(const double* terms) {
   const double weights = terms[kNormalTerms];

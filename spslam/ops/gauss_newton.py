@@ -86,6 +86,7 @@ class DepthViews(NamedTuple):
         rows: of each view, at most 8, the row of its image and the row of its pose.
         intrinsics: of the images, px.
         kernel_end: last width of the robust kernel of these distances, m; the first is that of the map's.
+        first_iteration: from which on they take part; the map alone brings a pose from farther away.
     """
 
     images: torch.Tensor
@@ -94,6 +95,7 @@ class DepthViews(NamedTuple):
     rows: tuple[tuple[int, int], ...]
     intrinsics: Intrinsics
     kernel_end: float
+    first_iteration: int = 0
 
 
 def track_gauss_newton(
@@ -190,12 +192,20 @@ def track_gauss_newton(
     if reference is not None:
         _check_reference(name, reference, like=scene.embeddings)
         image = (reference.cells, reference.pose, list(reference.intrinsics), reference.weight, reference.kernel)
-    earlier: tuple[torch.Tensor | None, torch.Tensor | None, list[int], list[float], float, float]
-    earlier = (None, None, [], [], 1.0, 1.0)
+    earlier: tuple[torch.Tensor | None, torch.Tensor | None, list[int], list[float], float, float, int]
+    earlier = (None, None, [], [], 1.0, 1.0, 0)
     if views is not None:
         _check_views(name, views, like=scene.embeddings)
         rows = [row for pair in views.rows for row in pair]
-        earlier = (views.images, views.poses, rows, list(views.intrinsics), views.unit, views.kernel_end)
+        earlier = (
+            views.images,
+            views.poses,
+            rows,
+            list(views.intrinsics),
+            views.unit,
+            views.kernel_end,
+            views.first_iteration,
+        )
     return torch.ops.spslam.track_gauss_newton(
         *scene.arguments(),
         pixels,

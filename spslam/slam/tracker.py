@@ -23,6 +23,7 @@ AGREE_CM, AGREE_DEG = 5.0, 4.0  # from one frame to the next
 AGREEING_DOUBT = 0.1  # of each at most
 AGREEING_INFORMATION = 0.004  # of each at least: a plane agrees with itself wherever it is laid
 MAPPED_SUPPORT = 0.7  # a frame to be mapped that has less may have something before the lens
+LITTLE_DEPTH = 0.25  # of the picture
 SHORT_LOSS = 5  # frames: for as long the camera cannot be far from where it was
 RESCUE_GAIN = 0.02  # of support: less is the chance of another draw, and no other pose
 
@@ -63,6 +64,7 @@ class Tracker:
         self._references = ReferenceKeeper(camera, weight_m, kernel) if weight_m > 0 else None
         self._reference: ops.ReferenceImage | None = None
         self._views: ops.DepthViews | None = None
+        self._views_from_the_start = False
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
@@ -96,6 +98,7 @@ class Tracker:
             return TrackingResult(start.clone(), 0, Fit(), lost=True)
         self._reference = self._mapped_view(past)
         self._views = past.depth_views() if past else None
+        self._views_from_the_start = pixels.valid_share < LITTLE_DEPTH
         adam = self.config.tracking.optimizer == "adam"
         find = self._track_adam if adam else self._track_gauss_newton
         result = find(scene, pixels.records, start, frame, self._iterations(frame))
@@ -179,7 +182,7 @@ class Tracker:
             frame=frame,
             noise_depth=tracking.noise_depth_m,
             reference=self._reference,
-            views=self._views,
+            views=self._views_of(iterations),
         )
         # The frame's one wait for the device.
         numbers = torch.cat([expected, pose, stats[-1], hessian.view(-1)]).tolist()
@@ -192,6 +195,15 @@ class Tracker:
             *jump(numbers[:7], numbers[7:14]),
         )
         return TrackingResult(pose, iterations, fit, self._is_lost(fit))
+
+    def _views_of(self, iterations: int) -> ops.DepthViews | None:
+        """The views, which join in the second half: the map alone brings a pose from farther away.
+
+        A strip of depth would slide along the map before that, so there they hold the pose from the start.
+        """
+        if self._views is None or self._views_from_the_start:
+            return self._views
+        return self._views._replace(first_iteration=iterations // 2)
 
     def _is_lost(self, fit: Fit) -> bool:
         """Whether the pose is to be given up; one of NaN has no inliers."""

@@ -186,6 +186,22 @@ def test_views_alone_find_the_pose(device, generator):
     assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.1
 
 
+def test_views_join_when_they_are_told_to(device, generator):
+    """Before their first iteration they are as good as not there."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    arguments = scene, corner_pixels(POSE, generator, 400).to(device), pose7(POSE, device), INTRINSICS
+    views = _views(EARLIER, device)
+
+    def track(**options):
+        return ops.track_gauss_newton(*arguments, **OPTIONS, frame=4, tf32=False, **options)[1]
+
+    plain, late = track(), track(views=views._replace(first_iteration=5))
+    assert torch.equal(late[:5], plain[:5])
+    # The step of iteration 5 is the first that they change.
+    assert not torch.equal(late[5, 2:4], plain[5, 2:4])
+    assert not torch.equal(track(views=views)[0, 2:4], plain[0, 2:4])
+
+
 def test_what_no_view_knows_moves_nothing(device, generator):
     """No depth, another direction, behind the camera, no views, and images too small to lie between pixels."""
     records = corner_pixels(POSE, generator).to(device)
@@ -246,6 +262,6 @@ def test_opcheck_with_views(device, generator):
     scene, views = make_scene(generator, random_decoder=False), _views(EARLIER)
     arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.02, 1e-4)
     rows = [row for pair in views.rows for row in pair]
-    of_views = (views.images, views.poses, rows, list(views.intrinsics), views.unit, views.kernel_end)
+    of_views = (views.images, views.poses, rows, list(views.intrinsics), views.unit, views.kernel_end, 0)
     call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, None, None, [], 0.0, 1.0, *of_views)
     opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)

@@ -148,7 +148,7 @@ def test_opcheck(device, generator):
     scene = make_scene(generator, random_decoder=False)
     records, pose = corner_pixels(POSE, generator, 50), pose7(POSE)
     arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.03, 1e-4, 0, 1, 0, 1.0)
-    call = (*scene.arguments(), *arguments, None, None, [], 0.3, 0.4, None, None, [], [], 1.0, 1.0)
+    call = (*scene.arguments(), *arguments, None, None, [], 0.3, 0.4, None, None, [], [], 1.0, 1.0, 0)
     opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)
     opcheck(torch.ops.spslam.predict_pose.default, (pose, pose), device)
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)

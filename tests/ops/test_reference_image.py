@@ -224,5 +224,5 @@ def test_opcheck_with_a_reference(generator):
     scene, reference = make_scene(generator, random_decoder=False), _reference(POSE)
     arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.02, 1e-4)
     image = (reference.cells, reference.pose, list(reference.intrinsics), 0.3, 0.4)
-    call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image, None, None, [], [], 1.0, 1.0)
+    call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image, None, None, [], [], 1.0, 1.0, 0)
     torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)

@@ -34,9 +34,10 @@ struct DepthViews {
   const std::uint16_t* images;  // [R, height, width] depth in `unit`, 0 where unknown
   const float* poses;           // [F, 7] T_world_camera
   std::int64_t height, width;
-  Intrinsics intrinsics;  // of the images
-  float unit;             // m
-  float kernel_end;       // m, width of the robust kernel at the last iterations
+  Intrinsics intrinsics;         // of the images
+  float unit;                    // m
+  float kernel_end;              // m, width of the robust kernel at the last iterations
+  std::int64_t first_iteration;  // from which on they take part
   int count;
   std::int64_t image_rows[kMaxDepthViews], pose_rows[kMaxDepthViews];  // of each view
 };
