@@ -136,7 +136,9 @@ class TrackingOptions(Section):
     depth_views: bool = _option(
         "gauss_newton: hold a frame also against the depth images of the last one, one 10 and one 40 frames back"
     )
-    view_kernel_m: float = _option("width of the robust kernel of these distances in the last iteration", "m", gt=0)
+    view_kernel_m: float = _option(
+        "gauss_newton: width of the robust kernel of distances from these images in the last iteration", "m", gt=0
+    )
     rescue: bool = _option(
         "start anew from projective ICP where a frame fits the map badly; with adam only where it is lost"
     )

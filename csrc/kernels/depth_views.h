@@ -7,6 +7,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/earlier_frame.h"
 #include "kernels/gauss_newton.h"
 #include "spslam/gauss_newton.h"
 
@@ -17,7 +18,6 @@ namespace spslam {
 constexpr int kViewTerms = kNormalTerms + 3;
 // Four pixels whose inverse depths spread more than this share have an edge between them.
 constexpr float kMaxViewSpread = 0.03f;
-constexpr float kMinViewDepth = 0.05f;  // m
 // The map weighs this much at least and at most, against one view's pixel.
 constexpr double kMinMapShare = 1e-3, kMaxMapShare = 4.0;
 
@@ -48,19 +48,9 @@ template <class T>
 SPS_INLINE void add_depth_view_residual(const DepthViews& views, const DepthView& view, const Vec3<float>& world,
                                         const Vec3<float>& offset, float kernel, float certainty,
                                         const MapResidual& map, T* terms) {
-  const float* r = view.pose.rotation.m;
-  const Vec3<float> from = world - view.pose.translation;
-  const Vec3<float> seen{r[0] * from.x + r[3] * from.y + r[6] * from.z, r[1] * from.x + r[4] * from.y + r[7] * from.z,
-                         r[2] * from.x + r[5] * from.y + r[8] * from.z};
-  if (!(seen.z > kMinViewDepth)) return;
-  const Intrinsics& k = views.intrinsics;
-  const float inverse_z = 1.0f / seen.z;
-  const float u = seen.x * inverse_z * k.fx + k.cx, v = seen.y * inverse_z * k.fy + k.cy;
-  if (!(u >= 0.0f && v >= 0.0f && u < static_cast<float>(views.width - 1) && v < static_cast<float>(views.height - 1)))
-    return;
-  const float left = std::floor(u), top = std::floor(v), a = u - left, b = v - top;
-  const std::uint16_t* row =
-      view.image + static_cast<std::int64_t>(top) * views.width + static_cast<std::int64_t>(left);
+  const FramePlace place = place_in_frame(view.pose, views.intrinsics, views.height, views.width, world);
+  if (!place.inside) return;
+  const std::uint16_t* row = view.image + place.row * views.width + place.column;
   const std::uint16_t d00 = row[0], d01 = row[1], d10 = row[views.width], d11 = row[views.width + 1];
   if (d00 == 0 || d01 == 0 || d10 == 0 || d11 == 0) return;
   const float q00 = 1.0f / (views.unit * d00), q01 = 1.0f / (views.unit * d01);
@@ -68,13 +58,11 @@ SPS_INLINE void add_depth_view_residual(const DepthViews& views, const DepthView
   const float most = std::fmax(std::fmax(q00, q01), std::fmax(q10, q11));
   const float least = std::fmin(std::fmin(q00, q01), std::fmin(q10, q11));
   if (!(most - least < kMaxViewSpread * most)) return;
-  const float upper = q00 + a * (q01 - q00), lower = q10 + a * (q11 - q10);
-  const float by_u = (1.0f - b) * (q01 - q00) + b * (q11 - q10), by_v = lower - upper;
-  const float q = upper + b * by_v;
-  const float x = by_u * k.fx, y = by_v * k.fy;
-  const Vec3<float> gradient{x, y, q - (x * seen.x + y * seen.y) * inverse_z};
+  const BilinearValue q = bilinear_value(q00, q01, q10, q11, place.a, place.b);
+  const float x = q.by_u * views.intrinsics.fx, y = q.by_v * views.intrinsics.fy;
+  const Vec3<float> gradient{x, y, q.value - (x * place.seen.x + y * place.seen.y) * place.inverse_z};
   const float inverse_slope = 1.0f / std::fmax(std::sqrt(dot(gradient, gradient)), 1e-6f);
-  const float residual = (seen.z * q - 1.0f) * inverse_slope;
+  const float residual = (place.seen.z * q.value - 1.0f) * inverse_slope;
   const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel));
   add_weighted_residual(offset, residual, view.pose.rotation * (inverse_slope * gradient), weight, terms);
   if (!map.known) return;

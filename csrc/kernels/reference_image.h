@@ -7,6 +7,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/earlier_frame.h"
 #include "kernels/gauss_newton.h"
 #include "kernels/pixel_record.h"
 #include "spslam/gauss_newton.h"
@@ -49,31 +50,23 @@ template <class T>
 SPS_INLINE void add_intensity_residual(const ReferenceView& reference, const Pixel& pixel, const Vec3<float>& world,
                                        const Vec3<float>& offset, T* terms) {
   const ReferenceImage& image = reference.image;
-  const float* r = reference.pose.rotation.m;
-  const Vec3<float> from = world - reference.pose.translation;
-  const Vec3<float> seen{r[0] * from.x + r[3] * from.y + r[6] * from.z, r[1] * from.x + r[4] * from.y + r[7] * from.z,
-                         r[2] * from.x + r[5] * from.y + r[8] * from.z};
-  if (!(pixel.depth > 0.0f) || !(seen.z > 0.05f)) return;
-  const Intrinsics& k = image.intrinsics;
-  const float inverse_z = 1.0f / seen.z;
-  const float u = seen.x * inverse_z * k.fx + k.cx, v = seen.y * inverse_z * k.fy + k.cy;
-  if (!(u >= 0.0f && v >= 0.0f && u < static_cast<float>(image.width - 1) && v < static_cast<float>(image.height - 1)))
-    return;
-  const float left = std::floor(u), top = std::floor(v), a = u - left, b = v - top;
-  const std::int64_t column = static_cast<std::int64_t>(left), row = static_cast<std::int64_t>(top);
-  const ReferenceCorner c00 = reference_corner(image, row, column), c01 = reference_corner(image, row, column + 1);
-  const ReferenceCorner c10 = reference_corner(image, row + 1, column),
-                        c11 = reference_corner(image, row + 1, column + 1);
+  if (!(pixel.depth > 0.0f)) return;
+  const FramePlace place = place_in_frame(reference.pose, image.intrinsics, image.height, image.width, world);
+  if (!place.inside) return;
+  const Vec3<float>& seen = place.seen;
+  const ReferenceCorner c00 = reference_corner(image, place.row, place.column),
+                        c01 = reference_corner(image, place.row, place.column + 1),
+                        c10 = reference_corner(image, place.row + 1, place.column),
+                        c11 = reference_corner(image, place.row + 1, place.column + 1);
   const float tolerance = kReferenceDepthAgreement * seen.z;
   const auto agrees = [&](const ReferenceCorner& c) { return std::fabs(c.depth - seen.z) < tolerance; };
   if (!(agrees(c00) && agrees(c01) && agrees(c10) && agrees(c11))) return;
-  const float upper = c00.intensity + a * (c01.intensity - c00.intensity);
-  const float lower = c10.intensity + a * (c11.intensity - c10.intensity);
-  const float difference = upper + b * (lower - upper) - luma(pixel.color);
-  const float by_u = (1.0f - b) * (c01.intensity - c00.intensity) + b * (c11.intensity - c10.intensity);
-  const float by_v = lower - upper;
-  const float x = by_u * k.fx * inverse_z, y = by_v * k.fy * inverse_z;
-  const Vec3<float> by_seen{x, y, -(x * seen.x + y * seen.y) * inverse_z};
+  const BilinearValue intensity =
+      bilinear_value(c00.intensity, c01.intensity, c10.intensity, c11.intensity, place.a, place.b);
+  const float difference = intensity.value - luma(pixel.color);
+  const float x = intensity.by_u * image.intrinsics.fx * place.inverse_z;
+  const float y = intensity.by_v * image.intrinsics.fy * place.inverse_z;
+  const Vec3<float> by_seen{x, y, -(x * seen.x + y * seen.y) * place.inverse_z};
   const Vec3<float> slope = image.weight * (reference.pose.rotation * by_seen);
   add_weighted_residual(offset, image.weight * difference, slope,
                         static_cast<T>(robust_weight(difference, image.kernel)), terms);

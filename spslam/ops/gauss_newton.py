@@ -28,7 +28,6 @@ from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 # What red, green and blue count for in a reference's intensity (Rec. 601), in thousandths; the kernel's own.
 LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
 
-
 _MAX_VIEWS = 8
 
 
@@ -242,6 +241,7 @@ def _check_views(name: str, views: DepthViews, like: torch.Tensor) -> None:
     check_intrinsics(name, views.intrinsics, "views.intrinsics")
     check(views.unit > 0, name, "views.unit", "be positive", views.unit)
     check(views.kernel_end > 0, name, "views.kernel_end", "be positive", views.kernel_end)
+    check(views.first_iteration >= 0, name, "views.first_iteration", "be at least 0", views.first_iteration)
     check(len(views.rows) <= _MAX_VIEWS, name, "views.rows", f"be at most {_MAX_VIEWS}", len(views.rows))
     for image, pose in views.rows:
         inside = 0 <= image < len(views.images) and 0 <= pose < len(views.poses)

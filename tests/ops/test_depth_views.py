@@ -7,12 +7,15 @@ import torch
 from spslam import ops
 from spslam.geometry import pose7_to_matrix, rotation_angle
 from tests.ops.arguments import opcheck
-from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
+from tests.ops.scenes import INTRINSICS, corner_pixels, make_scene
 from tests.ops.tracking_scene import (
+    KEY,
+    ONE_STEP,
     OPTIONS,
     POSE,
     camera_points,
     corner_depth,
+    drawn_pixels,
     moved_points,
     moved_pose,
     pose7,
@@ -20,17 +23,9 @@ from tests.ops.tracking_scene import (
     surface_equations,
 )
 
-ONE_STEP = dict(
-    num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0, seed=3
-)
-KEY = dict(stream=1, frame=4)
 UNIT = 1e-4
 CAMERA = ops.Intrinsics(50.0, 52.0, 32.3, 21.8)  # of the views, another than that of the pixels
 SHAPE = (45, 66)
-
-
-def _drawn(records):
-    return records[ops.sample_indices(3, KEY["stream"], KEY["frame"], 0, ONE_STEP["num_pixels"], len(records))]
 
 
 def _views(poses, device="cpu", noise=0.0, generator=None):
@@ -108,7 +103,7 @@ EARLIER = [moved_pose(POSE, np.array([0.02, -0.01, 0.015]), 0.03), moved_pose(PO
 
 def test_distances_are_those_from_the_walls(generator):
     """Nearly: between pixels on both sides of a corner the inverse depth is not linear."""
-    records = _drawn(corner_pixels(POSE, generator, 400))
+    records = drawn_pixels(corner_pixels(POSE, generator, 400))
     residual, _, compared = _equations(_views(EARLIER), 0, records)
     points = moved_points(camera_points(records), torch.zeros(6, dtype=torch.float64))
     walls = torch.tensor([0.9, 0.5, 1.1], dtype=torch.float64)
@@ -123,7 +118,7 @@ def test_the_step_is_that_of_autograd(device, generator, views, noise_depth):
     """On a map without voxels the views' mean equations are all there is."""
     scene, seen = ops.SceneView.empty(device=device), _views(EARLIER[:views], device, 0.003, generator)
     records = corner_pixels(POSE, generator, 400)
-    drawn = _drawn(records)
+    drawn = drawn_pixels(records)
     certainty = 1 / (1 + (camera_points(drawn)[:, 2] / noise_depth) ** 4) if noise_depth else 1.0
     hessian, gradient = torch.zeros(6, 6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
     for k in range(views):
@@ -148,7 +143,7 @@ def test_the_map_weighs_by_the_square_of_the_variances(device, generator, noise)
     """Beside exact views a map of random features counts nearly nothing, beside noisy ones more."""
     scene, seen = make_scene(generator, random_decoder=True, device=device), _views(EARLIER, device, noise, generator)
     records = corner_pixels(POSE, generator, 400)
-    drawn = _drawn(records)
+    drawn = drawn_pixels(records)
     of_map, map_jacobian, map_weight, known = surface_equations(scene, drawn, 0.03)
     hessian, gradient = torch.zeros(6, 6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
     squares, weights, map_squares, map_weights = 0.0, 0.0, 0.0, 0.0
@@ -166,6 +161,7 @@ def test_the_map_weighs_by_the_square_of_the_variances(device, generator, noise)
     delta = _step(hessian + share * h, gradient + share * g)
     arguments = scene, records.to(device), pose7(POSE, device), INTRINSICS
     pose, stats, judged = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY, views=seen, tf32=False)
+    # Such points are more where views are noisy, and c is a ratio of sums over them, squared.
     _assert_moved_by(pose, delta, 3e-2 * float(delta.norm()))
     _, plain, plain_judged = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY, tf32=False)
     # What a pose is judged by is the map's alone.
@@ -248,6 +244,7 @@ def test_bad_views_are_named(generator):
     for bad, message in (
         (good._replace(unit=0.0), "views.unit must be positive, got 0.0"),
         (good._replace(kernel_end=0.0), "views.kernel_end must be positive, got 0.0"),
+        (good._replace(first_iteration=-1), "views.first_iteration must be at least 0, got -1"),
         (good._replace(images=good.images.to(torch.int32)), "views.images must be uint16, got int32"),
         (good._replace(poses=good.poses[:, :6]), r"views.poses must have shape \[F, 7\]"),
         (good._replace(rows=((2, 0),)), r"views.rows must name images and poses that are there, got \(2, 0\)"),

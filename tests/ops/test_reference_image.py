@@ -6,27 +6,20 @@ import torch
 
 from spslam import ops
 from spslam.geometry import pose7_to_matrix, rotation_angle
-from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
+from tests.ops.scenes import INTRINSICS, corner_pixels, make_scene
 from tests.ops.tracking_scene import (
+    KEY,
+    ONE_STEP,
     OPTIONS,
     POSE,
     camera_points,
     corner_depth,
+    drawn_pixels,
     moved_points,
     moved_pose,
     pose7,
     surface_equations,
 )
-
-ONE_STEP = dict(
-    num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0, seed=3
-)
-KEY = dict(stream=1, frame=4)
-
-
-def _drawn(records):
-    """The pixels that the first iteration of ONE_STEP takes."""
-    return records[ops.sample_indices(3, KEY["stream"], KEY["frame"], 0, ONE_STEP["num_pixels"], len(records))]
 
 
 @pytest.mark.parametrize("noise_depth", [0.0, 0.7, 2.0])
@@ -34,7 +27,7 @@ def test_far_pixels_weigh_less(device, generator, noise_depth):
     """By 1 / (1 + (z / z0)^4) in the equations, which are told at a mean weight of 1; the fit doesn't know of it."""
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
-    drawn = _drawn(records)
+    drawn = drawn_pixels(records)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     depth = camera_points(drawn)[:, 2]
     certain = weight / (1 + (depth / noise_depth) ** 4) if noise_depth else weight
@@ -53,7 +46,7 @@ def test_a_pose_is_judged_by_a_kernel_of_its_own(device, generator, noise_depth)
     """The step is that of the iteration's kernel; the fit and the size of the equations are those of the other."""
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
-    drawn = _drawn(records)
+    drawn = drawn_pixels(records)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     judged = surface_equations(scene, drawn, 0.05)[2]
     depth = camera_points(drawn)[:, 2]
@@ -139,7 +132,7 @@ def test_colour_equations_are_those_of_autograd(device, generator):
     scene = ops.SceneView.empty(device=device)
     reference = _reference(moved_pose(POSE, 0.01, 0.03), device)
     records = _painted(corner_pixels(POSE, generator, 400))
-    jacobian, weight = _intensity_equations(reference, _drawn(records))
+    jacobian, weight = _intensity_equations(reference, drawn_pixels(records))
     _, stats, hessian = ops.track_gauss_newton(
         scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, reference=reference
     )

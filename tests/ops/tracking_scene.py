@@ -12,6 +12,17 @@ OPTIONS = dict(
     num_pixels=1024, iterations=8, truncation=0.16, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=3, stream=1
 )
 
+# A single undamped step, whose kernel and pixels are known.
+ONE_STEP = dict(
+    num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0, seed=3
+)
+KEY = dict(stream=1, frame=4)
+
+
+def drawn_pixels(records):
+    """The pixels that the first iteration of ONE_STEP takes."""
+    return records[ops.sample_indices(3, KEY["stream"], KEY["frame"], 0, ONE_STEP["num_pixels"], len(records))]
+
 
 def pose7(matrix, device="cpu"):
     return torch.from_numpy(matrix_to_pose7(matrix)).float().to(device)
