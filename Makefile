@@ -50,7 +50,7 @@ test-numpy: dev ## install bindings/numpy and test it against the torch ops
 	  --force-reinstall ./bindings/numpy
 	$(PYTHON) -m pytest bindings/numpy/tests
 
-test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined-behaviour sanitizers
+test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined-behavior sanitizers
 	$(RUN) cmake -S . -B build/asan -G Ninja -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPSLAM_SANITIZE=ON -DSPSLAM_CUDA=OFF \
 	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
 	$(RUN) cmake --build build/asan -j $(JOBS)

@@ -74,7 +74,7 @@ foreach(isa IN LISTS SPSLAM_CPU_ISAS)
   target_compile_features(${kernels} PUBLIC cxx_std_17)
   target_link_libraries(${kernels} PUBLIC Threads::Threads)
   spslam_export(${kernels} cpu_${isa} SpslamCpuTargets)
-  # Vectorised, but with NaN and infinity kept: no -ffast-math.
+  # Vectorized, but with NaN and infinity kept: no -ffast-math.
   target_compile_options(${kernels} PRIVATE -O3 -Wall -Wextra -Wno-psabi -fopenmp-simd -fno-math-errno -fno-trapping-math
     -ffp-contract=fast ${_isa_flags_${isa}})
   if(SPSLAM_TORCH_DIR)

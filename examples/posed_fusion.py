@@ -1,4 +1,4 @@
-"""Reconstructs an RGB-D sequence whose poses are known, with the kernels alone: no tracking, no optimisation.
+"""Reconstructs an RGB-D sequence whose poses are known, with the kernels alone: no tracking, no optimization.
 
 python examples/posed_fusion.py mesh.ply                     the generated room
 python examples/posed_fusion.py mesh.ply --data recording    a folder with color/, depth/, intrinsics.txt, poses.txt

@@ -12,7 +12,7 @@ import numpy as np
 class Camera:
     """A pinhole camera without distortion.
 
-    Axes are OpenCV's (x right, y down, z forward); pixel centres lie at whole numbers, so the image spans
+    Axes are OpenCV's (x right, y down, z forward); pixel centers lie at whole numbers, so the image spans
     [-0.5, width - 0.5] x [-0.5, height - 0.5].
 
     Attributes
@@ -81,7 +81,7 @@ class Camera:
         )
 
     def ray_directions(self) -> np.ndarray:
-        """Directions through the pixel centres with z = 1, float32 [height,width,3], camera axes."""
+        """Directions through the pixel centers with z = 1, float32 [height,width,3], camera axes."""
         directions = np.ones((self.height, self.width, 3), dtype=np.float32)
         directions[..., 0] = (np.arange(self.width) - self.cx) / self.fx
         directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, None]
@@ -92,11 +92,11 @@ class Camera:
 
         Parameters
         ----------
-        depth : [height,width], metres along the optical axis; 0 where there is none.
+        depth : [height,width], meters along the optical axis; 0 where there is none.
 
         Returns
         -------
-        float32 [height,width,3], camera axes, metres; (0, 0, 0) where the depth is 0.
+        float32 [height,width,3], camera axes, meters; (0, 0, 0) where the depth is 0.
         """
         depth = np.asarray(depth)
         if depth.shape != (self.height, self.width):
@@ -108,7 +108,7 @@ class Camera:
 
         Parameters
         ----------
-        points : [...,3], camera axes, metres.
+        points : [...,3], camera axes, meters.
 
         Returns
         -------

@@ -149,7 +149,7 @@ def umeyama(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """The rotation R [3,3], translation t [3] and scale s that carry points onto others best (Umeyama 1991).
 
-    Minimises ``sum |reference - (s R estimated + t)|^2`` over rigid motions (s = 1), or over similarities
+    Minimizes ``sum |reference - (s R estimated + t)|^2`` over rigid motions (s = 1), or over similarities
     with ``with_scale``.
 
     Parameters
@@ -165,12 +165,12 @@ def umeyama(
             f"got {estimated.shape} and {reference.shape}"
         )
     mean_estimated, mean_reference = estimated.mean(axis=0), reference.mean(axis=0)
-    centred = estimated - mean_estimated
-    covariance = (reference - mean_reference).T @ centred / len(estimated)
+    centered = estimated - mean_estimated
+    covariance = (reference - mean_reference).T @ centered / len(estimated)
     u, singular, vt = np.linalg.svd(covariance)
     signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * signs) @ vt
-    variance = np.mean(np.sum(centred * centred, axis=1))
+    variance = np.mean(np.sum(centered * centered, axis=1))
     scale = float(np.sum(singular * signs) / variance) if with_scale and variance > 0 else 1.0
     return rotation, mean_reference - scale * rotation @ mean_estimated, scale
 

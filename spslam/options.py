@@ -53,11 +53,11 @@ class DatasetOptions(Section):
     depth_variant: Literal["filtered", "noisy", "exact"] | None = _text(
         "synthetic_rgbd: depth with filtered noise, with noise, or exact; null is the first that is there"
     )
-    depth_scale: float | None = _option("folder: depth units a metre; null is what the files say", "1/m", gt=0)
+    depth_scale: float | None = _option("folder: depth units a meter; null is what the files say", "1/m", gt=0)
     frames: int = _option("generated: length of the sequence; 300 go round the room once", "frames", ge=1)
     width: int = _option("generated: width of the images", "px", ge=16)
     height: int = _option("generated: height of the images", "px", ge=16)
-    noise: float = _option("generated: 0 is exact depth and clean colour, 1 the noise and holes of a Kinect", ge=0)
+    noise: float = _option("generated: 0 is exact depth and clean color, 1 the noise and holes of a Kinect", ge=0)
     seed: int = _option("generated: seed of the room, the path and the noise", ge=0)
 
     def check(self) -> None:
@@ -71,7 +71,7 @@ class SceneOptions(Section):
     voxel_size_m: float = _option("edge of a voxel of the sparse volume", "m", gt=0, le=1)
     truncation_m: float = _option("truncation distance tr of the signed distance", "m", gt=0, le=4)
     plane_cell_m: float = _option("edge of a cell of the feature planes", "m", gt=0, le=4)
-    position_scale: float = _option("factor from metres to the position the geometry decoder is given", "1/m", gt=0)
+    position_scale: float = _option("factor from meters to the position the geometry decoder is given", "1/m", gt=0)
     first_pose: Literal["dataset", "identity"] = _text(
         "pose of the first frame: the data set's where it has one, or the identity"
     )
@@ -99,7 +99,7 @@ class SamplingOptions(Section):
 class LossOptions(Section):
     """Weights of the objective (7) and the reading of its geometric targets."""
 
-    rgb: float = _option("lambda_rgb, weight of the colour loss (8)", ge=0)
+    rgb: float = _option("lambda_rgb, weight of the color loss (8)", ge=0)
     depth: float = _option("lambda_depth, weight of the rendered depth loss (9)", ge=0)
     free_space: float = _option("lambda_fs, weight of the free-space loss (11)", ge=0)
     sdf: float = _option("lambda_sdf, weight of the signed distance loss (10)", ge=0)
@@ -123,38 +123,40 @@ class TrackingOptions(Section):
     kernel_start_m: float = _option("gauss_newton: width of the robust kernel in the first iteration", "m", gt=0)
     kernel_end_m: float = _option("gauss_newton: width of the robust kernel in the last iteration", "m", gt=0)
     damping: float = _option("gauss_newton: share of its diagonal added to the normal matrix", ge=0)
-    noise_depth_m: float = _option(
+    noise_crossover_depth_m: float = _option(
         "gauss_newton: depth at which noise that grows with its square equals the map's; 0 weighs all alike", "m", ge=0
     )
     color_weight_m: float = _option(
         "gauss_newton: what a difference in brightness from black to white to the last mapped frame counts as; 0 "
-        "compares no colours",
+        "compares no colors",
         "m",
         ge=0,
     )
     color_kernel: float = _option("gauss_newton: width of the robust kernel of brightness, of which white is 1", gt=0)
-    depth_views: bool = _option(
+    depth_keyframes: bool = _option(
         "gauss_newton: hold a frame also against the depth images of the last one, one 10 and one 40 frames back"
     )
-    view_kernel_m: float = _option(
+    depth_keyframe_kernel_m: float = _option(
         "gauss_newton: width of the robust kernel of distances from these images in the last iteration", "m", gt=0
     )
     rescue: bool = _option(
         "start anew from projective ICP where a frame fits the map badly; with adam only where it is lost"
     )
-    rescue_below: float = _option("rescue where the mean robust weight of the pixels is below this", ge=0, le=1)
-    doubtful_above: float = _option(
-        "verify a pose, and try others, where the doubt about it is above this (docs/loss.md)", ge=0, le=1
+    recovery_min_robust_weight: float = _option(
+        "rescue where the mean robust weight of the pixels is below this", ge=0, le=1
     )
-    lost_above: float = _option("a frame is lost where the doubt about its pose stays above this", ge=0, le=1)
-    relocalise_below: float = _option(
+    verify_threshold: float = _option(
+        "verify a pose, and try others, where the doubt about it is above this (docs/tracking-failure.md)", ge=0, le=1
+    )
+    lost_threshold: float = _option("a frame is lost where the doubt about its pose stays above this", ge=0, le=1)
+    relocalization_threshold: float = _option(
         "the doubt must be below this where a camera is found again after loss", ge=0, le=1
     )
-    relocalise_frames: int = _option(
+    relocalization_candidates: int = _option(
         "stored frames that a lost frame is laid onto, the likest ones; 0 looks for none", "frames", ge=0
     )
     min_inlier_share: float = _option("a frame with a smaller share of pixels on mapped surface is lost", ge=0, le=1)
-    min_valid_share: float = _option("a frame with depth in a smaller share of its image is lost", ge=0, le=1)
+    min_valid_depth_share: float = _option("a frame with depth in a smaller share of its image is lost", ge=0, le=1)
 
     def check(self) -> None:
         if self.kernel_end_m > self.kernel_start_m:
@@ -162,7 +164,7 @@ class TrackingOptions(Section):
 
 
 class MappingOptions(Section):
-    """Joint optimisation of the map and the poses of chosen frames (section III.D)."""
+    """Joint optimization of the map and the poses of chosen frames (section III.D)."""
 
     every: int = _option("map after this many frames", "frames", ge=1)
     iterations: int = _option("I_m, iterations each time", "iterations", ge=0)
@@ -177,10 +179,10 @@ class MappingOptions(Section):
     embedding_rate: float = _option("learning rate of the voxel embeddings", ge=0)
     plane_rate: float = _option("learning rate of the feature planes", ge=0)
     decoder_rate: float = _option("learning rate of the geometry decoder", ge=0)
-    color_decoder_rate: float = _option("learning rate of the colour decoder", ge=0)
+    color_decoder_rate: float = _option("learning rate of the color decoder", ge=0)
     pose_rate: float = _option("learning rate of the poses", ge=0)
-    optimize_poses: bool = _text("optimise the chosen frames' poses together with the map")
-    optimize_geometry: bool = _text("optimise embeddings and geometry decoder; false leaves geometry to fusion (1)")
+    optimize_poses: bool = _text("optimize the chosen frames' poses together with the map")
+    optimize_geometry: bool = _text("optimize embeddings and geometry decoder; false leaves geometry to fusion (1)")
     reset_moments: bool = _text("start Adam's moments anew each time mapping runs")
 
     def check(self) -> None:
@@ -218,7 +220,7 @@ class PriorOptions(Section):
     kappa: float = _option("sum of point weights at which a corner's weight W_m reaches 1", gt=0)
     max_weight: float = _option("cap of the fused weight W_g", gt=0)
     normal_step_px: int = _option("distance of the differences that give the normals", "px", ge=1)
-    max_jump: float = _option("depth step between neighbours, as a share of the depth, that is an edge", gt=0)
+    max_jump: float = _option("depth step between neighbors, as a share of the depth, that is an edge", gt=0)
 
 
 class MeshOptions(Section):

@@ -51,15 +51,15 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def truth_of_known(self, truth: np.ndarray) -> np.ndarray:
+    def ground_truth_of_known(self, ground_truth: np.ndarray) -> np.ndarray:
         """True poses, float64 [F,4,4], with NaN for the lost frames: what errors are measured against."""
-        return np.where(self.lost[:, None, None], np.nan, truth)
+        return np.where(self.lost[:, None, None], np.nan, ground_truth)
 
     def save_tum(self, path: str | os.PathLike) -> None:
         """Write the TUM format, a line a frame: ``timestamp tx ty tz qx qy qz qw``, camera to world.
 
         A lost frame has no pose but a comment in its place, ``# lost timestamp``, which other readers skip. The same
-        trajectory gives the same bytes. Poses are kept to a nanometre and 1e-9 in the quaternion. Written at once or
+        trajectory gives the same bytes. Poses are kept to a nanometer and 1e-9 in the quaternion. Written at once or
         not at all; raises OutputError.
         """
         lines = [_HEADER]

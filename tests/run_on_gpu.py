@@ -64,7 +64,7 @@ def _folder_beside_the_package() -> Iterator[Path]:
         yield ROOT
         return
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("tests", "benchmarks"):
+        for name in ("tests", "experiments", "examples"):
             shutil.copytree(ROOT / name, Path(folder) / name)
         shutil.copy(ROOT / "pyproject.toml", folder)
         yield Path(folder)

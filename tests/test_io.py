@@ -10,10 +10,10 @@ def names(folder):
 
 def test_bytes_text_and_function(tmp_path):
     atomic_write(tmp_path / "a.bin", b"\x00\x01")
-    atomic_write(tmp_path / "b.txt", "metres: µ")
+    atomic_write(tmp_path / "b.txt", "meters: µ")
     atomic_write(tmp_path / "c.ply", lambda path: path.write_text(path.suffix))
     assert (tmp_path / "a.bin").read_bytes() == b"\x00\x01"
-    assert (tmp_path / "b.txt").read_text(encoding="utf-8") == "metres: µ"
+    assert (tmp_path / "b.txt").read_text(encoding="utf-8") == "meters: µ"
     assert (tmp_path / "c.ply").read_text() == ".ply"
     assert names(tmp_path) == ["a.bin", "b.txt", "c.ply"]
 

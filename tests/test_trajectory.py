@@ -23,10 +23,10 @@ def test_round_trip(tmp_path):
 
 
 def test_errors_are_measured_where_the_pose_is_known():
-    truth, lost = make_trajectory(3).poses, [True, False, True]
-    known = Trajectory(np.arange(3.0), truth[::-1], lost).truth_of_known(truth)
+    ground_truth, lost = make_trajectory(3).poses, [True, False, True]
+    known = Trajectory(np.arange(3.0), ground_truth[::-1], lost).ground_truth_of_known(ground_truth)
     np.testing.assert_array_equal(np.isnan(known).all((1, 2)), lost)
-    np.testing.assert_array_equal(known[1], truth[1])
+    np.testing.assert_array_equal(known[1], ground_truth[1])
 
 
 def test_lost_frames_have_no_pose_in_the_file(tmp_path):

@@ -6,20 +6,20 @@ namespace spslam::bindings {
 namespace {
 
 // Keeps the tensors alive while a kernel reads the views.
-class ViewsArgument {
+class KeyframesArgument {
  public:
-  ViewsArgument(const char* function, const Tensor& poses, const Tensor& lattices,
+  KeyframesArgument(const char* function, const Tensor& poses, const Tensor& depth_thumbnails,
                 const std::vector<double>& intrinsics, std::int64_t step)
-      : poses_(torch::stable::contiguous(poses)), lattices_(torch::stable::contiguous(lattices)) {
+      : poses_(torch::stable::contiguous(poses)), thumbnails_(torch::stable::contiguous(depth_thumbnails)) {
     SPS_CHECK(poses.dim() == 2 && poses.size(1) == kPoseSize, function, ": poses must have shape [F, 7]");
-    SPS_CHECK(lattices.dim() == 3 && lattices.size(0) == poses.size(0) && lattices.scalar_type() == ScalarType::Half,
-              function, ": lattices must be float16 of shape [F, h, w]");
-    SPS_CHECK(step >= 1, function, ": lattice_step must be >= 1");
+    SPS_CHECK(depth_thumbnails.dim() == 3 && depth_thumbnails.size(0) == poses.size(0) && depth_thumbnails.scalar_type() == ScalarType::Half,
+              function, ": depth_thumbnails must be float16 of shape [F, h, w]");
+    SPS_CHECK(step >= 1, function, ": thumbnail_step must be >= 1");
     views = {data<float>(poses_),
-             static_cast<const std::uint16_t*>(lattices_.const_data_ptr()),
+             static_cast<const std::uint16_t*>(thumbnails_.const_data_ptr()),
              poses.size(0),
-             lattices.size(1),
-             lattices.size(2),
+             depth_thumbnails.size(1),
+             depth_thumbnails.size(2),
              load_intrinsics(intrinsics),
              step};
   }
@@ -27,29 +27,29 @@ class ViewsArgument {
   FrameViews views;
 
  private:
-  Tensor poses_, lattices_;
+  Tensor poses_, thumbnails_;
 };
 
-Tensor frame_overlap(Tensor points, Tensor poses, Tensor lattices, std::vector<double> intrinsics,
-                     std::int64_t lattice_step) {
+Tensor frame_overlap(Tensor points, Tensor poses, Tensor depth_thumbnails, std::vector<double> intrinsics,
+                     std::int64_t thumbnail_step) {
   SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "frame_overlap: points must have shape [N, 3]");
   DeviceScope scope(points);
-  const ViewsArgument argument("frame_overlap", poses, lattices, intrinsics, lattice_step);
+  const KeyframesArgument argument("frame_overlap", poses, depth_thumbnails, intrinsics, thumbnail_step);
   points = torch::stable::contiguous(points);
   Tensor share = empty(points, {argument.views.num_frames}, ScalarType::Float);
   spslam::frame_overlap(scope.context, data<float>(points), points.size(0), argument.views, mutable_data<float>(share));
   return share;
 }
 
-Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor poses, Tensor lattices, Tensor candidates,
-                               std::vector<double> intrinsics, std::int64_t lattice_step, std::int64_t num_points,
+Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor poses, Tensor depth_thumbnails, Tensor candidates,
+                               std::vector<double> intrinsics, std::int64_t thumbnail_step, std::int64_t num_points,
                                std::int64_t num_covisible, std::int64_t count, double threshold, std::int64_t seed,
                                std::int64_t stream, std::int64_t frame) {
   SPS_CHECK(records.dim() == 2 && records.size(1) == 3 && records.size(0) > 0,
             "select_covisible_frames: records must have shape [P, 3] with P >= 1");
   SPS_CHECK(current >= 0 && current < poses.size(0), "select_covisible_frames: current must be a row of poses");
   DeviceScope scope(poses);
-  const ViewsArgument argument("select_covisible_frames", poses, lattices, intrinsics, lattice_step);
+  const KeyframesArgument argument("select_covisible_frames", poses, depth_thumbnails, intrinsics, thumbnail_step);
   records = torch::stable::contiguous(records);
   candidates = torch::stable::contiguous(candidates);
   const std::int64_t num_candidates = candidates.numel();
@@ -69,10 +69,10 @@ Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor pose
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
-  m.def("frame_overlap(Tensor points, Tensor poses, Tensor lattices, float[] intrinsics, int lattice_step) -> Tensor");
+  m.def("frame_overlap(Tensor points, Tensor poses, Tensor depth_thumbnails, float[] intrinsics, int thumbnail_step) -> Tensor");
   m.def(
-      "select_covisible_frames(Tensor records, int current, Tensor poses, Tensor lattices, Tensor candidates, "
-      "float[] intrinsics, int lattice_step, int num_points, int num_covisible, int count, float threshold, "
+      "select_covisible_frames(Tensor records, int current, Tensor poses, Tensor depth_thumbnails, Tensor candidates, "
+      "float[] intrinsics, int thumbnail_step, int num_points, int num_covisible, int count, float threshold, "
       "int seed, int stream, int frame) -> Tensor");
 }
 #endif

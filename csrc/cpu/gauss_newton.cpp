@@ -2,7 +2,7 @@
 
 #include "core/for_each.h"
 #include "cpu/scene_tile.h"
-#include "kernels/depth_views.h"
+#include "kernels/depth_keyframes.h"
 #include "kernels/gauss_newton.h"
 #include "kernels/reference_image.h"
 
@@ -16,17 +16,17 @@ struct Measurement {
   Intrinsics camera;
   float truncation;
   KernelWidths kernel;
-  float noise_depth;
+  float noise_crossover_depth;
   ReferenceView reference;
-  DepthViews views;
-  DepthView view[kMaxDepthViews];
+  DepthKeyframes views;
+  DepthKeyframe view[kMaxDepthKeyframes];
 };
 
 // terms: of the map and, from kTrackingTerms on, of the views.
 void add_views(const Measurement& measure, const SurfacePoint& point, float certainty, const MapResidual& map,
                double* terms) {
   for (int k = 0; k < measure.views.count; ++k) {
-    add_depth_view_residual(measure.views, measure.view[k], point.world, point.offset, measure.kernel.view, certainty,
+    add_depth_keyframe_residual(measure.views, measure.view[k], point.world, point.offset, measure.kernel.view, certainty,
                             map, terms + kTrackingTerms);
   }
 }
@@ -61,7 +61,7 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
       add_intensity_residual(measure.reference, pixel, point.world, point.offset, terms);
     }
     const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
-    const float certain = depth_certainty(pixel.depth, measure.noise_depth);
+    const float certain = depth_certainty(pixel.depth, measure.noise_crossover_depth);
     if (!cell.corner_ids) {
       add_views(measure, point, certain, {0.0f, false}, terms);
       continue;
@@ -112,11 +112,11 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
   Measurement measure{options.intrinsics,
                       options.truncation,
                       {},
-                      options.noise_depth,
+                      options.noise_crossover_depth,
                       load_reference(options.reference),
                       options.views,
                       {}};
-  for (int k = 0; k < options.views.count; ++k) measure.view[k] = load_depth_view(options.views, k);
+  for (int k = 0; k < options.views.count; ++k) measure.view[k] = load_depth_keyframe(options.views, k);
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     PhiloxKey key = options.key;
     key.iteration = static_cast<std::uint32_t>(iteration);
@@ -125,12 +125,12 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
     measure.kernel = tracking_kernel(options, iteration);
-    measure.views.count = views_in_use(options.views, iteration);
+    measure.views.count = keyframes_in_use(options.views, iteration);
     sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
                terms);
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, options.num_pixels, own_stats);
-    join_view_terms(terms, terms + kTrackingTerms, measure.views.count, joint);
+    join_keyframe_terms(terms, terms + kTrackingTerms, measure.views.count, joint);
     tracking_step(terms, joint, options.damping, pose, own_stats + 2, hessian);
   }
 }

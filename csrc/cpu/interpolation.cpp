@@ -82,7 +82,7 @@ std::int64_t slice_width(std::int64_t channels, std::int64_t slices) {
   return std::min(channels, chunk_count(chunk_count(channels, slices), kLine) * kLine);
 }
 
-// Sums `width` neighbouring channels of one part of the table.
+// Sums `width` neighboring channels of one part of the table.
 template <int kWidth, class Field, class T>
 void scatter_part(const Field& field, int part, const T* grad, std::int64_t channels, std::int64_t width,
                   std::int64_t num_points, T* out) {
@@ -133,7 +133,7 @@ struct InterpolationLoops<Cpu> {
 
   // A row is summed in the order of the points, by one thread: threads share the work by parts of the table and by
   // cache lines of its rows. To deal out the rows themselves was measured and is slower, with any number of threads:
-  // neighbouring points share rows, which a walk in order finds in the cache.
+  // neighboring points share rows, which a walk in order finds in the cache.
   template <class Field, class T>
   static void scatter(Cpu device, const Field& field, const T* grad, std::int64_t num_rows, std::int64_t channels,
                       std::int64_t num_points, T* out, std::int64_t*) {

@@ -17,7 +17,7 @@ void update_span(const AdamCoefficients<T>& c, std::int64_t count, T* __restrict
   for (std::int64_t i = 0; i < count; ++i) adam_update(c, param[i], grad[i], exp_avg[i], exp_avg_sq[i]);
 }
 
-// Rows of [begin, end) with the wanted stamp, into `found`. Most blocks hold none and cost one vectorised comparison;
+// Rows of [begin, end) with the wanted stamp, into `found`. Most blocks hold none and cost one vectorized comparison;
 // the others are compacted without branches, since which rows are touched is as good as random.
 std::int64_t find_stamped(const std::int32_t* stamps, std::int32_t stamp, std::int64_t begin, std::int64_t end,
                           std::int64_t* found) {

@@ -37,20 +37,20 @@ std::int64_t list_valid(const RgbdImage& image, const PixelSampling& sampling, P
   return count;
 }
 
-void write_lattice(const RgbdImage& image, std::int32_t step, PaddedDepth& depth, std::uint16_t* lattice) {
+void write_thumbnail(const RgbdImage& image, std::int32_t step, PaddedDepth& depth, std::uint16_t* depth_thumbnail) {
   for (std::int32_t v = step / 2; v < image.height; v += step) {
     const float* row = depth.row(v);
-    for (std::int32_t u = step / 2; u < image.width; u += step) *lattice++ = half_bits(row[u]);
+    for (std::int32_t u = step / 2; u < image.width; u += step) *depth_thumbnail++ = half_bits(row[u]);
   }
 }
 
 void write_view(const RgbdImage& image, const PixelSampling& sampling, PaddedDepth& depth, std::uint16_t* view) {
-  const std::int32_t step = sampling.view_step;
+  const std::int32_t step = sampling.depth_image_step;
   if (step == 0) return;
-  const float per_unit = 1.0f / sampling.view_unit;
+  const float per_unit = 1.0f / sampling.depth_image_unit;
   for (std::int32_t v = 0; v < image.height; v += step) {
     const float* row = depth.row(v);
-    const std::int32_t columns = view_size(image.width, step);
+    const std::int32_t columns = depth_image_size(image.width, step);
     SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) {
       const float units = row[c * step] * per_unit + 0.5f;
       view[c] = static_cast<std::uint16_t>(units < 65536.0f ? static_cast<std::int32_t>(units) : 0);
@@ -91,7 +91,7 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
   // One place more than there are pixels: the list is written before it is known whether the pixel counts.
   std::int32_t* valid = scratch.valid.reserve(static_cast<std::int64_t>(image.width) * image.height + 1);
   const std::int64_t num_valid = list_valid(image, sampling, depth, valid);
-  write_lattice(image, sampling.lattice_step, depth, out.lattice);
+  write_thumbnail(image, sampling.thumbnail_step, depth, out.depth_thumbnail);
   write_view(image, sampling, depth, out.view);
   if (num_valid == 0) {
     std::fill(out.records, out.records + kPixelWords * sampling.count, 0);

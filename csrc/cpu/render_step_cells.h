@@ -47,7 +47,7 @@ inline void sample_keys(const Ray& ray, float inverse_voxel, const float* depths
   }
 }
 
-// Draws the samples, and lists the distinct cells along each ray: neighbours in the same cell share one look-up.
+// Draws the samples, and lists the distinct cells along each ray: neighbors in the same cell share one look-up.
 inline void sample_rays(const SceneView& scene, const RenderOptions& options, std::int64_t first_ray, Chunk& chunk) {
   const std::int32_t count = chunk.samples_per_ray;
   const float inverse_voxel = 1.0f / scene.voxel_size;

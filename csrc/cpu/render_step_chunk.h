@@ -37,7 +37,7 @@ struct RayPull {
 
 // What this call has to compute beyond the losses.
 struct Plan {
-  bool color;  // the colour term has a weight
+  bool color;  // the color term has a weight
   bool pose;   // gradients to sample positions
   bool embeddings, texels;
   bool geometry_params, color_params;
@@ -58,7 +58,7 @@ struct PlaneFraction {
   float u, v;
 };
 
-// Parts of the embeddings that are filled independently: blocks of 64 rows (ids are neighbours where vertices are),
+// Parts of the embeddings that are filled independently: blocks of 64 rows (ids are neighbors where vertices are),
 // dealt out in turn.
 constexpr int kEmbeddingParts = 4, kEmbeddingBlockShift = 6;
 
@@ -161,7 +161,7 @@ struct TableGradients {
 
   std::int64_t* num_texel_runs;  // [chunks, 3]
   TexelRun* texel_runs;          // [3, rows]
-  float* texel;                  // gradient rows of the colour decoder's input
+  float* texel;                  // gradient rows of the color decoder's input
   PlaneFraction* fractions;      // [3, rows]
 };
 

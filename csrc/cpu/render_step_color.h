@@ -1,4 +1,4 @@
-// Colour in render_step on the CPU: texels of three planes gathered, decoded, and the way back to texels and positions.
+// Color in render_step on the CPU: texels of three planes gathered, decoded, and the way back to texels and positions.
 #pragma once
 
 #include <initializer_list>
@@ -106,7 +106,7 @@ class TexelRunWriter {
   std::int64_t counts_[3] = {0, 0, 0};
 };
 
-// Fills the colour decoder's input for the rendered samples.
+// Fills the color decoder's input for the rendered samples.
 inline void gather_texels(const SceneView& scene, const MlpLayout<float>& layout, const Plan& plan, std::int64_t index,
                           const TableGradients& tables, Chunk& chunk) {
   constexpr std::int64_t kAhead = 16;

@@ -1,11 +1,11 @@
-// Rendering weights and losses of the rays of a chunk, and their gradients to SDF and colour (equations 5-11).
+// Rendering weights and losses of the rays of a chunk, and their gradients to SDF and color (equations 5-11).
 #pragma once
 
 #include "cpu/render_step_chunk.h"
 
 namespace spslam::render {
 
-// Normalised weights of a ray's samples and its depth; lists the samples that are rendered.
+// Normalized weights of a ray's samples and its depth; lists the samples that are rendered.
 inline void weigh_ray(float truncation, Ray& ray, Chunk& chunk) {
   float first_crossing = std::numeric_limits<float>::infinity();
   for (std::int32_t i = ray.begin; i < ray.end; ++i) {
@@ -36,7 +36,7 @@ inline void weigh_samples(float truncation, Chunk& chunk) {
   for (std::int64_t i = 0; i < chunk.num_rays; ++i) weigh_ray(truncation, chunk.rays[i], chunk);
 }
 
-// Colour of a ray, its loss, and the gradient to the colours of its samples.
+// Color of a ray, its loss, and the gradient to the colors of its samples.
 inline void render_color(float scale, Ray& ray, Chunk& chunk) {
   const std::int64_t stride = chunk.rgb_stride;
   for (int c = 0; c < 3; ++c) {
@@ -67,7 +67,7 @@ inline void supervise_samples(const LossWeights& scale, float truncation, Ray& r
   }
 }
 
-// Adds the gradient of the rendered colour and depth through the weights.
+// Adds the gradient of the rendered color and depth through the weights.
 inline void add_rendering_gradient(const LossWeights& scale, bool color, const Ray& ray, Chunk& chunk) {
   const std::int64_t stride = chunk.rgb_stride;
   const float grad_depth = scale.depth * depth_loss_gradient(ray.rendered_depth, ray.pixel.depth);
@@ -85,7 +85,7 @@ inline void add_rendering_gradient(const LossWeights& scale, bool color, const R
   }
 }
 
-// Losses of every ray, and their gradients to the SDF and the colour of its samples. `scale` is the weights of the
+// Losses of every ray, and their gradients to the SDF and the color of its samples. `scale` is the weights of the
 // terms over the number of rays.
 inline void ray_losses(const LossWeights& scale, bool color, float truncation, Chunk& chunk) {
   for (std::int64_t r = 0; r < chunk.num_rays; ++r) {

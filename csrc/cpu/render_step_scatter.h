@@ -1,7 +1,7 @@
 // Last part of render_step on the CPU: gradient rows of samples added to the rows of the tables.
 //
 // Tables are cut into parts, each of which one thread fills alone by walking through all samples in order: sums have
-// one order, whatever the number of threads. Neighbours along a ray mostly share a cell, so sums are kept in registers
+// one order, whatever the number of threads. Neighbors along a ray mostly share a cell, so sums are kept in registers
 // over a run of samples in one cell; the rows of runs to come are fetched ahead.
 #pragma once
 

@@ -8,7 +8,7 @@
 #include "core/for_each.h"
 #include "cuda/geometry_fragments.cuh"
 #include "cuda/warp_sums.cuh"
-#include "kernels/depth_views.h"
+#include "kernels/depth_keyframes.h"
 #include "kernels/gauss_newton.h"
 #include "kernels/reference_image.h"
 #include "spslam/gauss_newton.h"
@@ -21,8 +21,8 @@ constexpr int kThreads = kWarps * kWarp;
 constexpr int kBlockPixels = kWarps * fused::kTileRows;
 // A barrier of the whole grid needs all blocks resident at once: few enough for the smallest device.
 constexpr std::int64_t kMaxTrackingBlocks = 16;
-constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kViewTerms, one a lane
-static_assert(kTrackingTerms <= kPaddedTerms && kViewTerms <= kPaddedTerms, "one lane a term");
+constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kKeyframeTerms, one a lane
+static_assert(kTrackingTerms <= kPaddedTerms && kKeyframeTerms <= kPaddedTerms, "one lane a term");
 constexpr int kSets = 2;  // of terms: the map's, the views'
 constexpr int kSums = kSets * kPaddedTerms;
 
@@ -54,18 +54,18 @@ struct Measurement {
   Intrinsics camera;
   float truncation;
   KernelWidths kernel;
-  float noise_depth;
+  float noise_crossover_depth;
   ReferenceView reference;
-  DepthViews views;
-  const DepthView* view;  // in shared memory
-  int num_views;          // that take part
+  DepthKeyframes views;
+  const DepthKeyframe* view;  // in shared memory
+  int num_keyframes;          // that take part
 };
 
 // Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms of the map and of the views.
 template <Precision kPrecision>
 __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Measurement& measure, const Pose<float>& pose, const Pixel& pixel,
-                                               int lane, float* terms, float* view_terms) {
+                                               int lane, float* terms, float* keyframe_terms) {
   const Intrinsics& k = measure.camera;
   const SurfacePoint point = surface_point(pixel, pose, k.fx, k.fy, k.cx, k.cy);
   std::int32_t voxel = kNoVoxel;
@@ -78,10 +78,10 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   const float sdf = geometry_tile(scene, network, point.world, cell.local, voxel, lane, gradient);
   // Two lanes bring the same pixel; one adds it, and they share the views.
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
-  const float certainty = depth_certainty(pixel.depth, measure.noise_depth);
-  for (int v = lane % 4 / 2; v < measure.num_views && pixel.depth > 0.0f; v += 2) {
-    add_depth_view_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view, certainty,
-                            {sdf * measure.truncation, known}, view_terms);
+  const float certainty = depth_certainty(pixel.depth, measure.noise_crossover_depth);
+  for (int v = lane % 4 / 2; v < measure.num_keyframes && pixel.depth > 0.0f; v += 2) {
+    add_depth_keyframe_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view, certainty,
+                            {sdf * measure.truncation, known}, keyframe_terms);
   }
   if (adds && known) {
     add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, certainty, terms);
@@ -131,12 +131,12 @@ __device__ __forceinline__ double sum_block(const SceneView& scene, const Geomet
                                             const Measurement& measure, const Pose<float>& pose, PixelQueue& queue,
                                             float (&sums)[kWarps][kSums]) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  float terms[kPaddedTerms] = {}, view_terms[kPaddedTerms] = {};
+  float terms[kPaddedTerms] = {}, keyframe_terms[kPaddedTerms] = {};
   for (Pixel pixel; queue.pop(pixel);) {
-    add_pixel_tile(scene, network, measure, pose, pixel, lane, terms, view_terms);
+    add_pixel_tile(scene, network, measure, pose, pixel, lane, terms, keyframe_terms);
   }
   sums[warp][lane] = transpose_sum(terms, lane);
-  sums[warp][kPaddedTerms + lane] = transpose_sum(view_terms, lane);
+  sums[warp][kPaddedTerms + lane] = transpose_sum(keyframe_terms, lane);
   __syncthreads();
   double sum = 0.0;
   if (threadIdx.x < kSums) {
@@ -171,25 +171,25 @@ __global__ void __launch_bounds__(kThreads)
   __shared__ GeometryNetwork<kUsed> network;
   __shared__ float sums[kWarps][kSums];
   __shared__ double shares[kThreads / kSums][kSums], terms[kSums], joint[kNormalTerms];
-  __shared__ DepthView view[kMaxDepthViews];
+  __shared__ DepthKeyframe view[kMaxDepthKeyframes];
   __shared__ float own_pose[kPoseSize], own_stats[kTrackingStatSize], own_hessian[36];
   network.load(scene.geometry_params);
   if (threadIdx.x < kPoseSize) own_pose[threadIdx.x] = pose[threadIdx.x];
   const PhiloxKey key{options.key.seed, options.key.stream, options.key.frame, 0};
   PixelQueue queue({pixels, num_records, options.num_pixels, true, key}, 0);
   const ReferenceView reference = load_reference(options.reference);
-  if (threadIdx.x < options.views.count) view[threadIdx.x] = load_depth_view(options.views, threadIdx.x);
+  if (threadIdx.x < options.views.count) view[threadIdx.x] = load_depth_keyframe(options.views, threadIdx.x);
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
-    const int num_views = views_in_use(options.views, iteration);
+    const int num_keyframes = keyframes_in_use(options.views, iteration);
     const Measurement measure{options.intrinsics,
                               options.truncation,
                               tracking_kernel(options, iteration),
-                              options.noise_depth,
+                              options.noise_crossover_depth,
                               reference,
                               options.views,
                               view,
-                              num_views};
+                              num_keyframes};
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
     double* shared_sums = partials + (iteration % 2) * gridDim.x * kSums;
@@ -197,7 +197,7 @@ __global__ void __launch_bounds__(kThreads)
     cooperative_groups::this_grid().sync();
     add_partials(shared_sums, gridDim.x, shares, terms);
     if (threadIdx.x == 0) {
-      join_view_terms(terms, terms + kPaddedTerms, num_views, joint);
+      join_keyframe_terms(terms, terms + kPaddedTerms, num_keyframes, joint);
       tracking_step(terms, joint, options.damping, own_pose, own_stats + 2, own_hessian);
     }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);

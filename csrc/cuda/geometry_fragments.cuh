@@ -15,7 +15,7 @@ namespace spslam {
 template <Precision kPrecision>
 class GeometryNetwork {
  public:
-  // By all threads of a block, which must synchronise before the first use.
+  // By all threads of a block, which must synchronize before the first use.
   __device__ void load(const float* params) {
     constexpr int kHidden = kDecoderHidden, kInputs = kGeometryDecoder.input;
     constexpr MlpOffsets kAt = kGeometryDecoder.offsets();
@@ -86,7 +86,7 @@ class GeometryNetwork {
   float b3_;
 };
 
-// The lane's own value, or that of the neighbour who brings the quad's other sample.
+// The lane's own value, or that of the neighbor who brings the quad's other sample.
 __device__ __forceinline__ float of_sample(float own, bool is_own) {
   const float other = __shfl_xor_sync(fused::kAllLanes, own, 1);
   return is_own ? own : other;

@@ -24,7 +24,7 @@ template <class T>
 constexpr int kLaneRows = kVectorBytes / static_cast<int>(sizeof(T));
 template <class T>
 constexpr int kRows = kWarp * kLaneRows<T>;
-// An odd number of vectors, so that neighbouring units begin in different banks.
+// An odd number of vectors, so that neighboring units begin in different banks.
 template <class T>
 constexpr int kStride = kRows<T> + kLaneRows<T>;
 

@@ -232,7 +232,7 @@ class Tile {
     }
   }
 
-  // Outputs o, o + output_step, .. times inputs k, k + input_step, ..: neighbouring threads read neighbouring units.
+  // Outputs o, o + output_step, .. times inputs k, k + input_step, ..: neighboring threads read neighboring units.
   __device__ void add_block(const Layer& layer, int output, int output_step, int input, int input_step) {
     int outputs[kBlock], inputs[kBlock];  // those beyond the last stand for it, and are left out in the end
 #pragma unroll

@@ -86,7 +86,7 @@ struct EncoderWeights {
   alignas(16) float low[kPrecision == MlpPrecision::kFloat32 ? kBlocks * kBlock : 1];
   alignas(16) float first_bias[kEncoderHidden], second_bias[kEncoderHidden], third_bias[kPriorFeatures];
 
-  // By the whole block, which must synchronise afterwards.
+  // By the whole block, which must synchronize afterwards.
   __device__ void load(const float* params) {
     constexpr MlpOffsets kAt = kEncoder.offsets();
     const float *w1 = params + kAt.w1, *w2 = params + kAt.w2, *w3 = params + kAt.w3;
@@ -114,7 +114,7 @@ struct EncoderWeights {
     }
   }
 
-  // Accumulator columns 2 q and 2 q + 1 hold features q and 4 + q: the four lanes of a row then add to neighbours.
+  // Accumulator columns 2 q and 2 q + 1 hold features q and 4 + q: the four lanes of a row then add to neighbors.
   __device__ static int feature_of_column(int column) { return column % 2 * 4 + column / 2; }
 };
 

@@ -179,7 +179,7 @@ __global__ void __launch_bounds__(kThreads)
   const VoxelCoord block{(upper & 1 ? last.x : first.x) >> kBlockSideBits,
                          (upper & 2 ? last.y : first.y) >> kBlockSideBits,
                          (upper & 4 ? last.z : first.z) >> kBlockSideBits};
-  // Where both ends of the neighbourhood lie in one block, the lane of the lower end asks for it.
+  // Where both ends of the neighborhood lie in one block, the lane of the lower end asks for it.
   const bool repeated = (upper & 1 && block.x == first.x >> kBlockSideBits) ||
                         (upper & 2 && block.y == first.y >> kBlockSideBits) ||
                         (upper & 4 && block.z == first.z >> kBlockSideBits);

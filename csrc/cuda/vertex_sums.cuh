@@ -32,7 +32,7 @@ struct SumCounters {
   float bounds[kBoundsRows][6];  // of some finite points the least x, y, z, -x, -y and -z
 };
 
-// A pair that counts: of point pair / neighbourhood, and of the vertex at vertex % 64 in the block of slot vertex / 64.
+// A pair that counts: of point pair / neighborhood, and of the vertex at vertex % 64 in the block of slot vertex / 64.
 struct PointPair {
   std::uint32_t vertex, pair;
 };
@@ -87,7 +87,7 @@ __device__ inline EncoderInput encoder_input(const Neighborhood& neighborhood, c
   return input;
 }
 
-// How far to the right a corner's number is shifted for its place along x and y; the neighbourhood's sides are 4 or 2.
+// How far to the right a corner's number is shifted for its place along x and y; the neighborhood's sides are 4 or 2.
 __device__ inline int side_bits(const Neighborhood& neighborhood) {
   return neighborhood.side == 4 ? 2 : 1;
 }

@@ -43,7 +43,7 @@ SPS_INLINE Vec3<double> view_point(const std::int32_t* record, const Pose<double
   return pose.rotation * local + pose.translation;
 }
 
-// A lattice cell holds the depth of its middle pixel; pixel u lies in cell (u + 1/2) / step, so that no pixel is on the
+// A depth thumbnail cell holds the depth of its middle pixel; pixel u lies in cell (u + 1/2) / step, so that no pixel is on the
 // border of two.
 SPS_INLINE bool sees_point(const FrameViews& views, std::int64_t frame, const Pose<double>& pose,
                            const Vec3<double>& point) {
@@ -62,7 +62,7 @@ SPS_INLINE bool sees_point(const FrameViews& views, std::int64_t frame, const Po
   }
   const std::int64_t cell =
       (frame * views.rows + static_cast<std::int64_t>(row)) * views.columns + static_cast<std::int64_t>(column);
-  const double seen = half_to_float(views.lattices[cell]);
+  const double seen = half_to_float(views.depth_thumbnails[cell]);
   return seen > 0.0 && std::fabs(seen - z) < kDepthAgreement;
 }
 

@@ -35,7 +35,7 @@ SPS_INLINE float window_mean(float center, float weights, float differences) {
   return center > 0.0f ? center + differences / weights : 0.0f;
 }
 
-// Smoothed depth (m) of a pixel and of its neighbours at some step along the axes; 0 where invalid.
+// Smoothed depth (m) of a pixel and of its neighbors at some step along the axes; 0 where invalid.
 struct DepthCross {
   float center, left, right, up, down;
 };
@@ -62,7 +62,7 @@ SPS_INLINE Vec3<float> normal_of_cross(const DepthCamera& camera, float u, float
   return {known ? scale * normal.x : 0.0f, known ? scale * normal.y : 0.0f, known ? scale * normal.z : 0.0f};
 }
 
-// Whether the pixel and its neighbours at step_px lie in the image.
+// Whether the pixel and its neighbors at step_px lie in the image.
 SPS_INLINE bool cross_in_image(const DepthImage& image, std::int32_t u, std::int32_t v, std::int32_t step_px) {
   return (u >= step_px) & (v >= step_px) & (u < image.width - step_px) & (v < image.height - step_px);
 }

@@ -1,7 +1,7 @@
 // The maths of Gauss-Newton tracking: one residual, the sums over them, and the step they give.
 //
 // A pixel's residual is the scene's SDF (m) at its back-projected surface point; the increment (dt, domega) moves the
-// camera centre by dt and turns the camera by domega about it, from the left.
+// camera center by dt and turns the camera by domega about it, from the left.
 #pragma once
 
 #include <cmath>
@@ -29,7 +29,7 @@ struct KernelWidths {
 
 struct SurfacePoint {
   Vec3<float> world;   // m
-  Vec3<float> offset;  // world - camera centre
+  Vec3<float> offset;  // world - camera center
 };
 
 SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pose, float fx, float fy, float cx,
@@ -46,7 +46,7 @@ SPS_INLINE float robust_weight(float residual, float kernel) {
 }
 
 // Adds a residual (m) of a weight to the hessian and gradient in sums of type T, and nothing to the cost. slope is its
-// derivative by the surface point, offset the point seen from the camera centre that the increment turns about.
+// derivative by the surface point, offset the point seen from the camera center that the increment turns about.
 template <class T>
 SPS_INLINE void add_weighted_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, T weight,
                                       T* terms) {
@@ -71,7 +71,7 @@ SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, c
   terms[kNormalTerms + 2] += weight;
 }
 
-// The same of an inlier's SDF, which is normalised, and its gradient by the world point (1/m).
+// The same of an inlier's SDF, which is normalized, and its gradient by the world point (1/m).
 template <class T>
 SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
                                       float truncation, const KernelWidths& kernel, float certainty, T* terms) {
@@ -80,9 +80,9 @@ SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, cons
 
 // Inverse variance of a residual as a share of that at the camera: a structured-light or stereo depth's noise grows
 // with z^2, and adds to that of the map.
-SPS_INLINE float depth_certainty(float depth, float noise_depth) {
-  if (!(noise_depth > 0.0f)) return 1.0f;
-  const float ratio = depth / noise_depth, squared = ratio * ratio;
+SPS_INLINE float depth_certainty(float depth, float noise_crossover_depth) {
+  if (!(noise_crossover_depth > 0.0f)) return 1.0f;
+  const float ratio = depth / noise_crossover_depth, squared = ratio * ratio;
   return 1.0f / (1.0f + squared * squared);
 }
 
@@ -104,11 +104,11 @@ SPS_INLINE KernelWidths tracking_kernel(const TrackingOptions& options, std::int
   const float view = options.views.count > 0 ? annealed_kernel(options.kernel_start, options.views.kernel_end,
                                                                iteration, options.iterations)
                                              : step;
-  return {step, options.kernel_judge > 0.0f ? options.kernel_judge : step, view};
+  return {step, options.score_kernel > 0.0f ? options.score_kernel : step, view};
 }
 
 // How many views take part in an iteration.
-SPS_INLINE int views_in_use(const DepthViews& views, std::int64_t iteration) {
+SPS_INLINE int keyframes_in_use(const DepthKeyframes& views, std::int64_t iteration) {
   return iteration >= views.first_iteration ? views.count : 0;
 }
 

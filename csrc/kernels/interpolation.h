@@ -158,7 +158,7 @@ SPS_INLINE PlaneCell<T> tri_plane_cell(const Vec3<T>& point, T inverse_size, con
                     layout.size_v, 1);
 }
 
-// Adds a plane's gradient (texel units) to the gradient of the point (metres).
+// Adds a plane's gradient (texel units) to the gradient of the point (meters).
 template <class T>
 SPS_INLINE void add_plane_gradient(const PlaneGradient<T>& gradient, T inverse_size, int plane, Vec3<T>& point) {
   (plane == 2 ? point.y : point.x) += inverse_size * gradient.u;

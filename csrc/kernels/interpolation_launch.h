@@ -6,7 +6,7 @@
 
 namespace spslam {
 
-// Each device specialises this, before it instantiates, with static functions
+// Each device specializes this, before it instantiates, with static functions
 //   gather(device, field, table, channels, points, out): out[n] = sum of weight * row, 0 where there is no value;
 //   gather_gradient(device, field, grad, table, channels, points, out): d (grad . value) / d coordinates, [N, kAxes];
 //   scatter(device, field, grad, num_rows, channels, points, out, workspace): out[row] = sum of weight * grad;

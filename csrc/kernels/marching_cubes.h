@@ -1,7 +1,7 @@
 // Marching cubes of one cell: its own share of the samples, edges, vertices and faces.
 //
 // Cells that touch share samples, edges and so vertices. Each shared thing has one owner among the cells that exist:
-// its value, its bit and its number are the owner's. So neighbours agree whatever rounding their own samples had, and
+// its value, its bit and its number are the owner's. So neighbors agree whatever rounding their own samples had, and
 // vertices are welded without a search.
 #pragma once
 

@@ -36,7 +36,7 @@ SPS_INLINE Pixel unpack_pixel(const std::int32_t* words) {
   return pixel;
 }
 
-// The record of a pixel of that depth, colour [3] and surface normal [3] (0 = unknown) in the view of a camera. The
+// The record of a pixel of that depth, color [3] and surface normal [3] (0 = unknown) in the view of a camera. The
 // foreshortening is computed in double, so that its rounded step does not hang on the order of operations.
 SPS_INLINE void pack_pixel(std::int32_t u, std::int32_t v, float depth, const std::uint8_t* color, const float* normal,
                            double fx, double fy, double cx, double cy, std::int32_t* words) {

@@ -11,7 +11,7 @@ namespace spslam {
 
 constexpr int kPoseNumbers = 7, kQuaternionNumbers = 4;
 
-// Gradient by the seven numbers from that by translation and by a left turn omega about the camera's centre: as
+// Gradient by the seven numbers from that by translation and by a left turn omega about the camera's center: as
 // dq = (0, omega) q / 2, that in the unit quaternion's tangent space is 2 (0, g_omega) q.
 template <class T>
 SPS_INLINE void pose_gradient(const T* pose, const T* increment, T* gradient) {

@@ -32,7 +32,7 @@ struct EncodedPoint {
 };
 
 SPS_INLINE EncodedPoint locate_point(const float* point, const float* normal, float inverse_voxel_size) {
-  constexpr int kMargin = 2;  // so that every vertex of the neighbourhood is in range
+  constexpr int kMargin = 2;  // so that every vertex of the neighborhood is in range
   constexpr float kLow = kVoxelCoordMin + kMargin, kHigh = kVoxelCoordMax - kMargin;
   const Vec3<float> p{point[0] * inverse_voxel_size, point[1] * inverse_voxel_size, point[2] * inverse_voxel_size};
   const Vec3<float> base{std::floor(p.x), std::floor(p.y), std::floor(p.z)};

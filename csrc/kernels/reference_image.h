@@ -1,4 +1,4 @@
-// The maths of direct alignment: what a surface point should look like in an earlier frame's small grey image, against
+// The maths of direct alignment: what a surface point should look like in an earlier frame's small gray image, against
 // what it looks like now.
 #pragma once
 
@@ -27,7 +27,7 @@ SPS_INLINE ReferenceView load_reference(const ReferenceImage& image) {
   return {image, image.height > 0 ? load_pose(image.pose) : Pose<float>{}};
 }
 
-// Intensity of a colour in [0, 1].
+// Intensity of a color in [0, 1].
 SPS_INLINE float luma(const float* color) {
   constexpr float kRed = kLumaWeights[0] / 1000.0f, kGreen = kLumaWeights[1] / 1000.0f,
                   kBlue = kLumaWeights[2] / 1000.0f;

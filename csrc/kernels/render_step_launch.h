@@ -72,7 +72,7 @@ struct RenderStepLaunch {
     });
   }
 
-  // SDF, and colour where wanted, of every sample: 1 and 0 where there is nothing.
+  // SDF, and color where wanted, of every sample: 1 and 0 where there is nothing.
   void decode() {
     trilinear_interpolate(device_, scene_.embeddings, scene_.num_voxels, kEmbeddingChannels, b_.corners, b_.local, n_,
                           b_.feature);

@@ -1,5 +1,5 @@
 // Rendering weights of the samples of one ray and the loss terms of a ray (equations 5, 6, 8-11), with derivatives.
-// `sdf` is normalised: the signed distance divided by the truncation distance, in [-1, 1].
+// `sdf` is normalized: the signed distance divided by the truncation distance, in [-1, 1].
 #pragma once
 
 #include <cmath>
@@ -47,13 +47,13 @@ SPS_INLINE bool sample_visible(T t, bool valid, T first_crossing, T truncation) 
   return valid & (t <= first_crossing + truncation);
 }
 
-// 1 / sum of the bells, by which weights are normalised; 0 for a ray that meets nothing.
+// 1 / sum of the bells, by which weights are normalized; 0 for a ray that meets nothing.
 template <class T>
 SPS_INLINE T inverse_weight_sum(T bell_sum) {
   return bell_sum > 0 || bell_sum != bell_sum ? 1 / bell_sum : T(0);
 }
 
-// d L / d sdf of a sample, from d L / d its normalised weight, the ray's sum of weight * (d L / d weight), the slope of
+// d L / d sdf of a sample, from d L / d its normalized weight, the ray's sum of weight * (d L / d weight), the slope of
 // its bell (0 if it is not visible) and the inverse sum of bells.
 template <class T>
 SPS_INLINE T weight_backward(T grad_weight, T weighted_mean_grad, T bell_slope, T inverse_sum) {
@@ -100,13 +100,13 @@ SPS_INLINE SampleTarget<T> sample_target(T target_depth, T t, T cosine, T trunca
   return {distance, near_surface(distance, truncation, valid), in_free_space(distance, truncation)};
 }
 
-// Residual of the SDF term in metres; its derivatives are truncation by sdf and cosine by t.
+// Residual of the SDF term in meters; its derivatives are truncation by sdf and cosine by t.
 template <class T>
 SPS_INLINE T sdf_residual(T sdf, T distance, T truncation) {
   return sdf * truncation - distance;
 }
 
-// Residual of the free-space term, normalised; its derivative by sdf is 1.
+// Residual of the free-space term, normalized; its derivative by sdf is 1.
 template <class T>
 SPS_INLINE T free_space_residual(T sdf) {
   return sdf - 1;
@@ -124,7 +124,7 @@ struct RayLosses {
   T rgb, depth, free_space, sdf;
 };
 
-// Mean squared colour error over the channels (8).
+// Mean squared color error over the channels (8).
 template <class T>
 SPS_INLINE T color_loss(const T* color, const T* target) {
   T sum = 0;

@@ -9,7 +9,7 @@ namespace spslam {
 // Mask is bool, or T on the host: bytes beside floats would need four times as many lanes, more than a ray has samples.
 template <class T, class Mask>
 struct RaySamples {
-  const T* sdf;       // normalised
+  const T* sdf;       // normalized
   const T* t;         // depth, m
   const Mask* valid;  // inside the volume
   std::int32_t count;
@@ -26,7 +26,7 @@ SPS_INLINE T first_crossing(const RaySamples<T, Mask>& ray) {
   return first;
 }
 
-// Colour [3], depth and normalised weights of a ray (5, 6). `color` is [S, 3].
+// Color [3], depth and normalized weights of a ray (5, 6). `color` is [S, 3].
 template <class T, class Mask>
 SPS_INLINE void render_ray(const RaySamples<T, Mask>& ray, const T* color, T truncation, T* out_color, T* out_depth,
                            T* weights) {

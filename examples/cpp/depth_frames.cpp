@@ -11,7 +11,7 @@
 namespace {
 
 constexpr float kBallRadius = 0.5f, kHalfRoom = 1.6f;
-constexpr float kMetresPerUnit = 0.001f;
+constexpr float kMetersPerUnit = 0.001f;
 
 std::vector<float> read_numbers(const std::filesystem::path& path) {
   std::ifstream file(path);
@@ -35,7 +35,7 @@ DepthFrame read_depth(const std::filesystem::path& path, Intrinsics intrinsics) 
     throw std::runtime_error(path.string() + ": ends too early");
   }
   for (std::size_t i = 0; i < frame.depth.size(); ++i) {
-    frame.depth[i] = kMetresPerUnit * static_cast<float>(bytes[2 * i] << 8 | bytes[2 * i + 1]);
+    frame.depth[i] = kMetersPerUnit * static_cast<float>(bytes[2 * i] << 8 | bytes[2 * i + 1]);
   }
   return frame;
 }

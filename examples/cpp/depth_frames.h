@@ -21,7 +21,7 @@ struct DepthFrame {
   Vector3 to_camera(const Vector3& point) const;
 };
 
-// FOLDER/depth/*.pgm (16 bits, millimetres), FOLDER/intrinsics.txt (fx fy cx cy) and FOLDER/poses.txt (16 numbers a
+// FOLDER/depth/*.pgm (16 bits, millimeters), FOLDER/intrinsics.txt (fx fy cx cy) and FOLDER/poses.txt (16 numbers a
 // frame, the 4x4 matrix from camera to world). Throws std::runtime_error, naming the file.
 std::vector<DepthFrame> load_frames(const std::string& folder);
 

@@ -11,7 +11,7 @@
 
 class TsdfVolume {
  public:
-  // Both in metres; the truncation should be two voxels or more.
+  // Both in meters; the truncation should be two voxels or more.
   TsdfVolume(float voxel_size, float truncation);
 
   // Allocates the voxels near the frame's surface and averages its distances into all that it sees.

@@ -1,6 +1,6 @@
-"""The classical rival: voxelised GICP odometry against a growing map of Gaussians (`small_gicp`).
+"""The classical rival: voxelized GICP odometry against a growing map of Gaussians (`small_gicp`).
 
-No loop closure, no dense map, no colour, no learning; what a neural map must beat to be worth its work.
+No loop closure, no dense map, no color, no learning; what a neural map must beat to be worth its work.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class GicpOdometry:
         self.lost: list[bool] = []
 
     def process(self, depth: np.ndarray) -> np.ndarray:
-        """The pose of the next frame, float64 [4,4], from its depth float32 [H,W] in metres, 0 where unknown.
+        """The pose of the next frame, float64 [4,4], from its depth float32 [H,W] in meters, 0 where unknown.
 
         A frame without depth, or whose registration finds too little to hold on to, keeps the predicted pose, counts
         as lost and doesn't touch the map.

@@ -25,8 +25,8 @@ from spslam.evaluation.mesh import SAMPLES
 from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import ate, rpe
-from spslam.slam.device import resolve_device
-from spslam.slam.run import run_sequence
+from spslam.run.device import resolve_device
+from spslam.run.sequence import run_sequence
 
 _READING_THREADS, _READ_AHEAD = 2, 8
 
@@ -75,17 +75,17 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
     config = job.load_config()
     data = None if job.data is None else Path(job.data)
     dataset = open_dataset(config.dataset, data)
-    truth = _true_surface(dataset, job.mesh)
-    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=truth is not None or job.thorough)
+    ground_truth = _true_surface(dataset, job.mesh)
+    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=ground_truth is not None or job.thorough)
     if "peak_gpu_mb" in figures:
         figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
     run = RunOutput.read(folder)
     if run.mesh() is None:
         # A run that was lost throughout has an empty mesh, which is no reason to lose its other figures.
         return figures
-    if truth is not None:
+    if ground_truth is not None:
         extent = (SAMPLES, NOVEL_VIEWS) if job.thorough else (SAMPLES // 5, 0)
-        figures |= surface_figures(run, dataset, truth, *extent)
+        figures |= surface_figures(run, dataset, ground_truth, *extent)
     return {**figures, **view_figures(run, dataset)} if job.thorough else figures
 
 
@@ -99,8 +99,8 @@ def _measure_gicp(job: Job, threads: int) -> dict[str, Any]:
     dataset = open_sequence(
         job.load_config().dataset, None if job.data is None else Path(job.data), parse_slice(job.frames)
     )
-    truth = dataset.poses()
-    first_pose = truth[0] if truth is not None and bool(np.isfinite(truth[0]).all()) else np.eye(4)
+    ground_truth = dataset.poses()
+    first_pose = ground_truth[0] if ground_truth is not None and bool(np.isfinite(ground_truth[0]).all()) else np.eye(4)
     odometry = GicpOdometry(dataset.camera, first_pose, threads=threads, **dict(job.method_options))
     torch.set_num_threads(1)
     read, started = [], time.perf_counter()
@@ -119,4 +119,6 @@ def _measure_gicp(job: Job, threads: int) -> dict[str, Any]:
         "fps": len(poses) / wall_s,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
-    return figures | ({} if truth is None else {**ate(poses, truth[read]), **rpe(poses, truth[read])})
+    return figures | (
+        {} if ground_truth is None else {**ate(poses, ground_truth[read]), **rpe(poses, ground_truth[read])}
+    )

@@ -14,7 +14,7 @@ from spslam.benchmark.summary import Summary
 WIDTH, HEIGHT = 330, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 30, 42
 _LEGEND_HEIGHT = 26
-# Told apart with any colour vision, and by their markers in print.
+# Told apart with any color vision, and by their markers in print.
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _STYLE = (
     "text{font:12px sans-serif;fill:#222}.title{font-weight:600}.grid{stroke:#ddd}.axis{stroke:#888}"

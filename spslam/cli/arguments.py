@@ -34,14 +34,14 @@ def at_least_one(text: str) -> int:
     return int(text)
 
 
-def positive_metres(text: str) -> float:
+def positive_meters(text: str) -> float:
     """A length above 0."""
     try:
         value = float(text)
     except ValueError:
         value = 0.0
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a length in metres above 0, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a length in meters above 0, got {text!r}")
     return value
 
 

@@ -65,7 +65,7 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     from spslam.benchmark.report import describe_gaps, update_page, write_results
     from spslam.benchmark.summary import summarize
     from spslam.benchmark.tables import to_text
-    from spslam.slam.device import resolve_device
+    from spslam.run.device import resolve_device
 
     if args.data is not None and not args.data.is_dir():
         raise UsageError(f"--data must be a folder that holds the data sets, got {args.data}")

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> None:
     config = load_config("demo", overrides=overrides(args))
 
-    from spslam.slam.device import resolve_device
+    from spslam.run.device import resolve_device
 
     resolve_device(config.device)
     _remove_earlier_demo(args.output)

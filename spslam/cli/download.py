@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spslam.cli.arguments import add_quiet
 from spslam.download import SOURCES, Source, download, find_source, is_complete
-from spslam.download.catalogue import SCANNET_TERMS
+from spslam.download.catalog import SCANNET_TERMS
 
 SECONDS_BETWEEN_LINES = 2.0
 

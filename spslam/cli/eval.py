@@ -45,7 +45,7 @@ def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> dict[str, float
     from spslam.evaluation.finished_run import surface_figures, view_figures
     from spslam.evaluation.surface import TriangleSurface
 
-    truth = None if gt_mesh is None else TriangleSurface.load(gt_mesh)
+    ground_truth = None if gt_mesh is None else TriangleSurface.load(gt_mesh)
     dataset = open_dataset(load_config(require_run_file(run.folder, "config.yaml")).dataset)
-    figures = {} if truth is None else surface_figures(run, dataset, truth)
+    figures = {} if ground_truth is None else surface_figures(run, dataset, ground_truth)
     return {**figures, **view_figures(run, dataset)} if views else figures

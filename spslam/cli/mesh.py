@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from spslam.cli.arguments import add_run_folder, positive_metres, require_run_file
+from spslam.cli.arguments import add_run_folder, positive_meters, require_run_file
 from spslam.config import load_config
 
 FORMATS = ("ply", "glb", "obj")
@@ -12,7 +12,7 @@ FORMATS = ("ply", "glb", "obj")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_folder(parser)
-    parser.add_argument("--resolution", metavar="M", type=positive_metres, help="edge of a cell in metres")
+    parser.add_argument("--resolution", metavar="M", type=positive_meters, help="edge of a cell in meters")
     parser.add_argument("--format", choices=FORMATS, default="ply", help="file format, ply if not given")
 
 

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_OUTPUT,
         help=f"file of weights to write, {DEFAULT_OUTPUT} if not given; prior.weights in a configuration uses it",
     )
-    parser.add_argument("--steps", metavar="N", type=at_least_one, help="optimisation steps; the default is as shipped")
+    parser.add_argument("--steps", metavar="N", type=at_least_one, help="optimization steps; the default is as shipped")
     parser.add_argument("--seed", metavar="N", type=int, help="seed of all random draws, 0 if not given")
     parser.add_argument(
         "--neighborhood",

@@ -80,7 +80,7 @@ class Rate:
 
 
 def describe(report: Any) -> str:
-    """A frame in a few words: ok, lost or skipped, and the map's loss where it was just optimised."""
+    """A frame in a few words: ok, lost or skipped, and the map's loss where it was just optimized."""
     if report is None:
         return "unreadable frame skipped"
     parts = ["LOST" if report.lost else "ok"]

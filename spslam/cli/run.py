@@ -12,7 +12,7 @@ from spslam.cli.parser import UsageError
 from spslam.cli.progress import make_progress, print_summary
 from spslam.config import Config, load_config, resolve_config_path
 from spslam.errors import DeviceError
-from spslam.slam.reader_launch import end_spare, launch_spare
+from spslam.run.reader_launch import end_standby, launch_standby
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,8 +55,8 @@ def run(
     # Wrong data is told before torch is loaded.
     open_sequence(config.dataset, data, frames)
 
-    launch_spare(config)
-    from spslam.slam.run import run_sequence
+    launch_standby(config)
+    from spslam.run.sequence import run_sequence
 
     progress = make_progress(quiet)
     try:
@@ -70,7 +70,7 @@ def run(
             raise DeviceError(f"{error}; {command} --output {output} --resume goes on from its checkpoint") from error
         raise
     finally:
-        end_spare()
+        end_standby()
         if progress is not None:
             progress.close()
 

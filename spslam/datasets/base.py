@@ -16,14 +16,14 @@ from spslam.errors import DatasetError
 
 @dataclass
 class RgbdFrame:
-    """One colour image with its depth image, pixel by pixel of the same view.
+    """One color image with its depth image, pixel by pixel of the same view.
 
     Attributes
     ----------
     index : the frame's number in the dataset it was read from, counted from 0.
     timestamp : seconds.
     color : uint8 [H,W,3], RGB.
-    depth : float32 [H,W], metres along the optical axis; 0 where nothing was measured.
+    depth : float32 [H,W], meters along the optical axis; 0 where nothing was measured.
     pose : float64 [4,4] ``T_world_camera`` in OpenCV axes (x right, y down, z forward), or None where unknown.
         It is the truth to evaluate against; the system uses no more than the first.
     """
@@ -39,7 +39,7 @@ class RgbdDataset(ABC):
     """A sequence of frames of one camera, read one at a time and from any thread.
 
     ``dataset[i]`` reads frame i (0 <= i < len) and checks it: raises IndexError outside the range and
-    DatasetError, naming the file, for a frame that can't be used. Depth outside ``depth_range`` (metres) and within
+    DatasetError, naming the file, for a frame that can't be used. Depth outside ``depth_range`` (meters) and within
     ``border_px`` pixels of the image's border comes as 0. Reading the same frame again gives the same values.
     """
 
@@ -86,8 +86,8 @@ class RgbdDataset(ABC):
         color, depth = frame.color.shape[:2], frame.depth.shape[:2]
         if color != depth:
             raise DatasetError(
-                f"{self.describe(frame.index)}: depth must be as large as colour, "
-                f"got depth {_size(depth)} and colour {_size(color)}"
+                f"{self.describe(frame.index)}: depth must be as large as color, "
+                f"got depth {_size(depth)} and color {_size(color)}"
             )
         if color != expected:
             raise DatasetError(

@@ -9,7 +9,7 @@ import numpy as np
 _DISPARITY_PX_M = 43.5
 _DISPARITY_STEP_PX = 1 / 8
 _DISPARITY_SD_PX = 0.3 / 8
-# Neighbouring pixels err alike, because the sensor matches windows of some 7 px.
+# Neighboring pixels err alike, because the sensor matches windows of some 7 px.
 _CORRELATION_PX = 2.5
 _CORRELATED_SHARE = 0.9
 _WANDER_PX = 0.6
@@ -22,7 +22,7 @@ _RANDOM_LOSS = 0.002
 def kinect_depth(depth: np.ndarray, focal_px: float, level: float, generator: np.random.Generator) -> np.ndarray:
     """Depth as a structured-light sensor would measure it.
 
-    Disparity noise, mostly correlated over a few pixels, and its quantisation give an error that grows with depth
+    Disparity noise, mostly correlated over a few pixels, and its quantization give an error that grows with depth
     squared (about 0.2 cm at 1 m, 1.1 cm at 2.5 m); edges wander sideways; pixels are missing at depth edges, on
     surfaces seen under more than 80 degrees, outside 0.35 to 8 m, and now and then anywhere.
 

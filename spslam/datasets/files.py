@@ -53,16 +53,16 @@ class FileDataset(RgbdDataset):
     ----------
     frames : the files in order of time.
     true_poses : float64 [F,4,4], NaN where unknown, or None.
-    units_per_metre, invalid_depth : see :func:`spslam.datasets.images.read_depth`.
-    undistortion : applied to each colour image.
-    resize_color : bring each colour image to its depth image's size.
+    units_per_meter, invalid_depth : see :func:`spslam.datasets.images.read_depth`.
+    undistortion : applied to each color image.
+    resize_color : bring each color image to its depth image's size.
     """
 
     name: str
     camera: Camera
     frames: Sequence[FramePaths]
     true_poses: np.ndarray | None
-    units_per_metre: float | None
+    units_per_meter: float | None
     invalid_depth: Sequence[int] = ()
     undistortion: Undistortion | None = None
     resize_color: bool = False
@@ -87,7 +87,7 @@ class FileDataset(RgbdDataset):
         if paths.fault is not None:
             raise DatasetError(paths.fault)
         color = read_color(paths.color)
-        depth = read_depth(paths.depth, self.units_per_metre, self.invalid_depth)
+        depth = read_depth(paths.depth, self.units_per_meter, self.invalid_depth)
         if self.undistortion is not None:
             color = self.undistortion(color)
         if self.resize_color:
@@ -95,7 +95,7 @@ class FileDataset(RgbdDataset):
         return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index))
 
     def describe(self, index: int) -> str:
-        return f"{self.frames[index].depth} (colour: {self.frames[index].color.name})"
+        return f"{self.frames[index].depth} (color: {self.frames[index].color.name})"
 
     def _pose(self, index: int) -> np.ndarray | None:
         if self.true_poses is None or not np.isfinite(self.true_poses[index]).all():
@@ -133,7 +133,7 @@ def find_numbered(folder: Path, pattern: str) -> dict[int, Path]:
 def pair_numbered(
     colors: Mapping[int, Path], depths: Mapping[int, Path], frames_per_second: float
 ) -> dict[int, FramePaths]:
-    """Frames of the numbers that have a colour or a depth image; one without the other is a frame with a fault.
+    """Frames of the numbers that have a color or a depth image; one without the other is a frame with a fault.
 
     Times count from the first number at the given rate, so that a gap in the numbers is a gap in time.
     """
@@ -145,10 +145,10 @@ def pair_numbered(
 
 
 def paired(color: Path | None, depth: Path | None, timestamp: float) -> FramePaths:
-    """The frame of a colour and a depth image, one of which may be missing: then it is one with a fault."""
+    """The frame of a color and a depth image, one of which may be missing: then it is one with a fault."""
     fault = None
     if color is None or depth is None:
-        kind, present = ("colour", depth) if color is None else ("depth", color)
+        kind, present = ("color", depth) if color is None else ("depth", color)
         fault = f"{present}: the {kind} image of this frame is missing"
     return FramePaths(color or depth, depth or color, timestamp, fault)  # type: ignore[arg-type]
 

@@ -1,10 +1,10 @@
-"""A user's own recording: a folder of colour images, a folder of depth images and the intrinsics.
+"""A user's own recording: a folder of color images, a folder of depth images and the intrinsics.
 
 ``color/`` (or ``rgb/``, ``images/``) and ``depth/``, paired by name (the part before the suffix) or, where the names
 differ, by natural order if there are as many of each. Intrinsics in one of ``intrinsics.txt``,
 ``camera-intrinsics.txt`` (3x3 or 4x4 matrix, or fx fy cx cy), ``intrinsics.json`` or ``camera.json`` (``fx, fy, cx,
 cy`` and optionally ``width, height, depth_scale``). Depth is a 16-bit PNG or TIFF, or floating-point TIFF or npy, with
-``depth_scale`` units a metre: if nothing says otherwise 1000 for integers and 1 for floating point. Poses aren't
+``depth_scale`` units a meter: if nothing says otherwise 1000 for integers and 1 for floating point. Poses aren't
 needed; ``poses.txt``, with 16 numbers a frame (4x4 camera to world, OpenCV axes), is read if it is there.
 """
 
@@ -40,7 +40,7 @@ def open_folder(folder: Path, depth_scale: float | None = None) -> FileDataset:
     Parameters
     ----------
     folder : the recording.
-    depth_scale : depth units a metre; overrides the one in the JSON file.
+    depth_scale : depth units a meter; overrides the one in the JSON file.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def _pair(folder: Path, colors: list[Path], depths: list[Path]) -> list[FramePat
     if len(colors) == len(depths):
         return [paired(*pair, i / FRAMES_PER_SECOND) for i, pair in enumerate(zip(colors, depths, strict=True))]
     raise DatasetError(
-        f"{folder}: colour and depth images must have the same names or be as many, got {len(colors)} and {len(depths)}"
+        f"{folder}: color and depth images must have the same names or be as many, got {len(colors)} and {len(depths)}"
     )
 
 

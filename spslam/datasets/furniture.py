@@ -1,4 +1,4 @@
-"""The layout of the generated room: what stands where, and how it is coloured."""
+"""The layout of the generated room: what stands where, and how it is colored."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Color = tuple[float, float, float]
 _OAK = (0.66, 0.49, 0.32)
 _WALNUT = (0.44, 0.31, 0.22)
 _WHITE = (0.86, 0.84, 0.79)
-_GREY = (0.50, 0.51, 0.54)
+_GRAY = (0.50, 0.51, 0.54)
 _DARK = (0.22, 0.23, 0.26)
 _TEAL = (0.20, 0.47, 0.48)
 _NAVY = (0.22, 0.30, 0.50)
@@ -32,11 +32,11 @@ _BOOKS = (_TEAL, _NAVY, _MUSTARD, _BRICK, _ROSE, _LEAF, _WHITE, _DARK)
 
 @dataclass(frozen=True)
 class Material:
-    """A colour with a pattern through space, so that it needs no seams and no texture coordinates.
+    """A color with a pattern through space, so that it needs no seams and no texture coordinates.
 
-    Two waves, multiplied and sharpened, give checks or stripes between the colour and a darker one; a third, longer
-    wave varies the brightness. ``color`` is RGB in 0..1; ``waves`` [3,3] are wave vectors in radians a metre,
-    ``phases`` [3]; ``contrast`` is the share of the colour that the pattern takes.
+    Two waves, multiplied and sharpened, give checks or stripes between the color and a darker one; a third, longer
+    wave varies the brightness. ``color`` is RGB in 0..1; ``waves`` [3,3] are wave vectors in radians a meter,
+    ``phases`` [3]; ``contrast`` is the share of the color that the pattern takes.
     """
 
     color: np.ndarray
@@ -70,7 +70,7 @@ def furnish(seed: int) -> list[Piece]:
 
 
 def make_material(generator: np.random.Generator, color: Color, shortest_m: float, longest_m: float) -> Material:
-    """A random pattern of the given colour, its waves between two lengths in metres."""
+    """A random pattern of the given color, its waves between two lengths in meters."""
     lengths = np.exp(generator.uniform(np.log(shortest_m), np.log(longest_m), size=2))
     slant = generator.uniform(-0.25, 0.25)
     across, along = np.array([1, 1 + slant, slant]), np.array([slant, -slant, 1.2])
@@ -137,7 +137,7 @@ def _desk() -> Iterable[tuple[Primitive, Color]]:
     yield _standing(1.25, 1.67, (0.3, 0.6, 0.73)), _WHITE
     yield _upright(0.5, 1.75, 0.03, 0.14, bottom=0.765), _DARK
     yield _standing(0.5, 1.75, (0.62, 0.05, 0.36), bottom=0.88, yaw=0.12), _DARK
-    yield _standing(0.42, 1.48, (0.42, 0.14, 0.03), bottom=0.765, yaw=0.06), _GREY
+    yield _standing(0.42, 1.48, (0.42, 0.14, 0.03), bottom=0.765, yaw=0.06), _GRAY
     yield _upright(1.1, 1.6, 0.07, 0.16, bottom=0.765), _BRICK
 
 
@@ -158,7 +158,7 @@ def _cupboard_and_lamp() -> Iterable[tuple[Primitive, Color]]:
     yield _upright(0.75, -1.6, 0.17, 0.03), _DARK
     yield _upright(0.75, -1.6, 0.022, 1.45, bottom=0.02), _DARK
     yield Sphere((0.75, -1.6, 1.58), 0.0, 0.2), _LAMP
-    yield _upright(1.5, -1.72, 0.16, 0.36), _GREY
+    yield _upright(1.5, -1.72, 0.16, 0.36), _GRAY
 
 
 def _plant_and_stool(generator: np.random.Generator) -> Iterable[tuple[Primitive, Color]]:
@@ -168,7 +168,7 @@ def _plant_and_stool(generator: np.random.Generator) -> Iterable[tuple[Primitive
     yield Sphere((-2.1, -1.6, 1.0), 0.0, 0.24), _LEAF
     yield Sphere((-1.85, -1.55, 1.2), 0.0, 0.2), _LEAF
     yield _standing(1.45, 0.15, (0.45, 0.45, 0.42), yaw=yaw), _TEAL
-    yield _standing(-1.6, 1.65, (0.5, 0.5, 1.6), yaw=0.25), _GREY
+    yield _standing(-1.6, 1.65, (0.5, 0.5, 1.6), yaw=0.25), _GRAY
     yield _standing(2.2, 1.65, (0.45, 0.5, 2.65)), _WHITE
 
 

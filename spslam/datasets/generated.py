@@ -32,9 +32,9 @@ class GeneratedDataset(RgbdDataset):
     ----------
     frames : number of frames.
     width, height : image size; the field of view is 60 degrees across.
-    noise : 0 is exact depth and clean colour, 1 the errors of a Kinect v1 (:func:`kinect_depth`) and slight colour
+    noise : 0 is exact depth and clean color, 1 the errors of a Kinect v1 (:func:`kinect_depth`) and slight color
         noise; True and False stand for 1 and 0.
-    seed : decides on colours, small pieces of furniture, the hand's shaking and the noise.
+    seed : decides on colors, small pieces of furniture, the hand's shaking and the noise.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ def camera_path(frames: int, seed: int = 0) -> np.ndarray:
 
 
 def _hand_shake(frames: int, seed: int) -> np.ndarray:
-    """Offsets [frames,6]: metres, then radians of yaw, pitch and roll; waves of 0.3 to 1.5 Hz."""
+    """Offsets [frames,6]: meters, then radians of yaw, pitch and roll; waves of 0.3 to 1.5 Hz."""
     generator = np.random.default_rng([seed, 5])
     frequency = generator.uniform(0.3, 1.5, (6, 4))
     phase = generator.uniform(0, 2 * np.pi, (6, 4))

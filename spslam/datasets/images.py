@@ -1,4 +1,4 @@
-"""Decoding colour and depth images; every failure names the file."""
+"""Decoding color and depth images; every failure names the file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TAIL_BYTES = 1024
 
 
 def read_color(path: Path) -> np.ndarray:
-    """The image as uint8 [H,W,3], RGB; grey images are repeated over the channels.
+    """The image as uint8 [H,W,3], RGB; gray images are repeated over the channels.
 
     A rotation noted in EXIF is ignored: the depth image beside it isn't rotated either. Raises DatasetError.
     """
@@ -29,13 +29,13 @@ def decode_color(content: bytes, suffix: str, name: str) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
-def read_depth(path: Path, units_per_metre: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
-    """The depth image as float32 [H,W] in metres, 0 where nothing was measured.
+def read_depth(path: Path, units_per_meter: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
+    """The depth image as float32 [H,W] in meters, 0 where nothing was measured.
 
     Parameters
     ----------
     path : a one-channel image, 16-bit (PNG, TIFF) or 32-bit float (TIFF), or a two-dimensional ``.npy``.
-    units_per_metre : the stored value of one metre; None means millimetres in 16 bits, metres in floating point.
+    units_per_meter : the stored value of one meter; None means millimeters in 16 bits, meters in floating point.
     invalid : stored values besides 0 that stand for "not measured". Negative and non-finite ones always do.
 
     Raises
@@ -52,14 +52,14 @@ def read_depth(path: Path, units_per_metre: float | None, invalid: Sequence[int]
         raise DatasetError(
             f"{path}: depth must be 16-bit or floating-point with one channel, got {stored.dtype} with {channels}"
         )
-    return depth_in_metres(stored, units_per_metre, invalid)
+    return depth_in_meters(stored, units_per_meter, invalid)
 
 
-def depth_in_metres(stored: np.ndarray, units_per_metre: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
-    """Stored depth [H,W], uint16 or floating-point, as float32 metres; arguments as for :func:`read_depth`."""
-    if units_per_metre is None:
-        units_per_metre = 1000.0 if stored.dtype == np.uint16 else 1.0
-    depth = np.divide(stored, np.float32(units_per_metre), dtype=np.float32, casting="same_kind")
+def depth_in_meters(stored: np.ndarray, units_per_meter: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
+    """Stored depth [H,W], uint16 or floating-point, as float32 meters; arguments as for :func:`read_depth`."""
+    if units_per_meter is None:
+        units_per_meter = 1000.0 if stored.dtype == np.uint16 else 1.0
+    depth = np.divide(stored, np.float32(units_per_meter), dtype=np.float32, casting="same_kind")
     for value in invalid:
         depth[stored == value] = 0
     if stored.dtype != np.uint16:
@@ -81,7 +81,7 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], np.ndarray] = read_
 
 
 def resized_color(color: np.ndarray, width: int, height: int) -> np.ndarray:
-    """A colour image of the same view in another size; larger ones are averaged, smaller ones interpolated."""
+    """A color image of the same view in another size; larger ones are averaged, smaller ones interpolated."""
     if color.shape[:2] == (height, width):
         return color
     shrinks = color.shape[0] >= height and color.shape[1] >= width

@@ -29,7 +29,7 @@ _GOOD_AGREEMENT = 0.02
 
 @dataclass(frozen=True)
 class DepthStatistics:
-    """Depth of the frames looked at: percentiles 1, 50 and 99 in metres, share of pixels without depth."""
+    """Depth of the frames looked at: percentiles 1, 50 and 99 in meters, share of pixels without depth."""
 
     near_m: float
     median_m: float

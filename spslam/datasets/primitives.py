@@ -1,7 +1,7 @@
 """Boxes, spheres and cylinders: exact ray intersection, signed distance, normals and area-weighted sampling.
 
 World axes have z up. A ray is an origin [3] and directions [3,...] (structure of arrays); its parameter t is in units
-of the direction's length, so that directions with camera z = 1 give depth. Points are [N,3] in metres.
+of the direction's length, so that directions with camera z = 1 give depth. Points are [N,3] in meters.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Primitive(ABC):
     @property
     @abstractmethod
     def area(self) -> float:
-        """Surface in square metres."""
+        """Surface in square meters."""
 
     @abstractmethod
     def local_distance(self, points: np.ndarray) -> np.ndarray:
@@ -78,8 +78,8 @@ class Primitive(ABC):
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
         """Points [...,3] in the solid's own axes."""
-        centred = points - np.asarray(self.center, dtype=points.dtype)
-        return centred if self.yaw == 0 else centred @ self._rotation().astype(points.dtype)
+        centered = points - np.asarray(self.center, dtype=points.dtype)
+        return centered if self.yaw == 0 else centered @ self._rotation().astype(points.dtype)
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         """World points of points [...,3] in the solid's own axes."""
@@ -230,7 +230,7 @@ def _slab(origin: float, direction: np.ndarray, half: float) -> tuple[np.ndarray
 
 
 def _round_interval(origin: np.ndarray, directions: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    # In single precision the discriminant loses a millimetre at grazing rays.
+    # In single precision the discriminant loses a millimeter at grazing rays.
     origin, directions = origin.astype(np.float64), directions.astype(np.float64)
     a = np.sum(directions * directions, axis=0)
     half_b = np.tensordot(origin, directions, axes=1)

@@ -2,7 +2,7 @@
 
 ``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (16-bit), ``traj.txt`` with 16 numbers a line (4x4 camera
 to world, OpenCV axes) and ``cam_params.json`` beside the scene or in its parent folder: ``{"camera": {"w", "h", "fx",
-"fy", "cx", "cy", "scale"}}``, ``scale`` being the depth value of one metre.
+"fy", "cx", "cy", "scale"}}``, ``scale`` being the depth value of one meter.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ def open_replica(folder: Path) -> FileDataset:
     depths = find_numbered(results, r"depth(\d+)\.png")
     if not colors:
         raise DatasetError(f"{folder}: must hold results/frame000000.jpg and so on, got none")
-    camera, units_per_metre = _read_camera(_find_camera_file(folder), *first_size(colors.values()))
+    camera, units_per_meter = _read_camera(_find_camera_file(folder), *first_size(colors.values()))
     frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "traj.txt")
-    return FileDataset(f"replica/{folder.name}", camera, frames, poses, units_per_metre)
+    return FileDataset(f"replica/{folder.name}", camera, frames, poses, units_per_meter)
 
 
 def _find_camera_file(folder: Path) -> Path:

@@ -22,7 +22,7 @@ _PIXEL_STEP = 8
 # Poses fit if depth agrees to this share of itself; another reading is named if it is twice as good.
 _GOOD_RELATIVE_ERROR = 0.005
 _CLEARLY_BETTER = 0.5
-# Ratios between the depth scales in use (units a metre: 1000, 5000, 6553.5, 10000, 1).
+# Ratios between the depth scales in use (units a meter: 1000, 5000, 6553.5, 10000, 1).
 _SCALES = (0.001, 0.1, 0.2, 0.5, 0.1526, 0.763, 1.311, 2.0, 5.0, 6.5535, 10.0, 1000.0)
 
 Depths = Sequence[np.ndarray]
@@ -30,7 +30,7 @@ Depths = Sequence[np.ndarray]
 
 @dataclass(frozen=True)
 class DepthPair:
-    """Two views: frame numbers and depth images [H,W], metres, 0 unknown."""
+    """Two views: frame numbers and depth images [H,W], meters, 0 unknown."""
 
     frame_a: int
     frame_b: int

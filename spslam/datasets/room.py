@@ -1,4 +1,4 @@
-"""A closed furnished room of known shape: ray casting, colours, signed distance and surface samples."""
+"""A closed furnished room of known shape: ray casting, colors, signed distance and surface samples."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spslam.datasets.furniture import ROOM_SIZE, Material, Piece, furnish, make_
 from spslam.datasets.primitives import Box, Primitive
 from spslam.geometry import inverse
 
-# The shell's faces, two an axis (low, high): walls, floor and ceiling with colours of their own.
+# The shell's faces, two an axis (low, high): walls, floor and ceiling with colors of their own.
 _SHELL_COLORS = (
     (0.82, 0.76, 0.64),
     (0.64, 0.71, 0.76),
@@ -23,7 +23,7 @@ _LIGHT = np.array([0.40, 0.29, 0.87])
 _AMBIENT, _DIRECT = 0.76, 0.24
 # How hard the pattern's edges are, and the share of the broad wave.
 _SHARPNESS, _BROAD = 3.0, 0.12
-# A sampled point this far inside another solid is hidden; double precision on coordinates of metres.
+# A sampled point this far inside another solid is hidden; double precision on coordinates of meters.
 _HIDDEN_M = 1e-9
 # The middles of a round surface's triangles lie this much under it at most.
 _SAGITTA_M = 5e-4
@@ -39,9 +39,9 @@ class Room:
         self._shell_materials = [make_material(generator, color, 0.2, 0.5) for color in _SHELL_COLORS]
 
     def render(self, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What a camera inside sees: colour uint8 [H,W,3] and exact depth float32 [H,W] in metres.
+        """What a camera inside sees: color uint8 [H,W,3] and exact depth float32 [H,W] in meters.
 
-        One ray through each pixel centre is intersected with every solid; ``pose`` is ``T_world_camera`` [4,4].
+        One ray through each pixel center is intersected with every solid; ``pose`` is ``T_world_camera`` [4,4].
         """
         origin = pose[:3, 3]
         directions = np.tensordot(pose[:3, :3].astype(np.float32), camera.ray_directions(), axes=(1, 2))
@@ -51,7 +51,7 @@ class Room:
         return self._colors(points, owner.reshape(-1)).reshape(camera.height, camera.width, 3), depth
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] in metres of points [N,3] to the nearest surface.
+        """Distance [N] in meters of points [N,3] to the nearest surface.
 
         Positive and exact in free space; negative inside furniture and behind the walls, where it is the distance
         to leave the solid the point is deepest in (a lower bound of the distance to free space).
@@ -67,7 +67,7 @@ class Room:
         return np.abs(self.signed_distance(points))
 
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
-        """Points [count,3] spread evenly by area over the surfaces that face free space; float64, metres.
+        """Points [count,3] spread evenly by area over the surfaces that face free space; float64, meters.
 
         The same count and seed give the same points. ``count`` 0 gives an empty array.
         """
@@ -86,7 +86,7 @@ class Room:
         return np.concatenate(kept)
 
     def mesh(self, longest_edge_m: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The room's surface as triangles: vertices float64 [V,3], faces int64 [F,3], colours uint8 [V,3].
+        """The room's surface as triangles: vertices float64 [V,3], faces int64 [F,3], colors uint8 [V,3].
 
         Faces point into free space. Triangles whose middle is hidden in another solid are left out, so that along
         contacts the mesh ends within one triangle of the true line. Round surfaces deviate by under 0.5 mm.

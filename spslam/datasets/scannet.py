@@ -1,9 +1,9 @@
 """ScanNet (Dai et al. 2017): Structure Sensor on a tablet, poses by BundleFusion.
 
 A scan is read from ``sceneNNNN_NN.sens`` as it is distributed, or from what the data set's own exporter makes of it:
-``color/N.jpg``, ``depth/N.png`` (16-bit millimetres), ``pose/N.txt`` (4x4 camera to world, OpenCV axes; infinite where
-unknown) and ``intrinsic/intrinsic_depth.txt``. Colour is larger than depth (1296x968 against 640x480). The authors
-registered the two to each other ("they can be resampled to the same resolution"), so colour is brought to depth's size
+``color/N.jpg``, ``depth/N.png`` (16-bit millimeters), ``pose/N.txt`` (4x4 camera to world, OpenCV axes; infinite where
+unknown) and ``intrinsic/intrinsic_depth.txt``. Color is larger than depth (1296x968 against 640x480). The authors
+registered the two to each other ("they can be resampled to the same resolution"), so color is brought to depth's size
 and depth's intrinsics hold for both.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
-from spslam.datasets.images import depth_in_metres, first_size, read_depth, resized_color
+from spslam.datasets.images import depth_in_meters, first_size, read_depth, resized_color
 from spslam.datasets.sens import SensFile
 from spslam.datasets.text import camera_from_matrix, checked_pose, read_intrinsics_matrix
 from spslam.errors import DatasetError
@@ -54,7 +54,7 @@ def open_scannet(path: Path) -> RgbdDataset:
 class SensDataset(RgbdDataset):
     """The frames of a ``.sens`` file.
 
-    Times are those of the colour images, in seconds from the first; a file without times is taken at 30 Hz. Frames are
+    Times are those of the color images, in seconds from the first; a file without times is taken at 30 Hz. Frames are
     put in order of time; of frames with the same time all but the first raise when they are read, and so does one frame
     that stands for the missing rest of a file that was cut.
 
@@ -95,7 +95,7 @@ class SensDataset(RgbdDataset):
             raise DatasetError(self._faults[index])
         frame = int(self._order[index])
         color = resized_color(self._file.color(frame), self.camera.width, self.camera.height)
-        depth = depth_in_metres(self._file.depth(frame), self._file.header.units_per_metre)
+        depth = depth_in_meters(self._file.depth(frame), self._file.header.units_per_meter)
         pose = self._poses[index]
         return RgbdFrame(
             index, float(self._times[index]), color, depth, pose.copy() if np.isfinite(pose).all() else None
@@ -144,7 +144,7 @@ def _open_exported(folder: Path, name: str) -> FileDataset:
     camera = _find_camera(folder, size, list(colors.values()))
     paired = pair_numbered(colors, depths, FRAMES_PER_SECOND)
     frames, poses = attach_poses(paired, lambda number: folder / "pose" / f"{number}.txt")
-    return FileDataset(name, camera, frames, poses, units_per_metre=1000.0, resize_color=True)
+    return FileDataset(name, camera, frames, poses, units_per_meter=1000.0, resize_color=True)
 
 
 def _find_camera(folder: Path, size: tuple[int, int], colors: list[Path]) -> Camera:

@@ -1,9 +1,9 @@
 """ScanNet's ``.sens``: a whole recording in one file (version 4 of its format, little-endian).
 
-The head: version (u32), length (u64) and bytes of the sensor's name, four 4x4 float32 matrices row by row (colour's
-intrinsics and extrinsics, then depth's), the compressions of colour and of depth (i32), width and height of colour and
-of depth (u32), ``depth_shift`` (f32: depth units a metre) and the number of frames (u64).
-Each frame: ``camera_to_world`` (4x4 float32), the times of colour and depth in microseconds (u64), the bytes that
+The head: version (u32), length (u64) and bytes of the sensor's name, four 4x4 float32 matrices row by row (color's
+intrinsics and extrinsics, then depth's), the compressions of color and of depth (i32), width and height of color and
+of depth (u32), ``depth_shift`` (f32: depth units a meter) and the number of frames (u64).
+Each frame: ``camera_to_world`` (4x4 float32), the times of color and depth in microseconds (u64), the bytes that
 either takes (u64), and these. IMU readings follow; they aren't read.
 """
 
@@ -40,7 +40,7 @@ class SensHeader:
     color_compression : 0 raw, 1 PNG, 2 JPEG.
     depth_compression : 0 raw, 1 zlib.
     color_size, depth_size : (width, height).
-    units_per_metre : stored depth of one metre.
+    units_per_meter : stored depth of one meter.
     frames : how many the file should have.
     """
 
@@ -51,7 +51,7 @@ class SensHeader:
     depth_compression: int
     color_size: tuple[int, int]
     depth_size: tuple[int, int]
-    units_per_metre: float
+    units_per_meter: float
     frames: int
 
 
@@ -62,8 +62,8 @@ class SensIndex:
     Attributes
     ----------
     poses : float32 [F,16], ``camera_to_world`` as stored; minus infinity where unknown.
-    times_us : uint64 [F], of the colour images.
-    offsets : int64 [F], where the colour image begins in the file; depth follows it.
+    times_us : uint64 [F], of the color images.
+    offsets : int64 [F], where the color image begins in the file; depth follows it.
     color_bytes, depth_bytes : int64 [F].
     """
 
@@ -102,9 +102,9 @@ class SensFile:
         return f"{self.path}, frame {frame}"
 
     def color(self, frame: int) -> np.ndarray:
-        """Colour image of a frame, uint8 [H,W,3], RGB. Raises DatasetError."""
+        """Color image of a frame, uint8 [H,W,3], RGB. Raises DatasetError."""
         content = self._bytes(self.index.offsets[frame], self.index.color_bytes[frame])
-        name, (width, height) = f"{self.describe(frame)}, colour", self.header.color_size
+        name, (width, height) = f"{self.describe(frame)}, color", self.header.color_size
         if self.header.color_compression != _RAW:
             return decode_color(content, _COLOR_SUFFIXES[self.header.color_compression], name)
         if len(content) != 3 * width * height:
@@ -147,12 +147,12 @@ def _read_header(file: BinaryIO, path: Path) -> SensHeader:
         matrices = np.array(_unpack(file, "<64f"), dtype=np.float32).reshape(4, 4, 4)
         color_compression, depth_compression = _unpack(file, "<2i")
         color_width, color_height, depth_width, depth_height = _unpack(file, "<4I")
-        units_per_metre, frames = _unpack(file, "<fQ")
+        units_per_meter, frames = _unpack(file, "<fQ")
     except struct.error:
         raise DatasetError(f"{path}: the file is truncated in its head") from None
     if color_compression not in (_RAW, *_COLOR_SUFFIXES) or depth_compression not in (_RAW, _ZLIB):
         raise DatasetError(
-            f"{path}: must hold colour as raw, PNG or JPEG (0, 1, 2) and depth as raw or zlib (0, 1), "
+            f"{path}: must hold color as raw, PNG or JPEG (0, 1, 2) and depth as raw or zlib (0, 1), "
             f"got {color_compression} and {depth_compression}"
         )
     sizes = (color_width, color_height), (depth_width, depth_height)
@@ -160,10 +160,10 @@ def _read_header(file: BinaryIO, path: Path) -> SensHeader:
         raise DatasetError(
             f"{path}: image sizes must be within 1 and {_LARGEST_SIDE_PX} px, got {sizes[0]}, {sizes[1]}"
         )
-    if not 0 < units_per_metre < float("inf"):
-        raise DatasetError(f"{path}: depth_shift must be positive, got {units_per_metre}")
+    if not 0 < units_per_meter < float("inf"):
+        raise DatasetError(f"{path}: depth_shift must be positive, got {units_per_meter}")
     return SensHeader(
-        sensor, matrices[0], matrices[2], color_compression, depth_compression, *sizes, units_per_metre, frames
+        sensor, matrices[0], matrices[2], color_compression, depth_compression, *sizes, units_per_meter, frames
     )
 
 

@@ -1,8 +1,8 @@
 """7-Scenes (Shotton et al. 2013): Kinect v1 in seven small rooms.
 
 A scene folder holds ``seq-01``, ``seq-02``, ..., each with ``frame-NNNNNN.color.png`` (or jpg), ``.depth.png``
-(16-bit millimetres; 0 and 65535 are invalid) and ``.pose.txt`` (4x4 camera to world, OpenCV axes). The poses are
-KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Colour and depth were not
+(16-bit millimeters; 0 and 65535 are invalid) and ``.pose.txt`` (4x4 camera to world, OpenCV axes). The poses are
+KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Color and depth were not
 registered to each other by the data set's authors; both are taken as one camera's, as everybody does.
 """
 
@@ -58,7 +58,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
         lambda number: sequence_folder / f"frame-{number:06d}.pose.txt",
     )
     name = f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}"
-    return FileDataset(name, camera, frames, poses, units_per_metre=1000.0, invalid_depth=(65535,))
+    return FileDataset(name, camera, frames, poses, units_per_meter=1000.0, invalid_depth=(65535,))
 
 
 def list_sequences(scene: Path, split: str | None = None) -> list[str]:

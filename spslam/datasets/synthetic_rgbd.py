@@ -1,7 +1,7 @@
 """The layout of Neural RGB-D (Azinovic et al. 2022), which "Synthetic RGB-D" is distributed in.
 
 ``images/imgN.png`` (or jpg), ``depth_filtered/depthN.png`` (noisy and filtered), ``depth_with_noise/depthN.png``
-(before the filter) and ``depth/depthN.png`` (exact), each in 16-bit millimetres, ``poses.txt`` with four lines a frame
+(before the filter) and ``depth/depthN.png`` (exact), each in 16-bit millimeters, ``poses.txt`` with four lines a frame
 (4x4 camera to world, OpenGL camera axes: x right, y up, z backward) and ``focal.txt`` with one number. The principal
 point is the image's middle.
 """
@@ -46,7 +46,7 @@ def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileD
     frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "poses.txt")
     if poses is not None:
         poses = poses @ _OPENCV_FROM_OPENGL
-    return FileDataset(f"synthetic_rgbd/{folder.name}", camera, frames, poses, units_per_metre=1000.0)
+    return FileDataset(f"synthetic_rgbd/{folder.name}", camera, frames, poses, units_per_meter=1000.0)
 
 
 def _depth_folder(folder: Path, variant: str | None) -> Path:

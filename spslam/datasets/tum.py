@@ -1,13 +1,13 @@
 """TUM RGB-D (Sturm et al. 2012): Kinect and Xtion sequences with motion-capture truth.
 
 ``rgb.txt`` and ``depth.txt`` list ``timestamp file``, ``groundtruth.txt`` lists ``timestamp tx ty tz qx qy qz qw``
-(camera to world, OpenCV axes). Depth is 16-bit with 5000 units a metre, registered to the colour camera.
+(camera to world, OpenCV axes). Depth is 16-bit with 5000 units a meter, registered to the color camera.
 
-Colour and depth are taken at different moments, so each colour image is paired with the depth image nearest in time,
-and the truth is interpolated at the colour image's time. freiburg1's and freiburg2's colour images are distorted,
-freiburg3's are not; the intrinsics are those the authors calibrated for each. Colour is undistorted; depth is left as
+Color and depth are taken at different moments, so each color image is paired with the depth image nearest in time,
+and the truth is interpolated at the color image's time. freiburg1's and freiburg2's color images are distorted,
+freiburg3's are not; the intrinsics are those the authors calibrated for each. Color is undistorted; depth is left as
 it is, because it comes from another lens: carried from view to view with the true poses, the depth images of
-freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15 frames) than undistorted with the colour
+freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15 frames) than undistorted with the color
 camera's coefficients (3.0, 5.3, 5.3 cm).
 """
 
@@ -27,11 +27,11 @@ from spslam.errors import DatasetError
 from spslam.geometry import interpolate_pose
 from spslam.trajectory import Trajectory
 
-UNITS_PER_METRE = 5000.0
-# Further apart, colour and depth show different views (the sensor's rate is 30 Hz).
+UNITS_PER_METER = 5000.0
+# Further apart, color and depth show different views (the sensor's rate is 30 Hz).
 MAX_PAIR_DIFFERENCE_S = 0.02
 # Motion capture runs at 100 Hz or more; across a longer gap between two of its poses nothing is made up.
-MAX_TRUTH_GAP_S = 0.1
+MAX_GROUND_TRUTH_GAP_S = 0.1
 CALIBRATION_FILE = "calibration.txt"
 
 
@@ -43,7 +43,7 @@ class _Calibration:
     distortion: tuple[float, float, float, float, float]
 
 
-# https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats, table "Intrinsic camera calibration", colour cameras.
+# https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats, table "Intrinsic camera calibration", color cameras.
 _CALIBRATIONS = {
     "freiburg1": _Calibration((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": _Calibration((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -58,7 +58,7 @@ def open_tum(folder: Path) -> FileDataset:
 
     The camera is that of ``calibration.txt`` in the folder (fx fy cx cy, then up to five distortion coefficients), else
     the one named in the folder's name (``freiburg1`` or ``fr1``, ...), else ROS's default. Lists may be unsorted; of
-    lines with the same timestamp the first counts. Colour images without a depth image within 0.02 s are left out.
+    lines with the same timestamp the first counts. Color images without a depth image within 0.02 s are left out.
     Frames outside the time of ``groundtruth.txt``, or in a gap of over 0.1 s in it, have no pose; its rows with a
     number that isn't finite are left out, and the file may be missing.
 
@@ -72,7 +72,7 @@ def open_tum(folder: Path) -> FileDataset:
     pairs = associate(_times(colors), _times(depths), MAX_PAIR_DIFFERENCE_S)
     if not len(pairs):
         raise DatasetError(
-            f"{folder}: must have colour and depth images within {MAX_PAIR_DIFFERENCE_S} s of each other, got none "
+            f"{folder}: must have color and depth images within {MAX_PAIR_DIFFERENCE_S} s of each other, got none "
             f"({len(colors)} in rgb.txt, {len(depths)} in depth.txt)"
         )
     frames = [FramePaths(colors[c][1], depths[d][1], colors[c][0]) for c, d in pairs]
@@ -81,8 +81,8 @@ def open_tum(folder: Path) -> FileDataset:
         f"tum/{folder.name}",
         camera,
         frames,
-        _interpolated_truth(folder / "groundtruth.txt", np.array([frame.timestamp for frame in frames])),
-        UNITS_PER_METRE,
+        _interpolated_ground_truth(folder / "groundtruth.txt", np.array([frame.timestamp for frame in frames])),
+        UNITS_PER_METER,
         undistortion=Undistortion.of(camera, distortion) if any(distortion) else None,
     )
 
@@ -163,9 +163,9 @@ def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tu
     return Camera(640, 480, *calibration.intrinsics).resized(width, height), calibration.distortion
 
 
-def _interpolated_truth(path: Path, times: np.ndarray) -> np.ndarray | None:
+def _interpolated_ground_truth(path: Path, times: np.ndarray) -> np.ndarray | None:
     if not path.is_file():
         return None
-    truth = Trajectory.load_tum(path, skip_unknown=True)
-    timestamps, first = np.unique(truth.timestamps, return_index=True)
-    return interpolate_trajectory(Trajectory(timestamps, truth.poses[first]), times, MAX_TRUTH_GAP_S)
+    ground_truth = Trajectory.load_tum(path, skip_unknown=True)
+    timestamps, first = np.unique(ground_truth.timestamps, return_index=True)
+    return interpolate_trajectory(Trajectory(timestamps, ground_truth.poses[first]), times, MAX_GROUND_TRUTH_GAP_S)

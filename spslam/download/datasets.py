@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from spslam.download.catalogue import Archive, Source
+from spslam.download.catalog import Archive, Source
 from spslam.download.transfer import FIRST_PAUSE_S, fetch
 from spslam.download.unpacking import ArchiveError, unpack
 from spslam.errors import OutputError

@@ -1,1 +1,1 @@
-"""What a run is judged by: trajectories, surfaces, depth and colour images."""
+"""What a run is judged by: trajectories, surfaces, depth and color images."""

@@ -1,4 +1,4 @@
-"""Charts as inline SVG, in the colours of the report's style sheet."""
+"""Charts as inline SVG, in the colors of the report's style sheet."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_POINTS = 2000
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a chart. ``kind`` names its colour in the style sheet; NaN values break the line."""
+    """One line of a chart. ``kind`` names its color in the style sheet; NaN values break the line."""
 
     name: str
     kind: str
@@ -55,8 +55,8 @@ def line_chart(series: Sequence[Series], unit: str, marks: np.ndarray | None = N
     return _svg(WIDTH, HEIGHT, "".join(parts)) + _legend([(line.name, line.kind) for line in series])
 
 
-def path_chart(estimate: np.ndarray, truth: np.ndarray | None, lost: np.ndarray) -> str:
-    """A path seen from above, metres, both axes of one scale.
+def path_chart(estimate: np.ndarray, ground_truth: np.ndarray | None, lost: np.ndarray) -> str:
+    """A path seen from above, meters, both axes of one scale.
 
     Parameters
     ----------
@@ -64,7 +64,11 @@ def path_chart(estimate: np.ndarray, truth: np.ndarray | None, lost: np.ndarray)
     truth : [F,2] in the same axes, NaN where unknown, or None.
     lost : bool [F]; the estimate's line has a gap there.
     """
-    known = estimate if truth is None else np.concatenate([estimate, truth[np.isfinite(truth).all(axis=1)]])
+    known = (
+        estimate
+        if ground_truth is None
+        else np.concatenate([estimate, ground_truth[np.isfinite(ground_truth).all(axis=1)]])
+    )
     if not len(known):
         return ""
     low, high = known.min(axis=0), known.max(axis=0)
@@ -77,8 +81,8 @@ def path_chart(estimate: np.ndarray, truth: np.ndarray | None, lost: np.ndarray)
         return (points - low) * scale * (1, -1) + (0, height)
 
     parts = [_grid(low, high, scale, height)]
-    if truth is not None:
-        parts.append(f'<path class="line truth" d="{_path(place(truth))}"/>')
+    if ground_truth is not None:
+        parts.append(f'<path class="line ground-truth" d="{_path(place(ground_truth))}"/>')
     known_path = np.where(lost[:, None], np.nan, estimate)
     parts.append(f'<path class="line estimate" d="{_path(place(known_path))}"/>')
     parts += [f'<circle class="dot lost" cx="{u:.1f}" cy="{v:.1f}" r="3"/>' for u, v in place(estimate[lost])]
@@ -86,7 +90,7 @@ def path_chart(estimate: np.ndarray, truth: np.ndarray | None, lost: np.ndarray)
     parts.append(f'<circle class="dot estimate" cx="{u:.1f}" cy="{v:.1f}" r="5"><title>start</title></circle>')
     parts.append(f'<circle class="ring estimate" cx="{end_u:.1f}" cy="{end_v:.1f}" r="5"><title>end</title></circle>')
     names = [("estimate (disc: start, ring: end)", "estimate")]
-    names += [("truth", "truth")] if truth is not None else []
+    names += [("ground truth", "ground-truth")] if ground_truth is not None else []
     names += [("lost", "lost")] if lost.any() else []
     return _svg(width, height, "".join(parts)) + _legend(names)
 
@@ -158,7 +162,7 @@ def _frame_axis(count: int, x) -> str:
 
 
 def _grid(low: np.ndarray, high: np.ndarray, scale: float, height: float) -> str:
-    """A grid of round metres with a scale bar."""
+    """A grid of round meters with a scale bar."""
     step = nice_ticks(0, float((high - low).max()), 6)[1]
     width = (high[0] - low[0]) * scale
     verticals = (np.arange(np.ceil(low[0] / step), np.floor(high[0] / step) + 1) * step - low[0]) * scale

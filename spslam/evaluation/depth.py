@@ -12,7 +12,7 @@ def depth_l1(views: Iterable[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]
 
     Parameters
     ----------
-    views : pairs (estimated, reference) of depth images of one shape, metres, 0 or non-finite where there is none.
+    views : pairs (estimated, reference) of depth images of one shape, meters, 0 or non-finite where there is none.
 
     Returns
     -------

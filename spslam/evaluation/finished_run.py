@@ -13,17 +13,17 @@ from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.depth import depth_l1
 from spslam.evaluation.images import psnr_db, ssim
 from spslam.evaluation.mesh import SAMPLES, evaluate_surface, observed_mask
+from spslam.evaluation.renders import novel_depth, novel_poses, render_view
 from spslam.evaluation.run_output import Mesh, RunOutput, match_times
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import Alignment, ate, rpe
-from spslam.evaluation.views import novel_depth, novel_poses, render_view
 from spslam.geometry import umeyama
 from spslam.io import atomic_write
 from spslam.scene import Scene
 
-# Frames that decide what was observed; more of a sequence's neighbours add nothing but time.
+# Frames that decide what was observed; more of a sequence's neighbors add nothing but time.
 _CULLING_FRAMES = 100
-# Views whose depth, and frames whose colour, is compared; and the width of the former.
+# Views whose depth, and frames whose color, is compared; and the width of the former.
 NOVEL_VIEWS, COLOR_VIEWS = 32, 16
 _NOVEL_WIDTH_PX = 160
 
@@ -33,20 +33,20 @@ def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, fl
 
     With ``with_scale`` also ATE after alignment by a similarity, under names of its own.
     """
-    truth = run.known_truth
-    if truth is None:
+    ground_truth = run.known_ground_truth
+    if ground_truth is None:
         return {}
-    figures = {**ate(run.trajectory.poses, truth), **rpe(run.trajectory.poses, truth)}
-    return {**figures, **ate(run.trajectory.poses, truth, with_scale=True)} if with_scale else figures
+    figures = {**ate(run.trajectory.poses, ground_truth), **rpe(run.trajectory.poses, ground_truth)}
+    return {**figures, **ate(run.trajectory.poses, ground_truth, with_scale=True)} if with_scale else figures
 
 
 def surface_figures(
-    run: RunOutput, dataset: RgbdDataset, truth: Surface, samples: int = SAMPLES, novel_views: int = NOVEL_VIEWS
+    run: RunOutput, dataset: RgbdDataset, ground_truth: Surface, samples: int = SAMPLES, novel_views: int = NOVEL_VIEWS
 ) -> dict[str, float]:
     """Accuracy, completeness, F1 and depth from novel views of the run's mesh, as metrics.json names them.
 
     The mesh is carried into the truth's world by the rigid motion that best carries estimated onto true views (camera
-    centres and points a metre away from them: the centres of a straight path alone leave a rotation open); surface that
+    centers and points a meter away from them: the centers of a straight path alone leave a rotation open); surface that
     no frame observed is left out on both sides.
 
     Parameters
@@ -63,23 +63,23 @@ def surface_figures(
         When the run has no mesh, or none of its frames is in the dataset.
     """
     mesh = _require_mesh(run)
-    known = run.known_truth
-    rows, indices = _frames_of(run, dataset, _CULLING_FRAMES, known_only=run.truth is None)
-    poses = run.trajectory.poses if run.truth is None else run.truth
+    known = run.known_ground_truth
+    rows, indices = _frames_of(run, dataset, _CULLING_FRAMES, known_only=run.ground_truth is None)
+    poses = run.trajectory.poses if run.ground_truth is None else run.ground_truth
     rows, depths = _read_depths(dataset, rows, indices)
     vertices = mesh.vertices if known is None else _align_views(run.trajectory.poses, known).apply(mesh.vertices)
 
     def observed(points: np.ndarray) -> np.ndarray:
         return observed_mask(points, depths, poses[rows], dataset.camera)
 
-    figures = evaluate_surface(TriangleSurface(vertices, mesh.faces), truth, observed, samples)
+    figures = evaluate_surface(TriangleSurface(vertices, mesh.faces), ground_truth, observed, samples)
     if not novel_views:
         return figures
     known = np.flatnonzero(np.isfinite(poses[rows]).all(axis=(1, 2)))
     views = novel_poses(poses[rows][known], [depths[row] for row in known], dataset.camera, novel_views)
     height_px = max(round(dataset.camera.height * _NOVEL_WIDTH_PX / dataset.camera.width), 1)
     camera = dataset.camera.resized(_NOVEL_WIDTH_PX, height_px)
-    pairs = novel_depth((vertices, mesh.faces), truth.triangles(), views, camera, observed, novel_views)
+    pairs = novel_depth((vertices, mesh.faces), ground_truth.triangles(), views, camera, observed, novel_views)
     return {**figures, **depth_l1(pairs)}
 
 
@@ -143,7 +143,7 @@ def _require_mesh(run: RunOutput) -> Mesh:
 
 def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
     known = np.isfinite(reference).all(axis=(1, 2))
-    # Columns: the camera's centre, and the points a metre along its axes.
+    # Columns: the camera's center, and the points a meter along its axes.
     corners = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]], dtype=np.float64).T
     points = ((poses[known] @ corners)[:, :3].transpose(0, 2, 1).reshape(-1, 3) for poses in (estimated, reference))
     return Alignment(*umeyama(*points))

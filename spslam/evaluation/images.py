@@ -1,4 +1,4 @@
-"""Rendered colour images against true ones."""
+"""Rendered color images against true ones."""
 
 from __future__ import annotations
 

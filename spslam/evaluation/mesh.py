@@ -39,8 +39,8 @@ def observed_mask(
 
     Parameters
     ----------
-    points : [N,3], world, metres.
-    depths : depth images [H,W] in metres, 0 where unknown; read one at a time, so a generator over a dataset serves.
+    points : [N,3], world, meters.
+    depths : depth images [H,W] in meters, 0 where unknown; read one at a time, so a generator over a dataset serves.
     poses : ``T_world_camera`` [F,4,4] of those images; a frame with a non-finite one is left out.
     camera : of the depth images.
     tolerance_m : how far behind the measured depth (along the optical axis) a point still counts.
@@ -110,7 +110,7 @@ def evaluate_surface(
 
 
 def surface_metrics(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float]:
-    """Accuracy, completeness and F1 from distances in metres.
+    """Accuracy, completeness and F1 from distances in meters.
 
     Parameters
     ----------

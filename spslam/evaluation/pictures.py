@@ -1,4 +1,4 @@
-"""Pictures for the report: the mesh from input views and from above, depth in colours."""
+"""Pictures for the report: the mesh from input views and from above, depth in colors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def png_uri(image: np.ndarray, max_width: int = 480) -> str:
 
 
 def depth_picture(depth: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
-    """Depth [H,W] in colours from near (yellow) to far (violet), uint8 RGB; white where there is none."""
+    """Depth [H,W] in colors from near (yellow) to far (violet), uint8 RGB; white where there is none."""
     share = np.clip((depth - near_m) / max(far_m - near_m, 1e-6), 0, 1)
     picture = cv2.applyColorMap((255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
     picture[depth <= 0] = 255

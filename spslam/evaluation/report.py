@@ -37,8 +37,8 @@ def write_report(output_dir: str | os.PathLike) -> Path:
     Parameters
     ----------
     output_dir : the run's output folder. ``trajectory.txt`` and ``metrics.json`` must be there; ``mesh.ply``,
-        ``log.jsonl``, ``config.yaml`` and ``previews/`` (``camera.json``, ``truth.txt``, ``frame-NNNNNN.png`` and
-        ``depth-NNNNNN.png`` in 16-bit millimetres, numbered by row of the trajectory) add their parts where they are.
+        ``log.jsonl``, ``config.yaml`` and ``previews/`` (``camera.json``, ``ground_truth.txt``, ``frame-NNNNNN.png`` and
+        ``depth-NNNNNN.png`` in 16-bit millimeters, numbered by row of the trajectory) add their parts where they are.
 
     The file needs nothing from outside it: styles and pictures are inside, charts are SVG, there is no script.
 
@@ -123,7 +123,7 @@ def _spread(previews: list[Preview], count: int) -> list[Preview]:
 
 
 def _view(run: RunOutput, mesh: Mesh, camera: Camera, preview: Preview) -> str:
-    """A row: input and rendered colour, input depth where it was kept, rendered depth."""
+    """A row: input and rendered color, input depth where it was kept, rendered depth."""
     pose = run.trajectory.poses[preview.row]
     color, depth = render_mesh(mesh.vertices, mesh.faces, mesh.colors, camera, pose, supersampling=2)
     limits = pictures.depth_limits(depth if preview.depth is None else preview.depth)
@@ -141,22 +141,22 @@ def _view(run: RunOutput, mesh: Mesh, camera: Camera, preview: Preview) -> str:
 def _trajectory(run: RunOutput) -> str:
     if not len(run.trajectory):
         return ""
-    estimate, truth = _aligned_positions(run)
+    estimate, ground_truth = _aligned_positions(run)
     # Drawn in the estimate's axes as seen from above; with truth the two share them after alignment.
     axes = pictures.top_axes(run.trajectory.poses)
     origin = estimate[0]
-    plan_truth = None if truth is None else (truth - origin) @ axes
-    chart = charts.path_chart((estimate - origin) @ axes, plan_truth, run.trajectory.lost)
+    plan_ground_truth = None if ground_truth is None else (ground_truth - origin) @ axes
+    chart = charts.path_chart((estimate - origin) @ axes, plan_ground_truth, run.trajectory.lost)
     length = np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum()
     return _section("Trajectory", chart, f"seen from above; {length:.2f} m long")
 
 
 def _errors(run: RunOutput) -> str:
-    estimate, truth = _aligned_positions(run) if len(run.trajectory) else (np.zeros((0, 3)), None)
-    if truth is None:
+    estimate, ground_truth = _aligned_positions(run) if len(run.trajectory) else (np.zeros((0, 3)), None)
+    if ground_truth is None:
         return ""
     estimate = np.where(run.trajectory.lost[:, None], np.nan, estimate)
-    difference = 100 * (estimate - truth) @ np.column_stack([pictures.top_axes(run.trajectory.poses), _up(run)])
+    difference = 100 * (estimate - ground_truth) @ np.column_stack([pictures.top_axes(run.trajectory.poses), _up(run)])
     series = [charts.Series(name, name[0], column) for name, column in zip(_AXES, difference.T, strict=True)]
     series.append(charts.Series("distance", "total", np.linalg.norm(difference, axis=1)))
     chart = charts.line_chart(series, "cm", run.trajectory.lost)
@@ -174,10 +174,10 @@ def _up(run: RunOutput) -> np.ndarray:
 def _aligned_positions(run: RunOutput) -> tuple[np.ndarray, np.ndarray | None]:
     """Estimated positions [F,3], and the true ones carried into the estimate's world; None if none is known."""
     estimate = run.trajectory.poses[:, :3, 3]
-    if run.truth is None or run.known_truth is None:
+    if run.ground_truth is None or run.known_ground_truth is None:
         return estimate, None
-    alignment = align(run.trajectory.poses, run.known_truth)
-    return estimate, (run.truth[:, :3, 3] - alignment.translation) @ alignment.rotation
+    alignment = align(run.trajectory.poses, run.known_ground_truth)
+    return estimate, (run.ground_truth[:, :3, 3] - alignment.translation) @ alignment.rotation
 
 
 def _time(run: RunOutput) -> str:
@@ -213,12 +213,12 @@ def _time(run: RunOutput) -> str:
 
 
 def _tracking(run: RunOutput) -> str:
-    residual, inliers = _column(run, "residual_cm"), 100 * _column(run, "inliers")
+    residual, inlier_share = _column(run, "residual_cm"), 100 * _column(run, "inlier_share")
     if not np.isfinite(residual).any():
         return ""
     lost = run.trajectory.lost if len(run.trajectory) == len(residual) else None
     body = charts.line_chart([charts.Series("distance from the map", "tracking", residual)], "cm", lost)
-    body += charts.line_chart([charts.Series("pixels on mapped surface", "encoding", inliers)], "%", lost)
+    body += charts.line_chart([charts.Series("pixels on mapped surface", "encoding", inlier_share)], "%", lost)
     return _section("Tracking", body, "how far each frame's depth is from the map, and how much of it is mapped")
 
 

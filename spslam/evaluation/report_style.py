@@ -2,10 +2,10 @@
 
 STYLE = """
 :root { --ink: #1b1f24; --faint: #667080; --line: #dfe3e8; --page: #ffffff; --card: #f5f7f9;
-  --estimate: #1f6feb; --truth: #9aa3ad; --lost: #d1242f; --tracking: #1f6feb; --encoding: #1a9988; --mapping: #e0822d;
+  --estimate: #1f6feb; --ground-truth: #9aa3ad; --lost: #d1242f; --tracking: #1f6feb; --encoding: #1a9988; --mapping: #e0822d;
   --rest: #aab2bd; --mesh: #8957c9; --r: #d1495b; --f: #2a8c6a; --u: #7a5bc4; --total: #1b1f24; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e4e8ed; --faint: #97a1ad; --line: #333b45; --page: #14181d;
-  --card: #1d232a; --truth: #7d8793; --total: #e4e8ed; } }
+  --card: #1d232a; --ground-truth: #7d8793; --total: #e4e8ed; } }
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
 main { max-width: 1080px; margin: 0 auto; padding: 28px 24px 60px; }
@@ -27,7 +27,7 @@ svg { display: block; width: 100%; height: auto; margin: 10px 0 0; }
 .on-bar { fill: #fff; font-size: 13px; font-weight: 600; text-anchor: middle; }
 path.lost { stroke: var(--lost); stroke-width: 2; opacity: .25; }
 .ring { fill: var(--page); stroke-width: 2; }
-.line.truth { stroke-width: 3; opacity: .75; } .line.total { stroke-width: 2; }
+.line.ground-truth { stroke-width: 3; opacity: .75; } .line.total { stroke-width: 2; }
 .legend { display: flex; flex-wrap: wrap; gap: 4px 18px; list-style: none; margin: 6px 0 0; padding: 0;
   font-size: 13px; }
 .key { display: inline-block; width: 12px; height: 12px; border-radius: 3px; margin-right: 6px; vertical-align: -1px; }
@@ -40,7 +40,10 @@ pre { background: var(--card); border-radius: 8px; padding: 14px; overflow-x: au
     f".line.{kind}, .ring.{kind} {{ stroke: var(--{color}); }} "
     f".dot.{kind}, .bar.{kind} {{ fill: var(--{color}); }} .key.{kind} {{ background: var(--{color}); }}\n"
     for kind, color in (
-        *((name, name) for name in ("estimate", "truth", "lost", "tracking", "encoding", "mapping", "rest", "mesh")),
+        *(
+            (name, name)
+            for name in ("estimate", "ground-truth", "lost", "tracking", "encoding", "mapping", "rest", "mesh")
+        ),
         ("r", "r"),
         ("f", "f"),
         ("u", "u"),

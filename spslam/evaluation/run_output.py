@@ -21,7 +21,7 @@ _SAME_TIME_S = 2e-6
 
 @dataclass(frozen=True)
 class Preview:
-    """An input frame kept as pictures: its row in the trajectory, uint8 [H,W,3] RGB, float32 [H,W] metres or None."""
+    """An input frame kept as pictures: its row in the trajectory, uint8 [H,W,3] RGB, float32 [H,W] meters or None."""
 
     row: int
     color: np.ndarray
@@ -30,7 +30,7 @@ class Preview:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices [V,3] in metres, faces [L,3], colours uint8 [V,3]."""
+    """Vertices [V,3] in meters, faces [L,3], colors uint8 [V,3]."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -54,7 +54,7 @@ class RunOutput:
 
     folder: Path
     trajectory: Trajectory
-    truth: np.ndarray | None
+    ground_truth: np.ndarray | None
     metrics: dict[str, Any]
     log: list[dict[str, Any]]
     config: str
@@ -76,7 +76,7 @@ class RunOutput:
         return cls(
             folder,
             trajectory,
-            _read_truth(folder / "previews" / "truth.txt", trajectory.timestamps),
+            _read_ground_truth(folder / "previews" / "ground_truth.txt", trajectory.timestamps),
             _parse(folder / "metrics.json", _read_text(folder / "metrics.json")),
             [_parse(folder / "log.jsonl", line) for line in _read_text(folder / "log.jsonl").splitlines()],
             _read_text(folder / "config.yaml"),
@@ -84,9 +84,9 @@ class RunOutput:
         )
 
     @property
-    def known_truth(self) -> np.ndarray | None:
+    def known_ground_truth(self) -> np.ndarray | None:
         """The true poses [F,4,4] of the frames whose pose the run knew, NaN for the others; None if none is known."""
-        return None if self.truth is None else self.trajectory.truth_of_known(self.truth)
+        return None if self.ground_truth is None else self.trajectory.ground_truth_of_known(self.ground_truth)
 
     def previews(self) -> list[Preview]:
         """The kept input frames, by row; ones that can't be read, or whose pose isn't known, are left out."""
@@ -150,13 +150,13 @@ def _read_camera(path: Path) -> Camera | None:
         raise OutputError(f"{path}: must hold a camera: {error}") from error
 
 
-def _read_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:
+def _read_ground_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:
     if not path.is_file():
         return None
-    truth = Trajectory.load_tum(path)
+    ground_truth = Trajectory.load_tum(path)
     poses = np.full((len(timestamps), 4, 4), np.nan)
-    rows = match_times(truth.timestamps, timestamps)
-    poses[rows >= 0] = truth.poses[rows[rows >= 0]]
+    rows = match_times(ground_truth.timestamps, timestamps)
+    poses[rows >= 0] = ground_truth.poses[rows[rows >= 0]]
     return poses if np.isfinite(poses).any() else None
 
 
@@ -167,5 +167,5 @@ def _read_preview(path: Path) -> Preview | None:
         return None
     depth_path = path.with_name(f"depth-{number}.png")
     depth = cv2.imread(str(depth_path), cv2.IMREAD_UNCHANGED) if depth_path.is_file() else None
-    metres = None if depth is None else depth.astype(np.float32) / 1000
-    return Preview(int(number), cv2.cvtColor(color, cv2.COLOR_BGR2RGB), metres)
+    meters = None if depth is None else depth.astype(np.float32) / 1000
+    return Preview(int(number), cv2.cvtColor(color, cv2.COLOR_BGR2RGB), meters)

@@ -22,7 +22,7 @@ _SITES_COMPARED = (8, 32, 128)
 
 
 class Surface(Protocol):
-    """What the metrics need of a surface: evenly spread points and distances, in metres."""
+    """What the metrics need of a surface: evenly spread points and distances, in meters."""
 
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
         """Points [count,3] spread evenly by area; the same for the same count and seed."""
@@ -39,7 +39,7 @@ class TriangleSurface:
 
     Parameters
     ----------
-    vertices : [V,3], metres, finite.
+    vertices : [V,3], meters, finite.
     faces : [F,3], indices of vertices.
     """
 
@@ -101,11 +101,11 @@ class TriangleSurface:
         return (1 - root) * a + root * (1 - share) * b + root * share * c
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] in metres of points [N,3] to the nearest triangle; infinite for a mesh without area.
+        """Distance [N] in meters of points [N,3] to the nearest triangle; infinite for a mesh without area.
 
         Faces are found by the sites closest to a point, as many as it takes to be sure that no other face is closer,
         128 at most. So the distance is exact up to about 10 cm from the surface, and farther off at most a few
-        millimetres too long. Deterministic.
+        millimeters too long. Deterministic.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         distance = np.full(len(points), np.inf)

@@ -16,7 +16,7 @@ class Alignment:
     Attributes
     ----------
     rotation : float64 [3,3].
-    translation : float64 [3], metres.
+    translation : float64 [3], meters.
     scale : 1 for a rigid alignment.
     """
 
@@ -30,7 +30,7 @@ class Alignment:
 
 
 def align(estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False) -> Alignment:
-    """The alignment that minimises the squared distances between camera positions (Umeyama 1991).
+    """The alignment that minimizes the squared distances between camera positions (Umeyama 1991).
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def align(estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False
 
 
 def absolute_errors(estimated: np.ndarray, reference: np.ndarray, alignment: Alignment) -> np.ndarray:
-    """Distance [F] in metres of each aligned camera position from the true one, NaN where that is unknown."""
+    """Distance [F] in meters of each aligned camera position from the true one, NaN where that is unknown."""
     estimated, reference, known = _checked("absolute_errors", estimated, reference)
     errors = np.linalg.norm(alignment.apply(estimated[:, :3, 3]) - reference[:, :3, 3], axis=1)
     return np.where(known, errors, np.nan)

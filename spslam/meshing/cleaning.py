@@ -15,7 +15,7 @@ from spslam.camera import Camera
 from spslam.meshing.mesh import face_components, face_normals
 from spslam.scene import SparseVolume
 
-# More views than this add nothing: neighbouring ones see the same.
+# More views than this add nothing: neighboring ones see the same.
 MAX_VIEWS = 32
 # Faces this many steps away from a seen one are kept too, so that a noisy normal makes no hole.
 _RINGS = 1
@@ -44,7 +44,7 @@ def face_support(volume: SparseVolume, vertices: torch.Tensor, faces: torch.Tens
 
 
 def _largest_around(volume: SparseVolume) -> torch.Tensor:
-    """The largest weight float32 [V] among a vertex and its 26 neighbours, one axis after the other."""
+    """The largest weight float32 [V] among a vertex and its 26 neighbors, one axis after the other."""
     largest = volume.weights
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.int32, device=volume.device)

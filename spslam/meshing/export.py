@@ -16,11 +16,11 @@ FORMATS = (".ply", ".glb", ".obj")
 
 
 def save_mesh(mesh: TriangleMesh, path: str | os.PathLike) -> None:
-    """Writes a mesh with vertex colours and normals, atomically; the same mesh gives the same bytes.
+    """Writes a mesh with vertex colors and normals, atomically; the same mesh gives the same bytes.
 
     Args:
         mesh: what to write. A mesh without faces can be written as PLY only.
-        path: `.ply` (binary), `.glb` (glTF; axes are kept as they are) or `.obj` (colours behind the coordinates, as
+        path: `.ply` (binary), `.glb` (glTF; axes are kept as they are) or `.obj` (colors behind the coordinates, as
             most programs read them). The folder must exist.
 
     Raises:

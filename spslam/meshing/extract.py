@@ -93,7 +93,7 @@ def extract_mesh(
     min_support: float = MIN_SUPPORT,
     min_part_m2: float = MIN_PART_M2,
 ) -> TriangleMesh:
-    """The mesh of a map: its SDF's zero level within the complete cells, coloured, without what was never measured.
+    """The mesh of a map: its SDF's zero level within the complete cells, colored, without what was never measured.
 
     Args:
         scene: the map. Not changed.

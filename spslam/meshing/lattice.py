@@ -109,7 +109,7 @@ def _inward(coords: torch.Tensor) -> float:
     """How far, in blocks, to keep samples off a block's border.
 
     The block's own content must answer for them, since there may be no block on the other side; so they must not be
-    rounded out of it on the way to float32 metres and back: four roundings, half of this margin.
+    rounded out of it on the way to float32 meters and back: four roundings, half of this margin.
     """
     if len(coords) == 0:
         return 0.0
@@ -118,7 +118,7 @@ def _inward(coords: torch.Tensor) -> float:
 
 
 def _upper_neighbors(coords: torch.Tensor) -> dict[tuple[int, int, int], torch.Tensor]:
-    """For each step to a neighbour on the upper side, bool [M]: whether it is among the blocks."""
+    """For each step to a neighbor on the upper side, bool [M]: whether it is among the blocks."""
     capacity = max(2, 1 << (2 * len(coords) - 1).bit_length())
     keys, values = ops.new_voxel_hash(capacity, coords.device)
     ops.voxel_hash_build_(keys, values, coords)
@@ -131,7 +131,7 @@ def _upper_neighbors(coords: torch.Tensor) -> dict[tuple[int, int, int], torch.T
 
 
 def _held_above(has_upper: dict[tuple[int, int, int], torch.Tensor], upper: tuple[bool, ...]) -> torch.Tensor:
-    """Bool [M]: whether a neighbour holds the samples on the upper side along the axes where `upper` is true."""
+    """Bool [M]: whether a neighbor holds the samples on the upper side along the axes where `upper` is true."""
     held = torch.zeros_like(next(iter(has_upper.values())))
     for step, exists in has_upper.items():
         if all(side or not moved for side, moved in zip(upper, step, strict=True)):

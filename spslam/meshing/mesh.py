@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles with a colour and a normal at each vertex; K vertices, L faces, both may be 0.
+    """Triangles with a color and a normal at each vertex; K vertices, L faces, both may be 0.
 
     Attributes:
         vertices: float32 [K, 3], world, m.

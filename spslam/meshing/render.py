@@ -1,4 +1,4 @@
-"""Pictures of a mesh: a z-buffer rasteriser in NumPy, for reports and for masks of what a camera sees."""
+"""Pictures of a mesh: a z-buffer rasterizer in NumPy, for reports and for masks of what a camera sees."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Raster:
 
     Attributes
     ----------
-    depth : float32 [H,W], metres along the optical axis; 0 where nothing is.
+    depth : float32 [H,W], meters along the optical axis; 0 where nothing is.
     face_ids : int32 [H,W], -1 where nothing is.
     """
 
@@ -46,9 +46,9 @@ def render_mesh(
 
     Parameters
     ----------
-    vertices : [V,3], metres, world axes.
+    vertices : [V,3], meters, world axes.
     faces : integers [L,3].
-    colors : uint8 [V,3] RGB of the vertices; None is plain grey.
+    colors : uint8 [V,3] RGB of the vertices; None is plain gray.
     camera : whose view it is.
     T_world_camera : [4,4].
     cull_back : leave out faces seen from behind (counter-clockwise is the front), to look into a room from outside.
@@ -56,7 +56,7 @@ def render_mesh(
 
     Returns
     -------
-    uint8 [H,W,3] RGB on white, and float32 [H,W] depth in metres, 0 where nothing is. An empty mesh gives an empty
+    uint8 [H,W,3] RGB on white, and float32 [H,W] depth in meters, 0 where nothing is. An empty mesh gives an empty
     picture. Deterministic; a million small faces at 640x480 take about a second.
     """
     fine = camera.resized(camera.width * supersampling, camera.height * supersampling)
@@ -74,7 +74,7 @@ def render_mesh(
 def rasterize(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, T_world_camera: np.ndarray, cull_back: bool = False
 ) -> Raster:
-    """The nearest face behind each pixel centre; faces are cut at 2 cm before the camera.
+    """The nearest face behind each pixel center; faces are cut at 2 cm before the camera.
 
     Arguments as for :func:`render_mesh`. Of faces at the same depth the one with the highest number wins.
     """
@@ -224,7 +224,7 @@ def _cut(behind: np.ndarray, before: np.ndarray) -> np.ndarray:
 
 
 def _pixel_range(coordinates: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and last pixel centre between a triangle's corners, inside the image; first > last if there is none."""
+    """First and last pixel center between a triangle's corners, inside the image; first > last if there is none."""
     first = np.clip(np.ceil(coordinates.min(axis=1)), 0, size)
     last = np.clip(np.floor(coordinates.max(axis=1)), -1, size - 1)
     return first.astype(np.int64), last.astype(np.int64)

@@ -6,7 +6,7 @@ from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
 from spslam.ops.gauss_newton import (
     LUMA_WEIGHTS,
-    DepthViews,
+    DepthKeyframes,
     ReferenceImage,
     gauss_newton_poses,
     predict_pose,
@@ -44,7 +44,7 @@ __all__ = [
     "Activation",
     "AdamMoments",
     "AdamTable",
-    "DepthViews",
+    "DepthKeyframes",
     "EncodedFrame",
     "FrameFusion",
     "Intrinsics",

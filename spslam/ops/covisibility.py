@@ -1,6 +1,6 @@
 """Which frames see what another one sees. Not differentiable.
 
-A frame sees a world point if the point projects into a cell of its depth lattice and lies within 0.1 m of the depth
+A frame sees a world point if the point projects into a cell of its depth depth_thumbnail and lies within 0.1 m of the depth
 there. Computed in float64, so that CPU and CUDA agree.
 """
 
@@ -13,17 +13,21 @@ from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
 def frame_overlap(
-    points: torch.Tensor, poses: torch.Tensor, lattices: torch.Tensor, intrinsics: Intrinsics, lattice_step: int
+    points: torch.Tensor,
+    poses: torch.Tensor,
+    depth_thumbnails: torch.Tensor,
+    intrinsics: Intrinsics,
+    thumbnail_step: int,
 ) -> torch.Tensor:
     """Share of world points that each frame sees.
 
     Args:
         points: float32 [N, 3], m.
         poses: float32 [F, 7] T_world_camera, quaternion (w, x, y, z) and translation (m).
-        lattices: float16 [F, h, w] depth (m) of the frames at every `lattice_step`-th pixel, the first in the middle of
+        depth_thumbnails: float16 [F, h, w] depth (m) of the frames at every `thumbnail_step`-th pixel, the first in the middle of
             the first cell; 0 where unknown.
         intrinsics: of the whole image.
-        lattice_step: side of a lattice cell, px.
+        thumbnail_step: side of a depth_thumbnail cell, px.
 
     Returns:
         float32 [F] in [0, 1]; 0 where N = 0 and for a pose that is not finite. Points and depths that are not are not
@@ -34,25 +38,25 @@ def frame_overlap(
 
     Example:
         >>> poses = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [0.0, 0, 1, 0, 0, 0, 0]])  # forward, and turned back
-        >>> lattices = torch.full((2, 6, 8), 2.0, dtype=torch.float16)
-        >>> frame_overlap(torch.tensor([[0.1, 0.2, 2.0]]), poses, lattices, Intrinsics(100, 100, 63.5, 47.5), 16)
+        >>> depth_thumbnails = torch.full((2, 6, 8), 2.0, dtype=torch.float16)
+        >>> frame_overlap(torch.tensor([[0.1, 0.2, 2.0]]), poses, depth_thumbnails, Intrinsics(100, 100, 63.5, 47.5), 16)
         tensor([1., 0.])
     """
     name = "frame_overlap"
     check_tensor(name, "points", points, ("N", 3), torch.float32)
-    _check_views(name, poses, lattices, intrinsics, lattice_step, like=points)
-    return torch.ops.spslam.frame_overlap(points, poses, lattices, list(intrinsics), lattice_step)
+    _check_keyframes(name, poses, depth_thumbnails, intrinsics, thumbnail_step, like=points)
+    return torch.ops.spslam.frame_overlap(points, poses, depth_thumbnails, list(intrinsics), thumbnail_step)
 
 
 def select_covisible_frames(
     records: torch.Tensor,
     current: int,
     poses: torch.Tensor,
-    lattices: torch.Tensor,
+    depth_thumbnails: torch.Tensor,
     candidates: torch.Tensor,
     intrinsics: Intrinsics,
     *,
-    lattice_step: int,
+    thumbnail_step: int,
     num_points: int,
     num_covisible: int,
     count: int,
@@ -69,7 +73,7 @@ def select_covisible_frames(
     Args:
         records: int32 [P, 3] packed pixels of the current frame, P >= 1.
         current: its row.
-        poses, lattices, intrinsics, lattice_step: of all F frames, as in `frame_overlap`.
+        poses, depth_thumbnails, intrinsics, thumbnail_step: of all F frames, as in `frame_overlap`.
         candidates: int64 [M] different rows in [0, F), in order of preference, M at most F.
         num_points: how many are drawn, with replacement.
         num_covisible: most frames taken for being co-visible.
@@ -86,18 +90,18 @@ def select_covisible_frames(
 
     Example:
         >>> poses = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [0.0, 0, 1, 0, 0, 0, 0]]).repeat(3, 1)  # every other one
-        >>> lattices = torch.full((6, 6, 8), 2.0, dtype=torch.float16)  # looks back
+        >>> depth_thumbnails = torch.full((6, 6, 8), 2.0, dtype=torch.float16)  # looks back
         >>> depth = torch.full((1,), 2.0).view(torch.int32)
         >>> record = torch.stack([torch.tensor([60 | 40 << 16], dtype=torch.int32), depth, 0 * depth], 1)
         >>> select_covisible_frames(
-        ...     record, 0, poses, lattices, torch.arange(1, 6), Intrinsics(100, 100, 63.5, 47.5), lattice_step=16,
+        ...     record, 0, poses, depth_thumbnails, torch.arange(1, 6), Intrinsics(100, 100, 63.5, 47.5), thumbnail_step=16,
         ...     num_points=10, num_covisible=2, count=3, threshold=0.1, seed=0, frame=0)
         tensor([1, 2, 4])
     """
     name = "select_covisible_frames"
     check_tensor(name, "records", records, ("P", 3), torch.int32)
     check(len(records) > 0, name, "records", "have at least one row", 0)
-    _check_views(name, poses, lattices, intrinsics, lattice_step, like=records)
+    _check_keyframes(name, poses, depth_thumbnails, intrinsics, thumbnail_step, like=records)
     check(0 <= current < len(poses), name, "current", f"be a row of the {len(poses)} poses", current)
     check_tensor(name, "candidates", candidates, ("M",), torch.int64, like=records)
     check(len(candidates) <= len(poses), name, "candidates", f"be at most {len(poses)} rows", len(candidates))
@@ -108,10 +112,10 @@ def select_covisible_frames(
         records,
         current,
         poses,
-        lattices,
+        depth_thumbnails,
         candidates,
         list(intrinsics),
-        lattice_step,
+        thumbnail_step,
         num_points,
         num_covisible,
         count,
@@ -122,20 +126,25 @@ def select_covisible_frames(
     )
 
 
-def _check_views(
-    name: str, poses: torch.Tensor, lattices: torch.Tensor, intrinsics: Intrinsics, step: int, like: torch.Tensor
+def _check_keyframes(
+    name: str,
+    poses: torch.Tensor,
+    depth_thumbnails: torch.Tensor,
+    intrinsics: Intrinsics,
+    step: int,
+    like: torch.Tensor,
 ) -> None:
     check_tensor(name, "poses", poses, ("F", 7), torch.float32, like=like)
-    check_tensor(name, "lattices", lattices, (len(poses), "h", "w"), torch.float16, like=like)
+    check_tensor(name, "depth_thumbnails", depth_thumbnails, (len(poses), "h", "w"), torch.float16, like=like)
     check_intrinsics(name, intrinsics)
-    check(step >= 1, name, "lattice_step", "be at least 1", step)
+    check(step >= 1, name, "thumbnail_step", "be at least 1", step)
 
 
 @torch.library.register_fake("spslam::frame_overlap")
-def _(points, poses, lattices, intrinsics, lattice_step):
+def _(points, poses, depth_thumbnails, intrinsics, thumbnail_step):
     return points.new_empty(poses.shape[0])
 
 
 @torch.library.register_fake("spslam::select_covisible_frames")
-def _(records, current, poses, lattices, candidates, intrinsics, step, num_points, num_covisible, count, *_):
+def _(records, current, poses, depth_thumbnails, candidates, intrinsics, step, num_points, num_covisible, count, *_):
     return candidates.new_empty(min(count, candidates.shape[0]))

@@ -1,4 +1,4 @@
-"""Small multi-layer perceptrons: the geometry and colour decoders (equations 2 and 4)."""
+"""Small multi-layer perceptrons: the geometry and color decoders (equations 2 and 4)."""
 
 from enum import IntEnum
 

@@ -2,7 +2,7 @@
 
 A pixel of depth z is the world point x = R (z d) + t. Its residual is r = truncation * s(x), its weight
 1 / (1 + (r / k)^2)^2 (Geman-McClure's), and the increment (dt, domega) moves the camera by dt and turns it by
-exp(domega) about its centre, so that dr = truncation * grad s . (dt + domega x (x - t)).
+exp(domega) about its center, so that dr = truncation * grad s . (dt + domega x (x - t)).
 
 Where the noise of depth grows with z^2, as for structured light and stereo, a residual's inverse variance falls as
 1 / (1 + (z / z0)^4).
@@ -10,11 +10,11 @@ Where the noise of depth grows with z^2, as for structured light and stereo, a r
 Earlier frames' depth images add, view by view, the signed distance of x from the surface seen there,
 (z' q(u', v') - 1) / |grad|, q being the inverse depth between four pixels, which on a plane is linear in the image.
 Beside the mean of the views' equations, those of the map count c = (v_views / v_map)^2 in [1e-3, 4], v being the
-weighted mean squared residuals where both are known: squared, as the map's error is alike for neighbouring pixels and,
+weighted mean squared residuals where both are known: squared, as the map's error is alike for neighboring pixels and,
 unlike a sensor's noise, does not average out.
 
-A reference image adds, pixel by pixel, what direct methods minimise (Kerl et al. 2013): the intensity I of an earlier
-frame where x falls in it, less the pixel's own, times a weight in metres.
+A reference image adds, pixel by pixel, what direct methods minimize (Kerl et al. 2013): the intensity I of an earlier
+frame where x falls in it, less the pixel's own, times a weight in meters.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 # What red, green and blue count for in a reference's intensity (Rec. 601), in thousandths; the kernel's own.
 LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
 
-_MAX_VIEWS = 8
+_MAX_DEPTH_KEYFRAMES = 8
 
 
 def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
@@ -56,7 +56,7 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
 
 
 class ReferenceImage(NamedTuple):
-    """A small grey image of an earlier frame, to compare colours with.
+    """A small gray image of an earlier frame, to compare colors with.
 
     Attributes:
         cells: float32 [H, W, 2] intensity in [0, 1] (`LUMA_WEIGHTS`) and depth (m, 0 where unknown). A point is
@@ -74,7 +74,7 @@ class ReferenceImage(NamedTuple):
     kernel: float
 
 
-class DepthViews(NamedTuple):
+class DepthKeyframes(NamedTuple):
     """Depth images of earlier frames, to hold a frame's surface against.
 
     Attributes:
@@ -112,10 +112,10 @@ def track_gauss_newton(
     seed: int,
     stream: int,
     frame: int,
-    kernel_judge: float | None = None,
-    noise_depth: float = 0.0,
+    score_kernel: float | None = None,
+    noise_crossover_depth: float = 0.0,
     reference: ReferenceImage | None = None,
-    views: DepthViews | None = None,
+    views: DepthKeyframes | None = None,
     tf32: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Tracks one frame against a frozen scene; all iterations in one call, on CUDA in one kernel that never stops for
@@ -138,11 +138,11 @@ def track_gauss_newton(
         kernel_end: last width, m.
         damping: relative Levenberg damping.
         seed, stream, frame: keys of the draws, see `philox_uniform`.
-        kernel_judge: width of the kernel that the statistics are told by, m, so that poses are judged alike whatever
+        score_kernel: width of the kernel that the statistics are told by, m, so that poses are judged alike whatever
             kernel finds them; None takes the iteration's own.
-        noise_depth: depth z0 at which noise that grows with z^2 is as large as that of the map, m; pixels weigh
+        noise_crossover_depth: depth z0 at which noise that grows with z^2 is as large as that of the map, m; pixels weigh
             1 / (1 + (z / z0)^4) of what they would. 0 weighs near and far alike.
-        reference: an earlier frame to compare colours with; None uses the surface alone. It takes no part in what the
+        reference: an earlier frame to compare colors with; None uses the surface alone. It takes no part in what the
             statistics say.
         views: earlier frames' depth images; None uses the map alone. They take no part in what statistics and H say.
         tf32: on CUDA devices from sm_80 on, let tensor cores multiply in the decoder, with factors rounded to 10 bits
@@ -151,7 +151,7 @@ def track_gauss_newton(
     Returns:
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of pixels on
         mapped surface, the norms of the step in translation (m) and rotation (rad), and the mean weight over all pixels
-        (0 for those off the map), each before the iteration's step and with the weights of `kernel_judge`; float32
+        (0 for those off the map), each before the iteration's step and with the weights of `score_kernel`; float32
         [6, 6] H of the last iteration, scaled as if pixels weighed on average what those weights are, whatever they
         weigh by their depth and the iteration's kernel. The same to the bit every time on one device, and for any
         number of CPU threads.
@@ -184,9 +184,9 @@ def track_gauss_newton(
         "be positive",
         (kernel_start, kernel_end),
     )
-    check(kernel_judge is None or kernel_judge > 0, name, "kernel_judge", "be positive", kernel_judge)
+    check(score_kernel is None or score_kernel > 0, name, "score_kernel", "be positive", score_kernel)
     check(damping >= 0, name, "damping", "be at least 0", damping)
-    check(noise_depth >= 0, name, "noise_depth", "be at least 0", noise_depth)
+    check(noise_crossover_depth >= 0, name, "noise_crossover_depth", "be at least 0", noise_crossover_depth)
     image: tuple[torch.Tensor | None, torch.Tensor | None, list[float], float, float] = (None, None, [], 0.0, 1.0)
     if reference is not None:
         _check_reference(name, reference, like=scene.embeddings)
@@ -194,7 +194,7 @@ def track_gauss_newton(
     earlier: tuple[torch.Tensor | None, torch.Tensor | None, list[int], list[float], float, float, int]
     earlier = (None, None, [], [], 1.0, 1.0, 0)
     if views is not None:
-        _check_views(name, views, like=scene.embeddings)
+        _check_keyframes(name, views, like=scene.embeddings)
         rows = [row for pair in views.rows for row in pair]
         earlier = (
             views.images,
@@ -215,12 +215,12 @@ def track_gauss_newton(
         truncation,
         kernel_start,
         kernel_end,
-        kernel_judge or 0.0,
+        score_kernel or 0.0,
         damping,
         seed,
         stream,
         frame,
-        noise_depth,
+        noise_crossover_depth,
         *image,
         *earlier,
         tf32,
@@ -235,14 +235,20 @@ def _check_reference(name: str, reference: ReferenceImage, like: torch.Tensor) -
     check(reference.kernel > 0, name, "reference.kernel", "be positive", reference.kernel)
 
 
-def _check_views(name: str, views: DepthViews, like: torch.Tensor) -> None:
+def _check_keyframes(name: str, views: DepthKeyframes, like: torch.Tensor) -> None:
     check_tensor(name, "views.images", views.images, ("R", "H", "W"), torch.uint16, like=like)
     check_tensor(name, "views.poses", views.poses, ("F", 7), torch.float32, like=like)
     check_intrinsics(name, views.intrinsics, "views.intrinsics")
     check(views.unit > 0, name, "views.unit", "be positive", views.unit)
     check(views.kernel_end > 0, name, "views.kernel_end", "be positive", views.kernel_end)
     check(views.first_iteration >= 0, name, "views.first_iteration", "be at least 0", views.first_iteration)
-    check(len(views.rows) <= _MAX_VIEWS, name, "views.rows", f"be at most {_MAX_VIEWS}", len(views.rows))
+    check(
+        len(views.rows) <= _MAX_DEPTH_KEYFRAMES,
+        name,
+        "views.rows",
+        f"be at most {_MAX_DEPTH_KEYFRAMES}",
+        len(views.rows),
+    )
     for image, pose in views.rows:
         inside = 0 <= image < len(views.images) and 0 <= pose < len(views.poses)
         check(inside, name, "views.rows", "name images and poses that are there", (image, pose))

@@ -34,7 +34,7 @@ class VoxelHash:
     """A set of V voxel vertices, each with an id that it keeps; tables of features have a row for each id.
 
     It holds what the functions `voxel_hash_*` work on, and makes room as the set grows: buffers double, so that growth
-    is amortised, and a view's memory stays where it is until `capacity` changes. `spslam.scene.SparseVolume` is this
+    is amortized, and a view's memory stays where it is until `capacity` changes. `spslam.scene.SparseVolume` is this
     with embeddings and fusion weights beside it.
 
     Args:

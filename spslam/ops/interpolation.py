@@ -54,7 +54,7 @@ def bilinear_interpolate(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor
 
     Args:
         texels: [H, W, C] float32 or float64; H and W at least 1 unless N is 0.
-        uv: [N, 2] of the same dtype, positions in texels, u along W and v along H: (0, 0) is the centre of the first
+        uv: [N, 2] of the same dtype, positions in texels, u along W and v along H: (0, 0) is the center of the first
             texel, (W - 1, H - 1) that of the last. Positions outside are clamped to the border, with zero gradient, and
             so is infinity; NaN gives NaN for its point.
 
@@ -84,8 +84,8 @@ def tri_plane_interpolate(
 
     Args:
         texels: [P, C] float32 or float64, the texels of all planes as rows of one table.
-        points: [N, 3] of the same dtype, metres. NaN gives NaN for its point.
-        cell_size: distance between texels, metres; texel (iu, iv) lies at (iu, iv) * cell_size.
+        points: [N, 3] of the same dtype, meters. NaN gives NaN for its point.
+        cell_size: distance between texels, meters; texel (iu, iv) lies at (iu, iv) * cell_size.
         layout: 15 integers, (offset, origin_u, origin_v, size_u, size_v) for each of the planes with axes (u, v) =
             (x, y), (x, z), (y, z). Texel (iu, iv) is row offset + (iu - origin_u) * size_v + (iv - origin_v).
             Points outside a plane are clamped to its border, with zero gradient by that coordinate. While a plane

@@ -1,4 +1,4 @@
-"""A whole mapping call: all iterations of the joint optimisation of scene and poses in one op (section III.D)."""
+"""A whole mapping call: all iterations of the joint optimization of scene and poses in one op (section III.D)."""
 
 from dataclasses import dataclass
 
@@ -64,7 +64,7 @@ class AdamTable(AdamMoments):
 
 @dataclass(frozen=True)
 class MapMoments:
-    """Which parameters a mapping call optimises. What is None is frozen.
+    """Which parameters a mapping call optimizes. What is None is frozen.
 
     Attributes:
         embeddings, texels: of the scene's tables.
@@ -132,12 +132,12 @@ def optimize_map_(
     pixel_stream: int = Stream.MAPPING_PIXELS,
     graph: LaunchGraph | None = None,
 ) -> torch.Tensor:
-    """Optimises scene and poses over chosen frames, in place; all iterations in one call.
+    """Optimizes scene and poses over chosen frames, in place; all iterations in one call.
 
     Iteration i draws `num_pixels` pixels, shared evenly by the frames, as `sample_indices` does with `pixel_stream` and
     iteration `options.iteration + i`; makes a `render_step` with them; and takes one Adam step (as `sparse_adam_`) on
     the rows touched, on the decoders, and on quaternion and translation of the frames' poses, whose quaternions are
-    then normalised. On CUDA nothing waits for the device.
+    then normalized. On CUDA nothing waits for the device.
 
     Args:
         scene: the map. Its tables and decoders are changed where `moments` are given.
@@ -147,7 +147,7 @@ def optimize_map_(
             they are not looked at before they are used: each must be in [0, F).
         intrinsics: of the cameras.
         options: of the first iteration; `pose_gradient` is not read.
-        moments: what is optimised.
+        moments: what is optimized.
         num_pixels: R, rays an iteration, at least 1.
         iterations: I, at least 1.
         fixed_frame: row of `poses` that holds the world in place; -1 for none.

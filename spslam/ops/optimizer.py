@@ -1,4 +1,4 @@
-"""Optimiser steps: Adam on the touched rows of a table, and Gauss-Newton's normal equations. Not differentiable."""
+"""Optimizer steps: Adam on the touched rows of a table, and Gauss-Newton's normal equations. Not differentiable."""
 
 import torch
 

@@ -19,9 +19,9 @@ class PixelSampling:
         count: pixels to draw, P.
         min_depth, max_depth: pixels nearer or farther, m, are not drawn.
         step_px, max_jump: of the normals, see `depth_normals`.
-        lattice_step: distance of the lattice's pixels, px; the first lies at half of it.
-        view_step: distance of the view's pixels, px; the first lies at 0. With 0 there is no view.
-        view_unit: m, of the view's depth.
+        thumbnail_step: distance of the depth_thumbnail's pixels, px; the first lies at half of it.
+        depth_image_step: distance of the view's pixels, px; the first lies at 0. With 0 there is no view.
+        depth_image_unit: m, of the view's depth.
     """
 
     count: int
@@ -29,21 +29,21 @@ class PixelSampling:
     max_depth: float
     step_px: int
     max_jump: float
-    lattice_step: int
-    view_step: int = 0
-    view_unit: float = 1e-3
+    thumbnail_step: int
+    depth_image_step: int = 0
+    depth_image_unit: float = 1e-3
 
-    def lattice_shape(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the lattice of an image."""
-        first, step = self.lattice_step // 2, self.lattice_step
+    def thumbnail_shape(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the depth_thumbnail of an image."""
+        first, step = self.thumbnail_step // 2, self.thumbnail_step
         return len(range(first, height, step)), len(range(first, width, step))
 
-    def view_shape(self, height: int, width: int) -> tuple[int, int]:
+    def depth_image_shape(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of the view of an image; 0 and 0 where there is none."""
-        return _view_size(height, self.view_step), _view_size(width, self.view_step)
+        return _depth_image_size(height, self.depth_image_step), _depth_image_size(width, self.depth_image_step)
 
 
-def _view_size(size: int, step: int) -> int:
+def _depth_image_size(size: int, step: int) -> int:
     return -(-size // step) if step > 0 else 0
 
 
@@ -67,7 +67,7 @@ def sample_frame_pixels(
     direction with camera z = 1; 0 = unknown). Runs on the calling thread, without Python's lock.
 
     Args:
-        depth: float32 [H, W] on the CPU, metres; not finite, 0 and outside the range is invalid.
+        depth: float32 [H, W] on the CPU, meters; not finite, 0 and outside the range is invalid.
         color: uint8 [H, W, 3].
         fx, fy, cx, cy: pinhole camera, px.
         sampling: how many, and what is valid.
@@ -75,8 +75,8 @@ def sample_frame_pixels(
 
     Returns:
         buffer int32 [3 P + 3 P + ceil(h w / 2) + ceil(h' w' / 2)]: the records [P, 3], the normals [P, 3] as the bits
-        of float32, float16 depth [h, w] (m, 0 where invalid) at every `lattice_step`-th pixel, two a word, and the
-        view, uint16 depth [h', w'] in `view_unit` m, rounded (0 where invalid or beyond 65535) at every `view_step`-th
+        of float32, float16 depth [h, w] (m, 0 where invalid) at every `thumbnail_step`-th pixel, two a word, and the
+        view, uint16 depth [h', w'] in `depth_image_unit` m, rounded (0 where invalid or beyond 65535) at every `depth_image_step`-th
         pixel, two a word; and the number of valid pixels. Where that is 0, records and normals are 0. The same bits on
         every run.
 
@@ -85,7 +85,7 @@ def sample_frame_pixels(
         TypeError: wrong dtypes.
 
     Example:
-        >>> sampling = PixelSampling(4, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, lattice_step=16)
+        >>> sampling = PixelSampling(4, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, thumbnail_step=16)
         >>> depth, color = torch.ones(32, 48), torch.zeros(32, 48, 3, dtype=torch.uint8)
         >>> buffer, valid = sample_frame_pixels(depth, color, 50.0, 50.0, 24.0, 16.0, sampling, 0, 0, 0)
         >>> buffer.shape, valid
@@ -105,9 +105,17 @@ def sample_frame_pixels(
     check(sampling.min_depth >= 0, name, "min_depth", "be at least 0", sampling.min_depth)
     check(1 <= sampling.step_px <= _MAX_SIDE, name, "step_px", "be in [1, 65535]", sampling.step_px)
     check(sampling.max_jump > 0, name, "max_jump", "be positive", sampling.max_jump)
-    check(1 <= sampling.lattice_step <= _MAX_SIDE, name, "lattice_step", "be in [1, 65535]", sampling.lattice_step)
-    check(0 <= sampling.view_step <= _MAX_SIDE, name, "view_step", "be in [0, 65535]", sampling.view_step)
-    check(sampling.view_unit > 0, name, "view_unit", "be positive", sampling.view_unit)
+    check(
+        1 <= sampling.thumbnail_step <= _MAX_SIDE, name, "thumbnail_step", "be in [1, 65535]", sampling.thumbnail_step
+    )
+    check(
+        0 <= sampling.depth_image_step <= _MAX_SIDE,
+        name,
+        "depth_image_step",
+        "be in [0, 65535]",
+        sampling.depth_image_step,
+    )
+    check(sampling.depth_image_unit > 0, name, "depth_image_unit", "be positive", sampling.depth_image_unit)
     buffer, num_valid = torch.ops.spslam.sample_frame_pixels(
         depth,
         color,
@@ -120,9 +128,9 @@ def sample_frame_pixels(
         sampling.max_depth,
         sampling.step_px,
         sampling.max_jump,
-        sampling.lattice_step,
-        sampling.view_step,
-        sampling.view_unit,
+        sampling.thumbnail_step,
+        sampling.depth_image_step,
+        sampling.depth_image_unit,
         seed,
         stream,
         frame,
@@ -171,7 +179,22 @@ def _(records, normals, pose, fx, fy, cx, cy):
 
 
 @torch.library.register_fake("spslam::sample_frame_pixels")
-def _(depth, color, fx, fy, cx, cy, count, min_depth, max_depth, step_px, max_jump, lattice_step, view_step, *rest):
-    height, width = (max(0, -((lattice_step // 2 - size) // lattice_step)) for size in depth.shape)
-    view = _view_size(depth.shape[0], view_step) * _view_size(depth.shape[1], view_step)
+def _(
+    depth,
+    color,
+    fx,
+    fy,
+    cx,
+    cy,
+    count,
+    min_depth,
+    max_depth,
+    step_px,
+    max_jump,
+    thumbnail_step,
+    depth_image_step,
+    *rest,
+):
+    height, width = (max(0, -((thumbnail_step // 2 - size) // thumbnail_step)) for size in depth.shape)
+    view = _depth_image_size(depth.shape[0], depth_image_step) * _depth_image_size(depth.shape[1], depth_image_step)
     return depth.new_empty((6 * count + (height * width + 1) // 2 + (view + 1) // 2,), dtype=torch.int32), 0

@@ -28,11 +28,11 @@ def depth_normals(
     the five pixels: over 5x5 pixels, with a Gaussian of 2 px in the image and a biweight of 6 cm in depth.
 
     Args:
-        depth: float32 [H, W], metres; 0, negative and not finite are invalid.
+        depth: float32 [H, W], meters; 0, negative and not finite are invalid.
         pixels: int32 [N, 2], (u, v): column, row.
         fx, fy, cx, cy: pinhole camera, px.
         step_px: distance of the differences, at least 1.
-        max_jump: a neighbour whose depth differs by this share of the pixel's, or more, is another surface.
+        max_jump: a neighbor whose depth differs by this share of the pixel's, or more, is another surface.
 
     Returns:
         float32 [N, 3] in camera axes, unit, turned to the camera (n . p < 0). 0 where unknown: invalid depth at one of
@@ -70,14 +70,14 @@ def encode_points(
     """Encodes surface points into features at the voxel vertices around them; section III.B of SP-SLAM.
 
     A point x (in voxels) with normal n gives to a vertex c the feature `encoder([(x - c) / r, n])`, with the weight
-    `prod(1 - |x - c| / r)^3` over the axes: r = 2 and the 4x4x4 vertices around the point for a neighbourhood of 64,
+    `prod(1 - |x - c| / r)^3` over the axes: r = 2 and the 4x4x4 vertices around the point for a neighborhood of 64,
     r = 1 and the 8 corners of its cell for 8. The encoder is 6 -> 64 -> 64 -> 8 with ReLU.
 
     Args:
-        points: float32 [N, 3], world, metres. Not finite ones, and those beyond 2^20 voxels, are skipped.
+        points: float32 [N, 3], world, meters. Not finite ones, and those beyond 2^20 voxels, are skipped.
         normals: float32 [N, 3], unit, world, towards the camera; points whose normal is 0 are skipped.
         encoder_params: float32 [5128], flat, in the layout of `mlp`.
-        voxel_size: metres.
+        voxel_size: meters.
         neighborhood: 64 or 8.
         min_pair_weight: pairs of a point and a vertex with less weight are left out, and never looked at again.
         tf32: on CUDA devices from sm_80 on, let tensor cores multiply factors rounded to 10 bits of mantissa, which
@@ -91,7 +91,7 @@ def encode_points(
         or beyond 32768 makes all of them NaN, and the call waits for the device.
 
     Raises:
-        ValueError: wrong shapes or devices, `voxel_size` not positive, another neighbourhood, a negative minimum.
+        ValueError: wrong shapes or devices, `voxel_size` not positive, another neighborhood, a negative minimum.
         TypeError: wrong dtypes.
 
     Example:

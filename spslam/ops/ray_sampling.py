@@ -104,18 +104,18 @@ def sample_along_rays(
     one random place in each of as many equal parts. Both come merged in ascending order.
 
     Args:
-        depth: [R] float32 or float64, measured depth of each ray, metres. Rays whose depth is
+        depth: [R] float32 or float64, measured depth of each ray, meters. Rays whose depth is
             not positive and finite get zeros.
         num_uniform: samples between camera and surface (N_c), 0 to 2^20.
         num_surface: samples around the surface (N_f), 0 to 2^20.
         near: start of the uniform samples as a share of the depth (n_1).
         far: their end (n_2), at least `near`.
-        truncation: half width of the interval around the surface, metres.
+        truncation: half width of the interval around the surface, meters.
         seed, stream, frame, iteration: the key of the draw, as in `philox_uniform`. Sample s of ray r, with the uniform
             samples first, uses counter element r * S + s, which must stay below 2^32.
 
     Returns:
-        [R, S] with S = num_uniform + num_surface, of the dtype of `depth`, metres, ascending in each row. Not
+        [R, S] with S = num_uniform + num_surface, of the dtype of `depth`, meters, ascending in each row. Not
         differentiable. The same on every run; devices differ by rounding only. R = 0 or S = 0 gives an empty tensor.
 
     Raises:

@@ -52,7 +52,7 @@ class RenderOptions:
         truncation: distance at which the SDF saturates, m.
         cosine_targets: measure distances to the surface's tangent plane (depth difference times the pixel's
             foreshortening, at least 0.15), not along the ray.
-        weight_rgb, weight_depth, weight_free_space, weight_sdf: weights of equations (8), (9), (11), (10). Colour is
+        weight_rgb, weight_depth, weight_free_space, weight_sdf: weights of equations (8), (9), (11), (10). Color is
             not evaluated where weight_rgb is 0.
         seed, stream, frame, iteration: keys of the sampling, see `philox_uniform`.
         pose_gradient: whether the gradient of the poses is wanted.
@@ -155,9 +155,9 @@ class RenderStep:
         losses: float32 [5]: the weighted total, then the terms without weights: rgb (0 where it has
             no weight), depth (m^2), free space, SDF (m^2).
         grad_poses: float32 [F, 6] dL/d translation (1/m) and dL/d omega (1/rad), omega turning the camera about its
-            centre by exp(omega) R; None where not wanted.
+            center by exp(omega) R; None where not wanted.
         grad_geometry: float32 [1473] of the geometry decoder; None where embeddings are frozen.
-        grad_color: float32 [2211] of the colour decoder; None where texels are frozen.
+        grad_color: float32 [2211] of the color decoder; None where texels are frozen.
     """
 
     losses: torch.Tensor

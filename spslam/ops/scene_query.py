@@ -52,7 +52,7 @@ def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
     """RGB at world points, c = F(f_xy + f_xz + f_yz) (eq. 3, 4).
 
     Args:
-        scene: the map; points beyond its planes take the border's colour.
+        scene: the map; points beyond its planes take the border's color.
         points: float32 [N, 3], m. NaN gives NaN.
 
     Returns:
@@ -62,7 +62,7 @@ def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
         TypeError, ValueError: a tensor of another dtype, shape or device.
 
     Example:
-        >>> query_color(SceneView.empty(), torch.zeros(1, 3))  # a decoder of zeros is grey
+        >>> query_color(SceneView.empty(), torch.zeros(1, 3))  # a decoder of zeros is gray
         tensor([[0.5000, 0.5000, 0.5000]])
     """
     scene.check("query_color")

@@ -29,7 +29,7 @@ def track_adam(
     Iteration i draws `num_pixels` of the records as `sample_indices` does with `pixel_stream` and iteration
     `options.iteration + i`, makes a `render_step` with them, keeps the pose if its total loss is the least yet, and
     takes an Adam step (beta 0.9 and 0.999, epsilon 1e-8) on quaternion and translation; the quaternion is then
-    normalised. On CUDA nothing waits for the device.
+    normalized. On CUDA nothing waits for the device.
 
     Args:
         scene: the map; not changed.

@@ -1,7 +1,7 @@
 """Volume rendering of rays and the loss terms of tracking and mapping, differentiable by hand-written derivatives.
 
 float32 and float64, non-contiguous and empty input, first derivatives only. All sums run in a fixed order: the same
-input gives the same bits, whatever the number of threads. `sdf` is normalised throughout: the signed distance divided
+input gives the same bits, whatever the number of threads. `sdf` is normalized throughout: the signed distance divided
 by the truncation distance, in [-1, 1], positive in front of surfaces.
 """
 
@@ -16,7 +16,7 @@ from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 def volume_render(
     sdf: torch.Tensor, color: torch.Tensor, t: torch.Tensor, valid: torch.Tensor, truncation: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Colour and depth of rays as weighted sums over their samples (equations 5 and 6).
+    """Color and depth of rays as weighted sums over their samples (equations 5 and 6).
 
     The weight of a sample is the bell sigmoid(sdf / truncation) * sigmoid(-sdf / truncation), taken as 0 below 1e-3,
     where the sample is not valid, and where it lies deeper than the ray's first crossing (the smallest t of its valid
@@ -24,14 +24,14 @@ def volume_render(
     weight renders as zeros.
 
     Args:
-        sdf: [R, S] float32 or float64, normalised.
+        sdf: [R, S] float32 or float64, normalized.
         color: [R, S, 3] of the same dtype.
-        t: [R, S] of the same dtype, depth of the samples, metres, in any order.
+        t: [R, S] of the same dtype, depth of the samples, meters, in any order.
         valid: bool [R, S], whether a sample lies inside the volume.
-        truncation: truncation distance tr, metres.
+        truncation: truncation distance tr, meters.
 
     Returns:
-        color [R, 3], depth [R] in metres, weights [R, S]. All three are differentiable by `sdf`, `color` and `t`; which
+        color [R, 3], depth [R] in meters, weights [R, S]. All three are differentiable by `sdf`, `color` and `t`; which
         samples take part is not differentiated. R = 0 gives empty tensors, S = 0 zeros. NaN makes what it enters NaN,
         in its own ray alone.
 
@@ -73,7 +73,7 @@ def rendering_losses(
     `cosine_targets` is set and the ray's cosine is known, else 1. A sample is near if |e| < truncation and it is valid,
     free if e >= truncation, valid or not: outside the volume the field is 1, which adds nothing to the mean.
 
-    - rgb: squared error of the rendered colour, mean over the channels; rays that were rendered only.
+    - rgb: squared error of the rendered color, mean over the channels; rays that were rendered only.
     - depth: squared error of the rendered depth, m^2; rays that were rendered only.
     - free space: mean over a ray's free samples of (sdf - 1)^2.
     - sdf: mean over a ray's near samples of (sdf * truncation - e)^2, m^2.
@@ -84,16 +84,16 @@ def rendering_losses(
 
     Args:
         color: [R, 3] float32 or float64, rendered.
-        depth: [R] of the same dtype, rendered, metres.
-        sdf: [R, S] of the same dtype, normalised.
-        t: [R, S] of the same dtype, depth of the samples, metres.
+        depth: [R] of the same dtype, rendered, meters.
+        sdf: [R, S] of the same dtype, normalized.
+        t: [R, S] of the same dtype, depth of the samples, meters.
         valid: bool [R, S], whether a sample lies inside the volume.
         rendered: bool [R], whether any sample of the ray had a weight.
         target_color: [R, 3] of the same dtype, measured.
-        target_depth: [R] of the same dtype, measured, metres.
+        target_depth: [R] of the same dtype, measured, meters.
         cosine: [R] of the same dtype, surface normal times ray direction, the direction scaled to depth 1, so it may
             exceed 1 towards the image's corners; 0 where the normal is unknown.
-        truncation: truncation distance, metres.
+        truncation: truncation distance, meters.
         cosine_targets: whether distances are measured to the surface instead of along the ray.
 
     Returns:

@@ -191,8 +191,8 @@ def voxel_hash_lookup(
     Args:
         hash_keys, hash_values: the table.
         corner_ids: int32 [V, 8], see `voxel_hash_update_corner_ids`.
-        points: float32 or float64 [N, 3], world, metres.
-        voxel_size: edge of a voxel, metres.
+        points: float32 or float64 [N, 3], world, meters.
+        voxel_size: edge of a voxel, meters.
 
     Returns:
         cell_corner_ids int32 [N, 8], a row of -1 for points outside the allocated cells (and NaN), and local_coords

@@ -1,6 +1,5 @@
 """The scene prior: a depth encoder and a geometry decoder, trained together on procedural solids."""
 
-from spslam.prior.encode_frame import encode_frame
 from spslam.prior.encoder import Prior, load_prior
 
-__all__ = ["Prior", "encode_frame", "load_prior"]
+__all__ = ["Prior", "load_prior"]

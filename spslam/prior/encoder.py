@@ -56,7 +56,7 @@ class Prior:
 
 
 def shipped_weights(neighborhood: int = 64) -> Path:
-    """The shipped file of weights that were trained for a neighbourhood of 64 or 8 vertices."""
+    """The shipped file of weights that were trained for a neighborhood of 64 or 8 vertices."""
     return SHIPPED if neighborhood == 64 else _DATA / f"prior-{neighborhood}.safetensors"
 
 
@@ -64,7 +64,7 @@ def load_prior(path: str | os.PathLike | None = None, neighborhood: int = 64) ->
     """Reads a file of weights, as `spslam pretrain` writes it: safetensors with `encoder` and `geometry_decoder`.
 
     Args:
-        path: the file; where None, the one that is shipped for the neighbourhood.
+        path: the file; where None, the one that is shipped for the neighborhood.
         neighborhood: 64 or 8, only used without a path: a file says by itself what it was trained for.
 
     Raises:

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import linear
 
 from spslam.prior.encoder import DECODER_WIDTHS, ENCODER_WIDTHS
-from spslam.prior.views import Patches
+from spslam.prior.patches import Patches
 
 LATTICE_RADIUS = 6
 _LATTICE_SIZE = 2 * LATTICE_RADIUS + 1

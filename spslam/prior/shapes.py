@@ -207,7 +207,7 @@ def _start_points(parameters: Parameters, count: int, generator: Generator) -> T
 
 
 def _random_rotations(count: int, generator: Generator) -> Tensor:
-    """Uniform rotations [B,3,3], from normalised Gaussian quaternions."""
+    """Uniform rotations [B,3,3], from normalized Gaussian quaternions."""
     quaternion = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1)
     w, x, y, z = quaternion.unbind(-1)
     rows = [

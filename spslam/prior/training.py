@@ -23,8 +23,8 @@ from spslam.prior.model import (
     initial_parameters,
     without_position,
 )
+from spslam.prior.patches import Patches, PatchSettings, observe
 from spslam.prior.shapes import TRAINING_KINDS
-from spslam.prior.views import Patches, ViewSettings, observe
 
 _BLOCK_STEPS = 8
 _ENCODER_LENGTH = parameter_count(ENCODER_WIDTHS)
@@ -36,7 +36,7 @@ class PretrainSettings:
 
     Attributes
     ----------
-    steps, seed : number of optimisation steps, and the seed of everything drawn.
+    steps, seed : number of optimization steps, and the seed of everything drawn.
     patches_per_kind : solids of each kind a step.
     learning_rate, final_learning_rate : Adam's rate after ``warmup_steps``, and what it falls to along a cosine.
     surface_emphasis : how much more a query on the surface counts, falling off over half a voxel.
@@ -55,7 +55,7 @@ class PretrainSettings:
     feature_penalty: float = 1e-3
     neighborhood: int = 64
     min_pair_weight: float = 0.0
-    views: ViewSettings = field(default_factory=ViewSettings)
+    views: PatchSettings = field(default_factory=PatchSettings)
 
     def __post_init__(self) -> None:
         for name in ("steps", "patches_per_kind"):

@@ -6,8 +6,8 @@ import torch
 from torch import Generator, Tensor
 
 from spslam.prior.model import PatchFields, decode, encode_patches
+from spslam.prior.patches import Patches, PatchSettings, observe
 from spslam.prior.shapes import HELD_OUT_KINDS
-from spslam.prior.views import Patches, ViewSettings, observe
 
 MM_PER_VOXEL = 40.0
 """Figures are given for voxels of 4 cm."""
@@ -34,11 +34,11 @@ def validate(
     For each kind and for ``mean``: ``near_mae_mm`` (true distance within one voxel), ``far_mae_mm`` (within two),
     ``sign_accuracy`` (beyond 0.2 voxels), ``zero_crossing_mm`` and ``zero_crossing_bias_mm`` (distance of the
     predicted surface along the rays to the true surface's tangent plane, mean size and mean), ``crossing_share``
-    (rays that met one). Millimetres at 4 cm voxels.
+    (rays that met one). Millimeters at 4 cm voxels.
     """
     figures = {}
     for index, kind in enumerate(kinds):
-        patches = observe(kind, _SOLIDS, Generator().manual_seed(_SEED + index), ViewSettings(noise=_NOISE))
+        patches = observe(kind, _SOLIDS, Generator().manual_seed(_SEED + index), PatchSettings(noise=_NOISE))
         fields = encode_patches(patches, encoder_params, neighborhood, min_pair_weight)
         figures[kind] = _distance_errors(patches, fields, decoder_params)
         figures[kind] |= _crossing_errors(patches, fields, decoder_params)
@@ -48,7 +48,7 @@ def validate(
 
 
 def _distance_errors(patches: Patches, fields: PatchFields, decoder_params: Tensor) -> dict[str, float]:
-    truncation = ViewSettings().truncation
+    truncation = PatchSettings().truncation
     patch, _ = patches.valid.nonzero().unbind(1)
     features, inside = fields.interpolate(patch, patches.queries[patches.valid])
     predicted = truncation * decode(features[inside], decoder_params)

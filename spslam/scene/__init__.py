@@ -1,4 +1,4 @@
-"""The map and its parts: `SparseVolume` (geometry), `TriPlanes` (colour), their decoders, and `Scene`, all of it."""
+"""The map and its parts: `SparseVolume` (geometry), `TriPlanes` (color), their decoders, and `Scene`, all of it."""
 
 from spslam.scene.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import SparseVolume

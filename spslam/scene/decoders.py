@@ -36,7 +36,7 @@ COLOR_DECODER = MlpShape(inputs=32, hidden=32, outputs=3)  # tri-plane feature (
 
 
 def random_parameters(shape: MlpShape, seed: int, purpose: int) -> torch.Tensor:
-    """Uniform initialisation in +-1/sqrt(inputs) of each layer, weights and biases alike (torch.nn.Linear's).
+    """Uniform initialization in +-1/sqrt(inputs) of each layer, weights and biases alike (torch.nn.Linear's).
 
     Args:
         shape: the network.

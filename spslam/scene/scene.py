@@ -13,7 +13,7 @@ from spslam.scene.tensor_file import load_tensors, save_tensors
 from spslam.scene.tri_planes import TriPlanes
 
 FORMAT = "spslam-map-1"
-_GEOMETRY, _COLOR = 1, 2  # `purpose` of the decoders' initialisation
+_GEOMETRY, _COLOR = 1, 2  # `purpose` of the decoders' initialization
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Scene:
 
     Attributes:
         settings: sizes and scales.
-        origin: float64 [3] world point (m) that decoder positions are relative to, the first camera's centre.
+        origin: float64 [3] world point (m) that decoder positions are relative to, the first camera's center.
         volume: embeddings at the vertices of allocated voxels.
-        planes: colour features on three planes.
+        planes: color features on three planes.
         geometry_decoder: flat parameters of position, embedding -> SDF / truncation.
         color_decoder: flat parameters of tri-plane feature -> RGB.
     """

@@ -12,7 +12,7 @@ FEATURES = 8
 
 
 def resize_rows(tensor: torch.Tensor, rows: int) -> torch.Tensor:
-    """`tensor` with another number of rows: the common ones copied, new ones zero. For the optimiser's buffers.
+    """`tensor` with another number of rows: the common ones copied, new ones zero. For the optimizer's buffers.
 
     Args:
         tensor: any dtype, [V, ...].
@@ -36,7 +36,7 @@ class SparseVolume:
     rows are views of buffers of `capacity` rows: a view's memory stays where it is until `capacity` changes.
 
     Args:
-        voxel_size_m: edge of a voxel, metres.
+        voxel_size_m: edge of a voxel, meters.
         max_voxels: most vertices allowed; None for as many as memory holds.
         device: where the volume lives.
         capacity: rows to reserve at first.
@@ -68,7 +68,7 @@ class SparseVolume:
 
     @property
     def capacity(self) -> int:
-        """Rows reserved; optimiser buffers of as many rows stay valid until it changes."""
+        """Rows reserved; optimizer buffers of as many rows stay valid until it changes."""
         return self.cells.capacity
 
     @property
@@ -161,7 +161,7 @@ class SparseVolume:
         """Allocates the vertices around a frame's points and fuses their encoding, see `ops.encode_frame_`.
 
         Args:
-            points: float32 [N, 3], world, metres.
+            points: float32 [N, 3], world, meters.
             normals: float32 [N, 3], world, unit; 0 = unknown.
             encoder_params: float32 [5128], on the volume's device.
             fusion: settings; of this volume's voxel size.
@@ -184,7 +184,7 @@ class SparseVolume:
         """The cell around each point.
 
         Args:
-            points: float32 or float64 [N, 3], world, metres.
+            points: float32 or float64 [N, 3], world, meters.
 
         Returns:
             corner_ids int32 [N, 8], local_coords [N, 3] in [0, 1], and valid bool [N]: all eight corners exist.
@@ -196,7 +196,7 @@ class SparseVolume:
         """Trilinearly interpolated features at points, equation (2) of SP-SLAM; differentiable.
 
         Args:
-            points: float32 [N, 3], world, metres.
+            points: float32 [N, 3], world, meters.
 
         Returns:
             features float32 [N, 8], 0 outside the allocated cells, and valid bool [N].

@@ -1,4 +1,4 @@
-"""Colour features on three axis-aligned planes that grow as the camera moves (section III.B)."""
+"""Color features on three axis-aligned planes that grow as the camera moves (section III.B)."""
 
 from collections.abc import Sequence
 

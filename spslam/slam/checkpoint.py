@@ -32,7 +32,7 @@ def fingerprint(config: Config) -> str:
 
 
 # Rows of these are never changed once they are there, so a snapshot may share them.
-_APPENDED_ONLY = ("scene.volume.voxel_coords", "frames.lattices", "pixels.records")
+_APPENDED_ONLY = ("scene.volume.voxel_coords", "frames.depth_thumbnails", "pixels.records")
 
 
 @dataclass(frozen=True)

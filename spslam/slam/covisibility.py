@@ -1,11 +1,11 @@
-"""Which frames a mapping call optimises (section III.D)."""
+"""Which frames a mapping call optimizes (section III.D)."""
 
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.slam.pixels import LATTICE_STEP_PX
+from spslam.slam.pixels import THUMBNAIL_STEP_PX
 
 POINTS = 256
 
@@ -13,7 +13,7 @@ POINTS = 256
 def select_frames(
     records: torch.Tensor,
     poses: torch.Tensor,
-    lattices: torch.Tensor,
+    depth_thumbnails: torch.Tensor,
     usable: torch.Tensor,
     camera: Camera,
     config: Config,
@@ -25,7 +25,7 @@ def select_frames(
     Args:
         records: int32 [F, P, 3] packed pixels of all frames.
         poses: float32 [F, 7].
-        lattices: float16 [F, h, w] depth (m) at every `LATTICE_STEP_PX`-th pixel.
+        depth_thumbnails: float16 [F, h, w] depth (m) at every `THUMBNAIL_STEP_PX`-th pixel.
         usable: bool [F] on the CPU, frames that have pixels and a pose.
         camera: intrinsics.
         config: `mapping.frames`, `recent`, `covisible`, `covisibility_threshold`.
@@ -46,10 +46,10 @@ def select_frames(
         records[current],
         current,
         poses,
-        lattices,
+        depth_thumbnails,
         shuffled.to(device, non_blocking=True),
         ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
-        lattice_step=LATTICE_STEP_PX,
+        thumbnail_step=THUMBNAIL_STEP_PX,
         num_points=POINTS,
         num_covisible=mapping.covisible,
         count=mapping.frames - len(recent),

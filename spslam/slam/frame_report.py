@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from spslam.slam.timeline import Mark
+from spslam.slam.device_events import DeviceEvent
 
 
 @dataclass(frozen=True)
@@ -20,21 +20,21 @@ class FrameReport:
         index: its index in the data set.
         timestamp: s.
         lost: whether its pose is not to be trusted.
-        valid_depth: share of pixels with usable depth.
+        valid_depth_share: share of pixels with usable depth.
         tracking_iterations: of this frame; 0 for the first.
         residual_cm: weighted RMS distance of its pixels to the map; None where it was not tracked.
-        inliers: share of its pixels on mapped surface; None where it was not tracked.
-        support: mean robust weight of its pixels on the map, from 0 to 1; None where it was not tracked.
-        information: smallest eigenvalue of its normal equations a pixel; None where it was not tracked.
-        jump_cm, jump_deg: from the motion model's pose to the one found; None where that was not asked.
-        conflict: share of the surface other frames know that it looks through; None where that was not asked.
-        hidden: share of that surface that something nearer hides; None where that was not asked.
-        coverage: share of the last trusted frame's pixels on mapped surface; None where that was not asked.
-        likeness: correlation of its brightness with the map's colours; None where that was not asked, or is not known.
-        doubt: probability from these that its pose is wrong; None where it was not tracked.
-        rescued: whether its pose comes from a start that projective ICP found.
-        relocalised: whether that start was a stored frame that looks alike.
-        mapping_iterations: of the joint optimisation after this frame.
+        inlier_share: share of its pixels on mapped surface; None where it was not tracked.
+        mean_robust_weight: mean robust weight of its pixels on the map, from 0 to 1; None where it was not tracked.
+        min_eigenvalue: smallest eigenvalue of its normal equations a pixel; None where it was not tracked.
+        prediction_error_cm, prediction_error_deg: from the motion model's pose to the one found; None where that was not asked.
+        free_space_violation: share of the surface other frames know that it looks through; None where that was not asked.
+        occluded_share: share of that surface that something nearer hides; None where that was not asked.
+        map_coverage: share of the last trusted frame's pixels on mapped surface; None where that was not asked.
+        brightness_correlation: correlation of its brightness with the map's colors; None where that was not asked, or is not known.
+        error_probability: probability from these that its pose is wrong; None where it was not tracked.
+        recovered: whether its pose comes from a start that projective ICP found.
+        relocalized: whether that start was a stored frame that looks alike.
+        mapping_iterations: of the joint optimization after this frame.
         loss: total loss of the last mapping iteration; None where there was none.
         voxels: allocated vertices.
         decode_ms: reading, decoding and sampling the frame, on a thread and ahead of need.
@@ -42,7 +42,7 @@ class FrameReport:
         wait_ms: the device had nothing to do, for the frame was not there yet.
         tracking_ms: predicting and finding its pose.
         encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
-        mapping_ms: joint optimisation; 0 where there was none.
+        mapping_ms: joint optimization; 0 where there was none.
         other_ms: the rest of the time from when the frame was asked for until it was done.
     """
 
@@ -50,21 +50,21 @@ class FrameReport:
     index: int
     timestamp: float
     lost: bool
-    valid_depth: float
+    valid_depth_share: float
     tracking_iterations: int
     residual_cm: float | None
-    inliers: float | None
-    support: float | None
-    information: float | None
-    jump_cm: float | None
-    jump_deg: float | None
-    conflict: float | None
-    hidden: float | None
-    coverage: float | None
-    likeness: float | None
-    doubt: float | None
-    rescued: bool
-    relocalised: bool
+    inlier_share: float | None
+    mean_robust_weight: float | None
+    min_eigenvalue: float | None
+    prediction_error_cm: float | None
+    prediction_error_deg: float | None
+    free_space_violation: float | None
+    occluded_share: float | None
+    map_coverage: float | None
+    brightness_correlation: float | None
+    error_probability: float | None
+    recovered: bool
+    relocalized: bool
     mapping_iterations: int
     loss: float | None
     voxels: int
@@ -78,7 +78,7 @@ class FrameReport:
 
 
 @dataclass
-class FrameMarks:
+class FrameEvents:
     """Where a frame's stages begin and end on the device's time line; a stage that did not take place has no marks.
 
     Attributes:
@@ -88,13 +88,13 @@ class FrameMarks:
         upload, tracking, encode, mapping: begin and end of the stages; `upload` is on a stream of its own.
     """
 
-    asked: Mark
-    began: Mark
-    done: Mark
-    upload: tuple[Mark, Mark] | None = None
-    tracking: tuple[Mark, Mark] | None = None
-    encode: tuple[Mark, Mark] | None = None
-    mapping: tuple[Mark, Mark] | None = None
+    asked: DeviceEvent
+    began: DeviceEvent
+    done: DeviceEvent
+    upload: tuple[DeviceEvent, DeviceEvent] | None = None
+    tracking: tuple[DeviceEvent, DeviceEvent] | None = None
+    encode: tuple[DeviceEvent, DeviceEvent] | None = None
+    mapping: tuple[DeviceEvent, DeviceEvent] | None = None
 
     def times_ms(self, host_wait_ms: float) -> dict[str, float]:
         """The times of `FrameReport`, all marks having passed.
@@ -125,13 +125,13 @@ class PendingReport:
     """
 
     known: dict[str, Any]
-    marks: FrameMarks
+    marks: FrameEvents
     host_wait_ms: float
     loss: torch.Tensor | None
 
     def is_done(self) -> bool:
         """Whether `result()` would return at once."""
-        return self.marks.done.has_passed()
+        return self.marks.done.is_complete()
 
     def result(self) -> FrameReport:
         """The whole report; waits until the device is done with the frame."""
@@ -141,5 +141,5 @@ class PendingReport:
         return FrameReport(**fields)
 
 
-def _length_ms(stage: tuple[Mark, Mark] | None) -> float:
+def _length_ms(stage: tuple[DeviceEvent, DeviceEvent] | None) -> float:
     return stage[1].ms_since(stage[0]) if stage else 0.0

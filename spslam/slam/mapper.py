@@ -1,15 +1,16 @@
-"""Grows the map from new frames and optimises it together with the poses (sections III.A, III.C, III.D)."""
+"""Grows the map from new frames and optimizes it together with the poses (sections III.A, III.C, III.D)."""
 
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.prior import Prior, encode_frame
+from spslam.prior import Prior
 from spslam.scene import Scene
 from spslam.slam.covisibility import select_frames
-from spslam.slam.optimization import render_options
+from spslam.slam.encode_frame import encode_frame
 from spslam.slam.pixels import FramePixels
+from spslam.slam.render_options import render_options
 from spslam.slam.state import Moments, SlamState
 
 
@@ -45,7 +46,7 @@ class Mapper:
         return self.prior
 
     def optimize(self, state: SlamState, iterations: int) -> torch.Tensor | None:
-        """Joint optimisation of scene and poses over selected frames.
+        """Joint optimization of scene and poses over selected frames.
 
         Args:
             state: changed in place.
@@ -83,7 +84,7 @@ class Mapper:
         return losses[-1]
 
     def _moments(self, state: SlamState) -> ops.MapMoments:
-        """Adam's state of all that is optimised, grown to the scene's size."""
+        """Adam's state of all that is optimized, grown to the scene's size."""
         mapping, scene = self.config.mapping, state.scene
         geometry, color = mapping.optimize_geometry, self.config.loss.rgb > 0
         volume, planes = scene.volume.embeddings, scene.planes.texels
@@ -100,7 +101,7 @@ class Mapper:
     def _select(self, state: SlamState) -> torch.Tensor:
         frames = state.frames
         return select_frames(
-            state.pixels.records, frames.poses, frames.lattices, state.usable, self.camera, self.config
+            state.pixels.records, frames.poses, frames.depth_thumbnails, state.usable, self.camera, self.config
         )
 
 
@@ -112,10 +113,10 @@ def _moments(state: SlamState, name: str, parameter: torch.Tensor) -> Moments:
 
 
 def _decoder(
-    state: SlamState, name: str, parameter: torch.Tensor, rate: float, optimised: bool
+    state: SlamState, name: str, parameter: torch.Tensor, rate: float, optimized: bool
 ) -> ops.AdamMoments | None:
     """Adam's state of a decoder; None where it stays as it is."""
-    return _moments(state, name, parameter).of_tensor(rate) if optimised and rate > 0 else None
+    return _moments(state, name, parameter).of_tensor(rate) if optimized and rate > 0 else None
 
 
 def _reset(state: SlamState) -> None:

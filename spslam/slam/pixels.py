@@ -15,9 +15,9 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
-from spslam.slam.depth_views import UNITS, view_step
+from spslam.slam.depth_keyframes import UNITS, depth_image_step
 
-LATTICE_STEP_PX = 16
+THUMBNAIL_STEP_PX = 16
 
 
 @dataclass(frozen=True)
@@ -25,24 +25,24 @@ class FramePixels:
     """What tracking and mapping need of a frame, in one buffer, so that an upload is one copy.
 
     Attributes:
-        buffer: int32 words of the records, the normals, the lattice and the view, as `ops.sample_frame_pixels` returns
+        buffer: int32 words of the records, the normals, the depth_thumbnail and the view, as `ops.sample_frame_pixels` returns
             them.
         capacity: records that the buffer holds; without depth they are 0 and none of them counts.
-        lattice_shape: rows and columns of the lattice.
-        view_shape: rows and columns of the view; 0 and 0 without one.
-        valid_share: share of the image's pixels with usable depth.
+        thumbnail_shape: rows and columns of the depth_thumbnail.
+        depth_image_shape: rows and columns of the view; 0 and 0 without one.
+        valid_depth_share: share of the image's pixels with usable depth.
     """
 
     buffer: torch.Tensor
     capacity: int
-    lattice_shape: tuple[int, int]
-    view_shape: tuple[int, int]
-    valid_share: float
+    thumbnail_shape: tuple[int, int]
+    depth_image_shape: tuple[int, int]
+    valid_depth_share: float
 
     @property
     def count(self) -> int:
         """P, the number of records; 0 without depth."""
-        return self.capacity if self.valid_share > 0 else 0
+        return self.capacity if self.valid_depth_share > 0 else 0
 
     @cached_property
     def records(self) -> torch.Tensor:
@@ -55,15 +55,15 @@ class FramePixels:
         return self.buffer[3 * self.capacity :][: 3 * self.count].view(torch.float32).view(-1, 3)
 
     @cached_property
-    def lattice(self) -> torch.Tensor:
-        """float16 [h, w] depth (m) at every `LATTICE_STEP_PX`-th pixel, 0 where invalid, for co-visibility; a view."""
-        rows, columns = self.lattice_shape
+    def depth_thumbnail(self) -> torch.Tensor:
+        """float16 [h, w] depth (m) at every `THUMBNAIL_STEP_PX`-th pixel, 0 where invalid, for co-visibility; a view."""
+        rows, columns = self.thumbnail_shape
         return self.buffer[6 * self.capacity :].view(torch.float16)[: rows * columns].view(rows, columns)
 
     @cached_property
     def view(self) -> torch.Tensor:
         """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown, for tracking; a view."""
-        rows, columns = self.view_shape
+        rows, columns = self.depth_image_shape
         words = self.buffer[len(self.buffer) - -(-rows * columns // 2) :]
         return words.view(torch.uint16)[: rows * columns].view(rows, columns)
 
@@ -80,7 +80,7 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
     """Draws `pixels.per_frame` pixels with valid depth, with replacement, and finds their normals.
 
     Args:
-        frame: colour and depth; `frame.index` keys the draw.
+        frame: color and depth; `frame.index` keys the draw.
         camera: pinhole intrinsics of the frame.
         config: sections `dataset` (depth range), `pixels` and `prior` (normals).
     """
@@ -98,7 +98,7 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
         frame.index,
     )
     size = frame.depth.shape
-    shapes = sampling.lattice_shape(*size), sampling.view_shape(*size)
+    shapes = sampling.thumbnail_shape(*size), sampling.depth_image_shape(*size)
     return FramePixels(buffer, sampling.count, *shapes, num_valid / frame.depth.size)
 
 
@@ -106,7 +106,7 @@ def blank_pixels(camera: Camera, config: Config) -> FramePixels:
     """What `sample_frame` makes of a frame without depth."""
     sampling = _sampling(camera, config)
     size = camera.height, camera.width
-    shapes = sampling.lattice_shape(*size), sampling.view_shape(*size)
+    shapes = sampling.thumbnail_shape(*size), sampling.depth_image_shape(*size)
     words = 6 * sampling.count + sum(-(-rows * columns // 2) for rows, columns in shapes)
     return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, *shapes, 0.0)
 
@@ -118,9 +118,9 @@ def _sampling(camera: Camera, config: Config) -> ops.PixelSampling:
         max_depth=config.dataset.max_depth_m,
         step_px=config.prior.normal_step_px,
         max_jump=config.prior.max_jump,
-        lattice_step=LATTICE_STEP_PX,
-        view_step=view_step(camera) if config.tracking.depth_views else 0,
-        view_unit=config.dataset.max_depth_m / UNITS,
+        thumbnail_step=THUMBNAIL_STEP_PX,
+        depth_image_step=depth_image_step(camera) if config.tracking.depth_keyframes else 0,
+        depth_image_unit=config.dataset.max_depth_m / UNITS,
     )
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
+from spslam.slam.device_events import DeviceEvent
 from spslam.slam.pixels import FramePixels, sample_frame
-from spslam.slam.timeline import Mark
 from spslam.slam.upload import Upload, Uploader
 
 
@@ -28,7 +28,7 @@ class PreparedFrame:
     pixels: FramePixels | Upload
     decode_ms: float = 0.0
     wait_ms: float = 0.0
-    asked: Mark | None = None
+    asked: DeviceEvent | None = None
 
 
 class FramePreparation:

@@ -1,4 +1,4 @@
-"""What a mapped frame looked like, small and grey, for tracking to compare colours with."""
+"""What a mapped frame looked like, small and gray, for tracking to compare colors with."""
 
 import torch
 
@@ -43,7 +43,7 @@ def _depth_steps(records: torch.Tensor, camera: Camera) -> torch.Tensor:
     return (unpack_points(records, camera)[:, 2] / DEPTH_STEP_M).round().int()
 
 
-class ReferenceKeeper:
+class ReferenceCache:
     """The reference of the last mapped frame, made when first asked for.
 
     Args:

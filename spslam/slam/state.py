@@ -12,9 +12,9 @@ from spslam.config import Config
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import resize_rows
-from spslam.slam.depth_views import DepthViewStore
+from spslam.slam.depth_keyframes import DepthKeyframeStore
 from spslam.slam.pixel_database import PixelDatabase
-from spslam.slam.pixels import LATTICE_STEP_PX
+from spslam.slam.pixels import THUMBNAIL_STEP_PX
 
 _FIRST_CAPACITY = 64
 
@@ -28,17 +28,17 @@ class FrameTable:
 
     def __init__(self, camera: Camera, device: torch.device | str = "cpu"):
         """A table without rows for images of that camera."""
-        offset = LATTICE_STEP_PX // 2
-        rows = len(range(offset, camera.height, LATTICE_STEP_PX))
-        columns = len(range(offset, camera.width, LATTICE_STEP_PX))
+        offset = THUMBNAIL_STEP_PX // 2
+        rows = len(range(offset, camera.height, THUMBNAIL_STEP_PX))
+        columns = len(range(offset, camera.width, THUMBNAIL_STEP_PX))
         self._count = 0
         self._columns = {
             "poses": torch.zeros(0, 7, device=device),
             "timestamps": torch.zeros(0, dtype=torch.float64),
             "indices": torch.zeros(0, dtype=torch.int64),
             "lost": torch.zeros(0, dtype=torch.bool),
-            "agreeing": torch.zeros(0, dtype=torch.int64),
-            "lattices": torch.zeros(0, rows, columns, dtype=torch.float16, device=device),
+            "consistent_frames": torch.zeros(0, dtype=torch.int64),
+            "depth_thumbnails": torch.zeros(0, rows, columns, dtype=torch.float16, device=device),
         }
 
     @property
@@ -62,17 +62,23 @@ class FrameTable:
         return self._columns["lost"][: self._count]
 
     @property
-    def agreeing(self) -> torch.Tensor:
+    def consistent_frames(self) -> torch.Tensor:
         """int64 [F] how many lost frames up to this one had a pose that is likely, and agree with one another."""
-        return self._columns["agreeing"][: self._count]
+        return self._columns["consistent_frames"][: self._count]
 
     @property
-    def lattices(self) -> torch.Tensor:
+    def depth_thumbnails(self) -> torch.Tensor:
         """float16 [F, h, w] coarse depth (m), on the device."""
-        return self._columns["lattices"][: self._count]
+        return self._columns["depth_thumbnails"][: self._count]
 
     def append(
-        self, pose: torch.Tensor, timestamp: float, index: int, lost: bool, lattice: torch.Tensor, agreeing: int = 0
+        self,
+        pose: torch.Tensor,
+        timestamp: float,
+        index: int,
+        lost: bool,
+        depth_thumbnail: torch.Tensor,
+        consistent_frames: int = 0,
     ) -> None:
         """Adds a row."""
         if self._count == len(self._columns["poses"]):
@@ -83,8 +89,8 @@ class FrameTable:
             "timestamps": timestamp,
             "indices": index,
             "lost": lost,
-            "agreeing": agreeing,
-            "lattices": lattice,
+            "consistent_frames": consistent_frames,
+            "depth_thumbnails": depth_thumbnail,
         }
         for name, value in values.items():
             self._columns[name][self._count] = value
@@ -134,7 +140,7 @@ class Moments:
         return cls(first, second, ops.new_gradient_sums(first), stamps)
 
     def fit(self, rows: int) -> None:
-        """Appends zero rows up to `rows`, with spare capacity so that growth is amortised."""
+        """Appends zero rows up to `rows`, with spare capacity so that growth is amortized."""
         if rows <= len(self.stamps):
             return
         capacity = max(rows, len(self.stamps) * 3 // 2)
@@ -172,16 +178,16 @@ class SlamState:
         frames: poses and bookkeeping of every frame.
         pixels: pixel records of every frame.
         views: depth images of some earlier frames; None where tracking does not use them.
-        moments: optimiser state by parameter name.
+        moments: optimizer state by parameter name.
         steps: Adam steps since the moments were last reset.
         stamp: number of mapping iterations ever done; marks rows touched by the current one.
-        unmapped: whether frames came since the map was last optimised.
+        unmapped: whether frames came since the map was last optimized.
     """
 
     scene: Scene
     frames: FrameTable
     pixels: PixelDatabase
-    views: DepthViewStore | None = None
+    views: DepthKeyframeStore | None = None
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
     stamp: int = 0
@@ -214,7 +220,11 @@ class SlamState:
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
         pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device, config.pixels.keyframe_every)
         tracking, depth_m = config.tracking, config.dataset.max_depth_m
-        views = DepthViewStore(camera, depth_m, tracking.view_kernel_m, device) if tracking.depth_views else None
+        views = (
+            DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
+            if tracking.depth_keyframes
+            else None
+        )
         return cls(scene, FrameTable(camera, device), pixels, views)
 
 

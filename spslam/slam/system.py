@@ -10,20 +10,20 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
 from spslam.prior import load_prior
-from spslam.slam.frame_report import FrameMarks, FrameReport, PendingReport
-from spslam.slam.loss_decision import Fit
+from spslam.slam.device_events import marker
+from spslam.slam.frame_history import FrameHistory
+from spslam.slam.frame_report import FrameEvents, FrameReport, PendingReport
 from spslam.slam.mapper import Mapper
-from spslam.slam.past import Past
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.recovery.pose_confidence import Fit
 from spslam.slam.state import SlamState, pose_tensor
-from spslam.slam.timeline import marker
 from spslam.slam.tracker import Tracker, TrackingResult
 from spslam.slam.upload import Upload
 from spslam.trajectory import Trajectory
 
 SETTLED_FRAMES = 3  # known one after another, before what follows a loss is trusted with the map
-MAX_DISTANCE_M = 10_000.0  # a float32 still tells a millimetre there
+MAX_DISTANCE_M = 10_000.0  # a float32 still tells a millimeter there
 
 
 class SlamSystem:
@@ -61,7 +61,7 @@ class SlamSystem:
         self.first_pose = np.eye(4) if first_pose is None else np.asarray(first_pose, np.float64)
         _check_first_pose(self.first_pose)
         self.state = SlamState.start(config, camera, self.first_pose, decoder, self.device)
-        self.past = Past(self.state, camera)
+        self.history = FrameHistory(self.state, camera)
         self.tracker = Tracker(config, camera)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
 
@@ -69,7 +69,7 @@ class SlamSystem:
         """Takes the next frame in, and waits until the device is done with it.
 
         Args:
-            frame: colour, depth, timestamp.
+            frame: color, depth, timestamp.
 
         Raises:
             SpslamError: the map or the pixels would pass a limit of the configuration. The frame has then been taken
@@ -82,12 +82,12 @@ class SlamSystem:
         """Takes the next frame in as `process` does, but waits only for its pose: mapping goes on behind."""
         self._mark = marker(self.device)
         began = self._mark()
-        marks = FrameMarks(asked=frame.asked or began, began=began, done=began)
+        marks = FrameEvents(asked=frame.asked or began, began=began, done=began)
         pixels = self._receive(frame, marks)
         number = len(self.state.frames)
         tracked = self._track(pixels, number, marks)
         self.state.frames.append(
-            tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.lattice, tracked.agreeing
+            tracked.pose, frame.timestamp, frame.index, tracked.lost, pixels.depth_thumbnail, tracked.consistent_frames
         )
         obstructed = tracked.fit.is_obstructed
         # What is before the lens is no part of the scene: neither mapped now nor drawn from later.
@@ -104,21 +104,21 @@ class SlamSystem:
             "index": frame.index,
             "timestamp": frame.timestamp,
             "lost": bool(self.state.frames.lost[-1]),
-            "valid_depth": pixels.valid_share,
+            "valid_depth_share": pixels.valid_depth_share,
             "tracking_iterations": tracked.iterations,
             "residual_cm": _known(tracked.fit.residual_cm),
-            "inliers": _known(tracked.fit.inlier_share),
-            "support": _known(tracked.fit.support),
-            "information": _known(tracked.fit.information),
-            "jump_cm": _known(tracked.fit.jump_cm),
-            "jump_deg": _known(tracked.fit.jump_deg),
-            "conflict": _known(tracked.fit.conflict),
-            "hidden": _known(tracked.fit.hidden),
-            "coverage": _known(tracked.fit.coverage),
-            "likeness": _known(tracked.fit.likeness),
-            "doubt": _known(tracked.fit.doubt),
-            "rescued": tracked.rescued,
-            "relocalised": tracked.relocalised,
+            "inlier_share": _known(tracked.fit.inlier_share),
+            "mean_robust_weight": _known(tracked.fit.mean_robust_weight),
+            "min_eigenvalue": _known(tracked.fit.min_eigenvalue),
+            "prediction_error_cm": _known(tracked.fit.prediction_error_cm),
+            "prediction_error_deg": _known(tracked.fit.prediction_error_deg),
+            "free_space_violation": _known(tracked.fit.free_space_violation),
+            "occluded_share": _known(tracked.fit.occluded_share),
+            "map_coverage": _known(tracked.fit.map_coverage),
+            "brightness_correlation": _known(tracked.fit.brightness_correlation),
+            "error_probability": _known(tracked.fit.error_probability),
+            "recovered": tracked.recovered,
+            "relocalized": tracked.relocalized,
             "mapping_iterations": iterations,
             "voxels": self.state.scene.volume.num_voxels,
             "decode_ms": frame.decode_ms,
@@ -126,7 +126,7 @@ class SlamSystem:
         return PendingReport(known, marks, frame.wait_ms, loss)
 
     def finish(self) -> None:
-        """Optimises once more if frames came after the last mapping call. Call it after the last frame."""
+        """Optimizes once more if frames came after the last mapping call. Call it after the last frame."""
         if self.state.unmapped:
             self.mapper.optimize(self.state, self.config.mapping.iterations)
             self.state.unmapped = False
@@ -136,35 +136,37 @@ class SlamSystem:
         frames = self.state.frames
         return Trajectory(frames.timestamps.numpy().copy(), frames.matrices(), frames.lost.numpy().copy())
 
-    def _receive(self, frame: PreparedFrame, marks: FrameMarks) -> FramePixels:
+    def _receive(self, frame: PreparedFrame, marks: FrameEvents) -> FramePixels:
         if not isinstance(frame.pixels, Upload):
             return frame.pixels.to(self.device)
         marks.upload = (frame.pixels.begin, frame.pixels.end)
         return frame.pixels.received()
 
-    def _track(self, pixels: FramePixels, number: int, marks: FrameMarks) -> TrackingResult:
+    def _track(self, pixels: FramePixels, number: int, marks: FrameEvents) -> TrackingResult:
         if self.state.scene.volume.num_voxels == 0:
             pose = pose_tensor(self.first_pose, self.device)
-            return TrackingResult(pose, 0, Fit(), lost=self.tracker.is_blind(pixels))
+            return TrackingResult(pose, 0, Fit(), lost=self.tracker.has_too_little_depth(pixels))
         begin = self._mark()
         start = self.tracker.predict(self.state.frames)
-        tracked = self.tracker.track(self.state.scene, pixels, start, number, self.past, self._is_turn(number))
+        tracked = self.tracker.track(
+            self.state.scene, pixels, start, number, self.history, self._is_mapping_turn(number)
+        )
         marks.tracking = (begin, self._mark())
         return tracked
 
-    def _is_turn(self, number: int) -> bool:
+    def _is_mapping_turn(self, number: int) -> bool:
         return number % self.config.mapping.every == 0
 
     def _is_mapping_frame(self, number: int) -> bool:
         """Whether the newest frame is to be mapped: a lost one never, one soon after loss not yet."""
         if self.state.scene.volume.num_voxels == 0:
             return not bool(self.state.frames.lost[-1])
-        if not self._is_turn(number):
+        if not self._is_mapping_turn(number):
             return False
         return not bool(self.state.frames.lost[-SETTLED_FRAMES:].any())
 
-    def _map(self, pixels: FramePixels, marks: FrameMarks) -> tuple[int, torch.Tensor | None]:
-        """Encodes and optimises; returns the number of iterations and the last one's losses."""
+    def _map(self, pixels: FramePixels, marks: FrameEvents) -> tuple[int, torch.Tensor | None]:
+        """Encodes and optimizes; returns the number of iterations and the last one's losses."""
         first, begin = self.state.scene.volume.num_voxels == 0, self._mark()
         self.mapper.integrate(self.state, pixels)
         marks.encode = (begin, self._mark())

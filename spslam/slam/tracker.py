@@ -9,14 +9,14 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
-from spslam.slam.loss_decision import JUDGING_KERNEL_M, Fit, information, jump
-from spslam.slam.optimization import render_options
-from spslam.slam.past import Past
+from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
-from spslam.slam.reference_image import ReferenceKeeper
-from spslam.slam.rescue import IcpAlignment
+from spslam.slam.recovery.icp_alignment import IcpAlignment
+from spslam.slam.recovery.pose_confidence import SCORE_KERNEL_M, Fit, min_eigenvalue, prediction_error
+from spslam.slam.recovery.verifier import Verifier
+from spslam.slam.reference_image import ReferenceCache
+from spslam.slam.render_options import render_options
 from spslam.slam.state import FrameTable
-from spslam.slam.verifier import Verifier
 
 AGREEING = 4  # frames in a row whose likely poses agree are found
 AGREE_CM, AGREE_DEG = 5.0, 4.0  # from one frame to the next
@@ -37,18 +37,18 @@ class TrackingResult:
         iterations: how many were made.
         fit: of the pose found, also where it is not taken.
         lost: whether the pose is not to be trusted.
-        rescued: whether the pose comes from a start that ICP found.
-        relocalised: whether that start was another frame than the last.
-        agreeing: how many lost frames up to this one had likely poses that agree; `pose` is the last of them.
+        recovered: whether the pose comes from a start that ICP found.
+        relocalized: whether that start was another frame than the last.
+        consistent_frames: how many lost frames up to this one had likely poses that agree; `pose` is the last of them.
     """
 
     pose: torch.Tensor
     iterations: int
     fit: Fit
     lost: bool
-    rescued: bool = False
-    relocalised: bool = False
-    agreeing: int = 0
+    recovered: bool = False
+    relocalized: bool = False
+    consistent_frames: int = 0
 
 
 class Tracker:
@@ -61,10 +61,10 @@ class Tracker:
         self._graph = ops.LaunchGraph()
         self._verifier = Verifier(config, camera)
         weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
-        self._references = ReferenceKeeper(camera, weight_m, kernel) if weight_m > 0 else None
+        self._references = ReferenceCache(camera, weight_m, kernel) if weight_m > 0 else None
         self._reference: ops.ReferenceImage | None = None
-        self._views: ops.DepthViews | None = None
-        self._views_from_the_start = False
+        self._views: ops.DepthKeyframes | None = None
+        self._keyframes_from_the_start = False
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """Constant-speed prediction of the next pose, float32 [7]; the last pose after one frame only, or loss."""
@@ -78,51 +78,51 @@ class Tracker:
         pixels: FramePixels,
         start: torch.Tensor,
         frame: int,
-        past: Past | None = None,
+        history: FrameHistory | None = None,
         to_be_mapped: bool = False,
     ) -> TrackingResult:
-        """Optimises the pose from `start`; where that is doubtful, tries again from where ICP leads.
+        """Optimizes the pose from `start`; where that is doubtful, tries again from where ICP leads.
 
         Args:
             scene: the map, not changed.
             pixels: of the frame.
             start: float32 [7] where the motion model puts the camera.
             frame: number of the frame, keys the random draws.
-            past: the frames before; without it there is no second try.
+            history: the frames before; without it there is no second try.
             to_be_mapped: whether the frame is to be mapped if its pose is good.
 
         Returns:
             The best supported pose. Where the frame is lost, a likely one, or else `start`.
         """
-        if self.is_blind(pixels):
+        if self.has_too_little_depth(pixels):
             return TrackingResult(start.clone(), 0, Fit(), lost=True)
-        self._reference = self._mapped_view(past)
-        self._views = past.depth_views() if past else None
-        self._views_from_the_start = pixels.valid_share < LITTLE_DEPTH
+        self._reference = self._reference_image(history)
+        self._views = history.depth_keyframes() if history else None
+        self._keyframes_from_the_start = pixels.valid_depth_share < LITTLE_DEPTH
         adam = self.config.tracking.optimizer == "adam"
         find = self._track_adam if adam else self._track_gauss_newton
         result = find(scene, pixels.records, start, frame, self._iterations(frame))
-        if past is not None and (past.is_lost or self._is_doubtful(result)):
-            result = self._look_again(scene, pixels, start, frame, past, result)
-        elif past is not None and to_be_mapped and result.fit.support < MAPPED_SUPPORT:
-            result = self._verified(scene, IcpAlignment(pixels, self.camera), past, result)
-        if result.lost and not result.agreeing:
+        if history is not None and (history.is_lost or self._is_doubtful(result)):
+            result = self._look_again(scene, pixels, start, frame, history, result)
+        elif history is not None and to_be_mapped and result.fit.mean_robust_weight < MAPPED_SUPPORT:
+            result = self._verified(scene, IcpAlignment(pixels, self.camera), history, result)
+        if result.lost and not result.consistent_frames:
             # A start from lost frames was no more than likely.
-            known = past.last() if past is not None and past.agreeing else None
+            known = history.last() if history is not None and history.consistent_frames else None
             result = replace(result, pose=(start if known is None else known.pose).clone())
         return result
 
-    def _mapped_view(self, past: Past | None) -> ops.ReferenceImage | None:
-        """What the last mapped frame looked like, where colours are to be compared."""
-        mapped = past.mapped(self.config.mapping.every) if self._references and past else None
+    def _reference_image(self, history: FrameHistory | None) -> ops.ReferenceImage | None:
+        """What the last mapped frame looked like, where colors are to be compared."""
+        mapped = history.mapped(self.config.mapping.every) if self._references and history else None
         if mapped is None or self._references is None:
             return None
         row, frame = mapped
         return self._references.of(row, frame.records, frame.pose)
 
-    def is_blind(self, pixels: FramePixels) -> bool:
+    def has_too_little_depth(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to tell a pose from."""
-        return len(pixels.records) == 0 or pixels.valid_share < self.config.tracking.min_valid_share
+        return len(pixels.records) == 0 or pixels.valid_depth_share < self.config.tracking.min_valid_depth_share
 
     def _iterations(self, frame: int) -> int:
         tracking = self.config.tracking
@@ -175,45 +175,49 @@ class Tracker:
             truncation=scene.settings.truncation_m,
             kernel_start=kernel_start_m,
             kernel_end=tracking.kernel_end_m,
-            kernel_judge=JUDGING_KERNEL_M,
+            score_kernel=SCORE_KERNEL_M,
             damping=tracking.damping,
             seed=self.config.seed,
             stream=ops.Stream.TRACKING_PIXELS,
             frame=frame,
-            noise_depth=tracking.noise_depth_m,
+            noise_crossover_depth=tracking.noise_crossover_depth_m,
             reference=self._reference,
-            views=self._views_of(iterations),
+            views=self._keyframes_of(iterations),
         )
         # The frame's one wait for the device.
         numbers = torch.cat([expected, pose, stats[-1], hessian.view(-1)]).tolist()
-        cost, inlier_share, _, _, support = numbers[14:19]
+        cost, inlier_share, _, _, mean_robust_weight = numbers[14:19]
         fit = Fit(
             100 * math.sqrt(max(cost, 0.0)),
             inlier_share,
-            support,
-            information(numbers[19:], tracking.pixels),
-            *jump(numbers[:7], numbers[7:14]),
+            mean_robust_weight,
+            min_eigenvalue(numbers[19:], tracking.pixels),
+            *prediction_error(numbers[:7], numbers[7:14]),
         )
         return TrackingResult(pose, iterations, fit, self._is_lost(fit))
 
-    def _views_of(self, iterations: int) -> ops.DepthViews | None:
+    def _keyframes_of(self, iterations: int) -> ops.DepthKeyframes | None:
         """The views, which join in the second half: the map alone brings a pose from farther away.
 
         A strip of depth would slide along the map before that, so there they hold the pose from the start.
         """
-        if self._views is None or self._views_from_the_start:
+        if self._views is None or self._keyframes_from_the_start:
             return self._views
         return self._views._replace(first_iteration=iterations // 2)
 
     def _is_lost(self, fit: Fit) -> bool:
         """Whether the pose is to be given up; one of NaN has no inliers."""
         tracking = self.config.tracking
-        return not (fit.inlier_share >= tracking.min_inlier_share and fit.doubt <= tracking.lost_above)
+        return not (fit.inlier_share >= tracking.min_inlier_share and fit.error_probability <= tracking.lost_threshold)
 
     def _is_doubtful(self, result: TrackingResult) -> bool:
         """Whether so little speaks for the pose that it may be a wrong one."""
         tracking = self.config.tracking
-        return result.lost or result.fit.doubt > tracking.doubtful_above or result.fit.support < tracking.rescue_below
+        return (
+            result.lost
+            or result.fit.error_probability > tracking.verify_threshold
+            or result.fit.mean_robust_weight < tracking.recovery_min_robust_weight
+        )
 
     def _look_again(
         self,
@@ -221,7 +225,7 @@ class Tracker:
         pixels: FramePixels,
         start: torch.Tensor,
         frame: int,
-        past: Past,
+        history: FrameHistory,
         first: TrackingResult,
     ) -> TrackingResult:
         """The best supported of the first result and those that ICP leads to, held against what other frames saw.
@@ -229,19 +233,19 @@ class Tracker:
         It begins at the last trusted frame, and where that is no good at the stored frames that look most alike.
         """
         tracking, alignment, best = self.config.tracking, IcpAlignment(pixels, self.camera), first
-        last = past.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
+        last = history.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
         starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
         best = self._best(scene, pixels, starts, start, frame, best)
         # After lost frames whose poses agree, the way to where the camera was is not that from the start.
-        if past.frames_lost <= SHORT_LOSS and not past.agreeing:
-            best = self._verified(scene, alignment, past, best, pixels.records)
+        if history.consecutive_lost_frames <= SHORT_LOSS and not history.consistent_frames:
+            best = self._verified(scene, alignment, history, best, pixels.records)
             if not best.lost:
                 return best
-        alike = past.similar(pixels, tracking.relocalise_frames)
+        alike = history.similar(pixels, tracking.relocalization_candidates)
         starts = [alignment.pose(other.frame, other.start) for other in alike]
         found = self._best(scene, pixels, starts, start, frame, best)
-        found = self._found_again(self._verified(scene, alignment, past, found, pixels.records), past)
-        return replace(found, relocalised=found.pose is not best.pose and not found.lost)
+        found = self._found_again(self._verified(scene, alignment, history, found, pixels.records), history)
+        return replace(found, relocalized=found.pose is not best.pose and not found.lost)
 
     def _best(
         self,
@@ -258,35 +262,35 @@ class Tracker:
         for guess in starts:
             again = self._fitted(scene, pixels.records, expected, guess, frame, tracking.iterations, kernel_m)
             iterations += again.iterations
-            if again.fit.support > best.fit.support + RESCUE_GAIN:
-                best = replace(again, rescued=True)
+            if again.fit.mean_robust_weight > best.fit.mean_robust_weight + RESCUE_GAIN:
+                best = replace(again, recovered=True)
         return replace(best, iterations=iterations)
 
     def _verified(
         self,
         scene: Scene,
         alignment: IcpAlignment,
-        past: Past,
+        history: FrameHistory,
         result: TrackingResult,
         records: torch.Tensor | None = None,
     ) -> TrackingResult:
-        """The result, judged anew with what else is known; by its colours too where its pixel records are given."""
-        fit = self._verifier.verified(result.fit, result.pose, scene, alignment, past, records)
+        """The result, judged anew with what else is known; by its colors too where its pixel records are given."""
+        fit = self._verifier.verified(result.fit, result.pose, scene, alignment, history, records)
         return replace(result, fit=fit, lost=self._is_lost(fit))
 
-    def _found_again(self, result: TrackingResult, past: Past) -> TrackingResult:
+    def _found_again(self, result: TrackingResult, history: FrameHistory) -> TrackingResult:
         """The result, judged as that of a camera that may be anywhere: of all places some are always alike.
 
         The motion model has no say in the doubt, and there must be next to none; or little, in some frames one after
         another whose poses agree.
         """
         tracking = self.config.tracking
-        agrees = result.fit.jump_cm < AGREE_CM and result.fit.jump_deg < AGREE_DEG
-        fit = replace(result.fit, jump_cm=math.nan, jump_deg=math.nan)
-        if fit.doubt <= tracking.relocalise_below and not self._is_lost(fit):
-            return replace(result, fit=fit, lost=False, agreeing=0)
-        likely = fit.doubt <= AGREEING_DOUBT and fit.information >= AGREEING_INFORMATION
-        agreeing = int(likely and not self._is_lost(fit)) * (1 + past.agreeing * int(agrees))
-        if agreeing >= AGREEING:
-            return replace(result, fit=fit, lost=False, agreeing=0)
-        return replace(result, fit=fit, lost=True, agreeing=agreeing)
+        agrees = result.fit.prediction_error_cm < AGREE_CM and result.fit.prediction_error_deg < AGREE_DEG
+        fit = replace(result.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
+        if fit.error_probability <= tracking.relocalization_threshold and not self._is_lost(fit):
+            return replace(result, fit=fit, lost=False, consistent_frames=0)
+        likely = fit.error_probability <= AGREEING_DOUBT and fit.min_eigenvalue >= AGREEING_INFORMATION
+        consistent_frames = int(likely and not self._is_lost(fit)) * (1 + history.consistent_frames * int(agrees))
+        if consistent_frames >= AGREEING:
+            return replace(result, fit=fit, lost=False, consistent_frames=0)
+        return replace(result, fit=fit, lost=True, consistent_frames=consistent_frames)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
+from spslam.slam.device_events import StreamEvent
 from spslam.slam.pixels import FramePixels
-from spslam.slam.timeline import StreamMark
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Upload:
 
     pixels: FramePixels
     source: FramePixels
-    begin: StreamMark
-    end: StreamMark
+    begin: StreamEvent
+    end: StreamEvent
 
     def received(self) -> FramePixels:
         """The pixels, for work that is given to the current stream from now on; the host waits for nothing."""
@@ -48,9 +48,9 @@ class Uploader:
         stream = self._stream()
         with torch.cuda.stream(stream):
             buffer = torch.empty(len(source.buffer), dtype=torch.int32, device=self.device)
-            begin = StreamMark(stream)
+            begin = StreamEvent(stream)
             buffer.copy_(source.buffer, non_blocking=True)
-            return Upload(pixels.holding(buffer), source, begin, StreamMark(stream))
+            return Upload(pixels.holding(buffer), source, begin, StreamEvent(stream))
 
     def _stream(self) -> torch.cuda.Stream:
         if not hasattr(self._own, "stream"):

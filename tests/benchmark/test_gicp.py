@@ -12,7 +12,7 @@ from tests.system.sequences import Recorded
 
 FRAMES = 12
 VOXEL_M = 0.04
-# Measured: 0.01 cm. Flat walls at this image size leave a millimetre.
+# Measured: 0.01 cm. Flat walls at this image size leave a millimeter.
 ATE_CM = 0.1
 
 pytest.importorskip("small_gicp")

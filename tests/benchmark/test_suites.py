@@ -59,9 +59,9 @@ def test_nothing_is_published_about_other_suites():
 
 
 def test_a_suite_is_narrowed():
-    suite = load_suite("quick", ["fast"], ["room", "grey"], None, "0:5", 3, baseline=False)
+    suite = load_suite("quick", ["fast"], ["room", "gray"], None, "0:5", 3, baseline=False)
     (study,) = suite.studies
-    assert [sequence.name for sequence in study.sequences] == ["room", "grey"]
+    assert [sequence.name for sequence in study.sequences] == ["room", "gray"]
     assert {sequence.frames for sequence in study.sequences} == {"0:5"}
     assert [variant.preset for variant in study.variants] == ["fast"]
     assert suite.seeds == 3

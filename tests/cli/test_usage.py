@@ -53,7 +53,7 @@ def test_version(tmp_path):
         (["run", "7scenes", "--resume"], "--resume needs the interrupted run's folder as --output"),
         (["run", "demo", "--data", "."], "--data has no meaning here"),
         (["demo", "--frames", "0"], "--frames: must be a whole number of at least 1, got '0'"),
-        (["mesh", "x", "--resolution", "-1"], "--resolution: must be a length in metres above 0, got '-1'"),
+        (["mesh", "x", "--resolution", "-1"], "--resolution: must be a length in meters above 0, got '-1'"),
         (["mesh", "x", "--format", "stl"], "--format: invalid choice: 'stl'"),
     ],
 )

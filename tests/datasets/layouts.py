@@ -26,7 +26,7 @@ def color_image(index: int) -> np.ndarray:
     return image
 
 
-def depth_metres(index: int) -> np.ndarray:
+def depth_meters(index: int) -> np.ndarray:
     rows = np.linspace(1, 2, HEIGHT)[:, None] + np.linspace(0, 0.5, WIDTH) + 0.01 * index
     return np.round(rows, 3)
 
@@ -41,9 +41,9 @@ def write_color(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 
 
-def write_depth(path: Path, metres: np.ndarray, units_per_metre: float = 1000.0) -> None:
+def write_depth(path: Path, meters: np.ndarray, units_per_meter: float = 1000.0) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.round(metres * units_per_metre).astype(np.uint16))
+    assert cv2.imwrite(str(path), np.round(meters * units_per_meter).astype(np.uint16))
 
 
 def matrix_text(matrix: np.ndarray) -> str:
@@ -55,7 +55,7 @@ def write_seven_scenes(scene: Path, count: int = 4, sequences: tuple[str, ...] =
         for i, pose in enumerate(poses(count)):
             stem = scene / name / f"frame-{i:06d}"
             write_color(Path(f"{stem}.color.png"), color_image(i))
-            write_depth(Path(f"{stem}.depth.png"), depth_metres(i))
+            write_depth(Path(f"{stem}.depth.png"), depth_meters(i))
             Path(f"{stem}.pose.txt").write_text(matrix_text(pose))
     (scene / "camera-intrinsics.txt").write_text(matrix_text(CAMERA_MATRIX))
     return scene
@@ -65,8 +65,8 @@ def write_synthetic_rgbd(scene: Path, count: int = 12) -> Path:
     flip = np.diag([1, -1, -1, 1])
     for i in range(count):
         write_color(scene / "images" / f"img{i}.png", color_image(i))
-        write_depth(scene / "depth" / f"depth{i}.png", depth_metres(i))
-        write_depth(scene / "depth_filtered" / f"depth{i}.png", depth_metres(i) + 0.1)
+        write_depth(scene / "depth" / f"depth{i}.png", depth_meters(i))
+        write_depth(scene / "depth_filtered" / f"depth{i}.png", depth_meters(i) + 0.1)
     (scene / "poses.txt").write_text("".join(matrix_text(pose @ flip) for pose in poses(count)))
     (scene / "focal.txt").write_text("30.0\n")
     return scene
@@ -75,7 +75,7 @@ def write_synthetic_rgbd(scene: Path, count: int = 12) -> Path:
 def write_replica(scene: Path, count: int = 3) -> Path:
     for i in range(count):
         write_color(scene / "results" / f"frame{i:06d}.jpg", color_image(i))
-        write_depth(scene / "results" / f"depth{i:06d}.png", depth_metres(i), 6553.5)
+        write_depth(scene / "results" / f"depth{i:06d}.png", depth_meters(i), 6553.5)
     lines = (" ".join(f"{value:.9e}" for value in pose.ravel()) for pose in poses(count))
     (scene / "traj.txt").write_text("\n".join(lines) + "\n")
     camera = {"w": WIDTH, "h": HEIGHT, "fx": 30.0, "fy": 31.0, "cx": 15.5, "cy": 11.5, "scale": 6553.5}
@@ -89,17 +89,17 @@ def write_tum(folder: Path, count: int = 5, depth_delay: float = 0.004) -> Path:
     for i in range(count):
         time, depth_time = start + i / 30, start + i / 30 + depth_delay
         write_color(folder / "rgb" / f"{time:.6f}.png", color_image(i))
-        write_depth(folder / "depth" / f"{depth_time:.6f}.png", depth_metres(i), 5000.0)
+        write_depth(folder / "depth" / f"{depth_time:.6f}.png", depth_meters(i), 5000.0)
         rgb.append(f"{time:.6f} rgb/{time:.6f}.png")
         depth.append(f"{depth_time:.6f} depth/{depth_time:.6f}.png")
     (folder / "rgb.txt").write_text("\n".join(rgb) + "\n")
     (folder / "depth.txt").write_text("\n".join(depth) + "\n")
-    truth = ["# timestamp tx ty tz qx qy qz qw"]
+    ground_truth = ["# timestamp tx ty tz qx qy qz qw"]
     for i, pose in enumerate(poses(40)):
         w, x, y, z = matrix_to_quaternion(pose[:3, :3])
         numbers = [*pose[:3, 3], x, y, z, w]
-        truth.append(f"{start - 0.05 + 0.01 * i:.4f} " + " ".join(f"{value:.9f}" for value in numbers))
-    (folder / "groundtruth.txt").write_text("\n".join(truth) + "\n")
+        ground_truth.append(f"{start - 0.05 + 0.01 * i:.4f} " + " ".join(f"{value:.9f}" for value in numbers))
+    (folder / "groundtruth.txt").write_text("\n".join(ground_truth) + "\n")
     return folder
 
 
@@ -131,7 +131,7 @@ def sens_frame(pose: np.ndarray, time_us: int, color: bytes, depth: bytes) -> by
 
 
 def zipped_depth(index: int) -> bytes:
-    return zlib.compress(np.round(1000 * depth_metres(index)).astype("<u2").tobytes())
+    return zlib.compress(np.round(1000 * depth_meters(index)).astype("<u2").tobytes())
 
 
 def write_sens(path: Path, count: int = 4) -> Path:
@@ -146,10 +146,10 @@ def write_sens(path: Path, count: int = 4) -> Path:
 
 
 def write_scannet(scan: Path, count: int = 4) -> Path:
-    """The folders that ScanNet's exporter makes; colour is twice as large as depth."""
+    """The folders that ScanNet's exporter makes; color is twice as large as depth."""
     for i, pose in enumerate(poses(count)):
         write_color(scan / "color" / f"{i}.jpg", color_image(i).repeat(2, axis=0).repeat(2, axis=1))
-        write_depth(scan / "depth" / f"{i}.png", depth_metres(i))
+        write_depth(scan / "depth" / f"{i}.png", depth_meters(i))
         (scan / "pose").mkdir(exist_ok=True)
         (scan / "pose" / f"{i}.txt").write_text(matrix_text(pose))
     (scan / "intrinsic").mkdir()
@@ -161,10 +161,10 @@ def write_scannet(scan: Path, count: int = 4) -> Path:
     return scan
 
 
-def write_folder(folder: Path, count: int = 3, units_per_metre: float = 1000.0) -> Path:
+def write_folder(folder: Path, count: int = 3, units_per_meter: float = 1000.0) -> Path:
     for i in range(count):
         write_color(folder / "color" / f"{i}.jpg", color_image(i))
-        write_depth(folder / "depth" / f"{i}.png", depth_metres(i), units_per_metre)
+        write_depth(folder / "depth" / f"{i}.png", depth_meters(i), units_per_meter)
     (folder / "intrinsics.txt").write_text(matrix_text(CAMERA_MATRIX))
     return folder
 

@@ -7,7 +7,7 @@ from spslam.errors import DatasetError
 
 
 class Ramp(RgbdDataset):
-    """Ten frames whose depth is their number in metres."""
+    """Ten frames whose depth is their number in meters."""
 
     name = "ramp"
     camera = Camera(4, 3, 4, 4, 1.5, 1)
@@ -49,7 +49,7 @@ def test_sizes_are_checked():
     dataset = Ramp()
     dataset.read = lambda index: RgbdFrame(index, 0, np.zeros((3, 4, 3), np.uint8), np.zeros((2, 4), np.float32))
     with pytest.raises(
-        DatasetError, match="ramp, frame 1: depth must be as large as colour, got depth 4x2 and colour 4x3"
+        DatasetError, match="ramp, frame 1: depth must be as large as color, got depth 4x2 and color 4x3"
     ):
         dataset[1]
     dataset.read = lambda index: RgbdFrame(index, 0, np.zeros((2, 4, 3), np.uint8), np.zeros((2, 4), np.float32))

@@ -29,7 +29,7 @@ COUNT, BROKEN = 5, 2
 
 
 class Layout:
-    """Where a layout keeps the colour and depth image of the frame to break, and the poses."""
+    """Where a layout keeps the color and depth image of the frame to break, and the poses."""
 
     def __init__(self, folder, kind):
         self.kind, self.folder = kind, WRITERS[kind](folder / "data", count=COUNT)

@@ -12,7 +12,7 @@ from tests.datasets.layouts import (
     CAMERA_MATRIX,
     HEIGHT,
     WIDTH,
-    depth_metres,
+    depth_meters,
     matrix_text,
     poses,
     write_depth,
@@ -29,13 +29,13 @@ def test_a_recording(tmp_path):
     assert dataset.poses() is None
     assert len(dataset) == 12
     frame = dataset[10]  # 10.png sorts before 2.png by name
-    np.testing.assert_allclose(frame.depth, depth_metres(10), atol=1e-6)
+    np.testing.assert_allclose(frame.depth, depth_meters(10), atol=1e-6)
     assert frame.pose is None
     np.testing.assert_allclose(dataset.timestamps(), np.arange(12) / 30)
 
 
 @pytest.mark.parametrize("name", ["rgb", "images"])
-def test_other_names_of_the_colour_folder(tmp_path, name):
+def test_other_names_of_the_color_folder(tmp_path, name):
     folder = write_folder(tmp_path)
     shutil.move(folder / "color", folder / name)
     assert len(open_folder(folder)) == 3
@@ -46,7 +46,7 @@ def test_pairing(tmp_path):
     (folder / "color" / ".hidden.jpg").touch()
     for i in range(3):
         (folder / "depth" / f"{i}.png").rename(folder / "depth" / f"{i}-d.png")
-    assert open_folder(folder)[2].depth[0, 0] == pytest.approx(depth_metres(2)[0, 0], abs=1e-6)
+    assert open_folder(folder)[2].depth[0, 0] == pytest.approx(depth_meters(2)[0, 0], abs=1e-6)
     (folder / "depth" / "2-d.png").unlink()
     with pytest.raises(DatasetError, match="must have the same names or be as many, got 3 and 2"):
         open_folder(folder)
@@ -100,7 +100,7 @@ def test_wrong_json(tmp_path, change, message):
 
 
 def test_depth_scale_comes_from_the_option_or_the_json(tmp_path):
-    folder = write_folder(tmp_path, units_per_metre=5000)
+    folder = write_folder(tmp_path, units_per_meter=5000)
     assert open_folder(folder, depth_scale=5000)[0].depth[0, 0] == pytest.approx(1, abs=1e-3)
     (folder / "intrinsics.txt").unlink()
     values = {"fx": 30, "fy": 31, "cx": 15.5, "cy": 11.5, "depth_scale": 5000}
@@ -132,11 +132,11 @@ def test_plausibility_skips_empty_and_broken_images(tmp_path):
         open_folder(folder, depth_scale=1.0)
 
 
-def test_floating_point_depth_is_in_metres(tmp_path):
+def test_floating_point_depth_is_in_meters(tmp_path):
     folder = write_folder(tmp_path, count=1)
     (folder / "depth" / "0.png").unlink()
-    cv2.imwrite(str(folder / "depth" / "0.tiff"), depth_metres(0).astype(np.float32))
-    np.testing.assert_allclose(open_folder(folder)[0].depth, depth_metres(0), atol=1e-6)
+    cv2.imwrite(str(folder / "depth" / "0.tiff"), depth_meters(0).astype(np.float32))
+    np.testing.assert_allclose(open_folder(folder)[0].depth, depth_meters(0), atol=1e-6)
 
 
 def test_poses_are_read_if_there(tmp_path):

@@ -84,14 +84,14 @@ def test_every_view_is_well_constrained(seed):
         assert frame.depth.max() < 6
 
 
-def test_colours_are_textured(round_trip):
+def test_colors_are_textured(round_trip):
     for index in range(0, FRAMES_PER_ROUND, 60):
         gray = cv2.cvtColor(round_trip[index].color, cv2.COLOR_RGB2GRAY).astype(float)
         assert np.mean(np.abs(np.diff(gray, axis=1)) > 3) > 0.2
         assert gray.std() > 20
 
 
-def test_the_same_point_has_the_same_colour_from_everywhere():
+def test_the_same_point_has_the_same_color_from_everywhere():
     dataset = GeneratedDataset(frames=10, width=320, height=240)
     first, second = dataset[0], dataset[9]
     points = transform_points(inverse(second.pose), world_points(dataset, first))
@@ -121,17 +121,17 @@ def test_frame_metadata():
 def test_noise_is_a_kinect_s():
     exact = GeneratedDataset(frames=60, width=320, height=240)
     noisy = GeneratedDataset(frames=60, width=320, height=240, noise=1)
-    truth = np.stack([exact[i].depth for i in (0, 30, 59)])
+    ground_truth = np.stack([exact[i].depth for i in (0, 30, 59)])
     measured = np.stack([noisy[i].depth for i in (0, 30, 59)])
     known = measured > 0
     assert 0.01 < np.mean(~known) < 0.08
-    error = np.where(known, measured - truth, np.nan)
+    error = np.where(known, measured - ground_truth, np.nan)
     error[np.abs(error) > 0.3] = np.nan
     for low, high, expected_cm in ((0.8, 1.2, 0.2), (2.3, 2.7, 0.8), (3.3, 3.7, 1.6)):
-        part = error[(truth > low) & (truth < high)]
+        part = error[(ground_truth > low) & (ground_truth < high)]
         assert np.nanmedian(np.abs(part)) * 100 == pytest.approx(expected_cm * 0.67, rel=0.5)
     assert abs(np.nanmean(error)) < 0.002
-    # Neighbours err alike, because the sensor matches windows.
+    # Neighbors err alike, because the sensor matches windows.
     left, right = error[..., :-1].ravel(), error[..., 1:].ravel()
     both = np.isfinite(left) & np.isfinite(right)
     assert np.corrcoef(left[both], right[both])[0, 1] > 0.2

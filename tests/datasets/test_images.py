@@ -15,7 +15,7 @@ def test_color_is_rgb(tmp_path):
     assert np.abs(difference[:, :8]).max() < 10  # JPEG's own error, away from the edge
 
 
-def test_grey_colour_images_are_repeated(tmp_path):
+def test_gray_color_images_are_repeated(tmp_path):
     cv2.imwrite(str(tmp_path / "g.png"), np.full((4, 5), 7, np.uint8))
     np.testing.assert_array_equal(read_color(tmp_path / "g.png"), np.full((4, 5, 3), 7))
 
@@ -36,7 +36,7 @@ def test_floating_point_depth(tmp_path):
         np.testing.assert_array_equal(read_depth(tmp_path / name, None), [[1.5, 0, 0], [0, 0, 2]])
 
 
-def test_sixteen_bits_are_millimetres_unless_told(tmp_path):
+def test_sixteen_bits_are_millimeters_unless_told(tmp_path):
     cv2.imwrite(str(tmp_path / "d.png"), np.array([[1500]], np.uint16))
     assert read_depth(tmp_path / "d.png", None)[0, 0] == 1.5
 
@@ -86,7 +86,7 @@ def test_first_size_skips_what_cannot_be_read(tmp_path):
 
 
 def test_depth_round_trip_at_every_scale(tmp_path):
-    metres = np.random.default_rng(1).uniform(0.3, 6, (10, 12))
+    meters = np.random.default_rng(1).uniform(0.3, 6, (10, 12))
     for scale in (1000.0, 5000.0, 6553.5):
-        write_depth(tmp_path / "d.png", metres, scale)
-        np.testing.assert_allclose(read_depth(tmp_path / "d.png", scale), metres, atol=0.51 / scale)
+        write_depth(tmp_path / "d.png", meters, scale)
+        np.testing.assert_allclose(read_depth(tmp_path / "d.png", scale), meters, atol=0.51 / scale)

@@ -5,7 +5,7 @@ import pytest
 
 from spslam.datasets.primitives import Box, Cylinder, Sphere
 
-# Single-precision rays over a few metres.
+# Single-precision rays over a few meters.
 RAY_TOLERANCE_M = 5e-6
 
 SOLIDS = [

@@ -8,7 +8,7 @@ from spslam.datasets import dataset_types, open_dataset, open_sequence, sequence
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
 from tests.datasets.layouts import (
-    depth_metres,
+    depth_meters,
     write_folder,
     write_replica,
     write_scannet,
@@ -39,7 +39,7 @@ def test_every_format_gives_the_same_frames(tmp_path, kind):
         assert frame.color.dtype == np.uint8
         assert frame.depth.dtype == np.float32
         assert frame.color.flags.c_contiguous
-        np.testing.assert_allclose(frame.depth, depth_metres(index), atol=2e-4)
+        np.testing.assert_allclose(frame.depth, depth_meters(index), atol=2e-4)
 
 
 def test_generated_needs_no_folder():
@@ -57,7 +57,7 @@ def test_common_options(tmp_path):
     assert dataset.name.endswith("seq-02")
     assert list(dataset.source_indices) == [0, 2, 4]
     depth = dataset[1].depth
-    expected = depth_metres(2)
+    expected = depth_meters(2)
     np.testing.assert_allclose(depth, np.where((expected >= 1.2) & (expected <= 2.0), expected, 0), atol=1e-6)
 
 

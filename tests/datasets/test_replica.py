@@ -8,7 +8,7 @@ from spslam.camera import Camera
 from spslam.datasets.replica import open_replica
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
 from spslam.errors import DatasetError
-from tests.datasets.layouts import depth_metres, poses, shared_data, write_replica
+from tests.datasets.layouts import depth_meters, poses, shared_data, write_replica
 
 
 def test_a_scene(tmp_path):
@@ -16,7 +16,7 @@ def test_a_scene(tmp_path):
     assert dataset.name == "replica/room0"
     assert dataset.camera == Camera(32, 24, 30, 31, 15.5, 11.5)
     frame = dataset[1]
-    np.testing.assert_allclose(frame.depth, depth_metres(1), atol=1e-4)
+    np.testing.assert_allclose(frame.depth, depth_meters(1), atol=1e-4)
     np.testing.assert_allclose(frame.pose, poses(3)[1], atol=1e-8)
     np.testing.assert_allclose(dataset.poses(), poses(3), atol=1e-8)
 
@@ -71,7 +71,7 @@ def test_wrong_layout(tmp_path):
         open_replica(tmp_path)
 
 
-def test_the_grey_room_is_the_same_in_both_layouts():
+def test_the_gray_room_is_the_same_in_both_layouts():
     replica = open_replica(shared_data("replica-layout"))
     synthetic = open_synthetic_rgbd(shared_data("synthetic-grey-white-room"), "exact")
     assert replica.camera == synthetic.camera

@@ -14,7 +14,7 @@ from tests.datasets.layouts import (
     HEIGHT,
     WIDTH,
     color_image,
-    depth_metres,
+    depth_meters,
     poses,
     truncate,
     write_scannet,
@@ -30,7 +30,7 @@ def test_a_scan(tmp_path):
     assert found.color.shape == (HEIGHT, WIDTH, 3)
     # JPEG's own error, away from the edge.
     assert np.abs(found.color.astype(int) - color_image(10))[:, :8].max() < 10
-    np.testing.assert_allclose(found.depth, depth_metres(10), atol=1e-6)
+    np.testing.assert_allclose(found.depth, depth_meters(10), atol=1e-6)
     np.testing.assert_allclose(dataset.poses(), poses(12), atol=1e-9)
     np.testing.assert_allclose(dataset.timestamps(), np.arange(12) / 30)
 
@@ -57,7 +57,7 @@ def test_where_a_scan_may_be(tmp_path):
 def test_intrinsics(tmp_path):
     scan = write_scannet(tmp_path)
     (scan / "intrinsic" / "intrinsic_depth.txt").unlink()
-    # Those of colour, which is twice as large, with pixel centres at whole numbers.
+    # Those of color, which is twice as large, with pixel centers at whole numbers.
     expected = Camera(2 * WIDTH, 2 * HEIGHT, 60, 62, 31, 23).resized(WIDTH, HEIGHT)
     assert open_scannet(scan).camera == expected
     shutil.rmtree(scan / "intrinsic")

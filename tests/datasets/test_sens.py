@@ -14,7 +14,7 @@ from tests.datasets.layouts import (
     HEIGHT,
     WIDTH,
     color_image,
-    depth_metres,
+    depth_meters,
     encoded,
     poses,
     sens_frame,
@@ -51,7 +51,7 @@ def test_a_scan(tmp_path):
         np.testing.assert_allclose(dataset.poses(), poses(4), atol=FLOAT32)
         for i, found in enumerate(dataset):
             np.testing.assert_array_equal(found.color, color_image(i))
-            np.testing.assert_allclose(found.depth, depth_metres(i), atol=FLOAT32)
+            np.testing.assert_allclose(found.depth, depth_meters(i), atol=FLOAT32)
             np.testing.assert_allclose(found.pose, poses(4)[i], atol=FLOAT32)
             assert (found.index, found.timestamp) == (i, dataset.timestamps()[i])
 
@@ -70,10 +70,10 @@ def test_frames_are_read_where_they_stand_from_any_thread(tmp_path):
     for thread in threads:
         thread.join()
     for i in range(8):
-        np.testing.assert_allclose(found[i].depth, depth_metres(i), atol=FLOAT32)
+        np.testing.assert_allclose(found[i].depth, depth_meters(i), atol=FLOAT32)
 
 
-def test_colour_is_brought_to_the_size_of_depth(tmp_path):
+def test_color_is_brought_to_the_size_of_depth(tmp_path):
     large = color_image(0).repeat(2, axis=0).repeat(2, axis=1)
     color = encoded(large, ".jpg")
     path = write(tmp_path / "a.sens", [frame(0, color=color)], color=2, color_size=(2 * WIDTH, 2 * HEIGHT))
@@ -84,11 +84,11 @@ def test_colour_is_brought_to_the_size_of_depth(tmp_path):
 
 
 def test_raw_images(tmp_path):
-    stored = np.round(1000 * depth_metres(0)).astype("<u2").tobytes()
+    stored = np.round(1000 * depth_meters(0)).astype("<u2").tobytes()
     path = write(tmp_path / "a.sens", [frame(0, color=color_image(0).tobytes(), depth=stored)], color=0, depth=0)
     found = open_scannet(path)[0]
     np.testing.assert_array_equal(found.color, color_image(0))
-    np.testing.assert_allclose(found.depth, depth_metres(0), atol=FLOAT32)
+    np.testing.assert_allclose(found.depth, depth_meters(0), atol=FLOAT32)
     found.color[0], found.depth[0] = 0, 0
 
 
@@ -105,7 +105,7 @@ def test_times(tmp_path):
     shuffled = open_scannet(write(tmp_path / "a.sens", [frame(i) for i in (2, 0, 1)]))
     np.testing.assert_allclose(shuffled.timestamps(), 0.033333 * np.arange(3), atol=1e-9)
     for i, found in enumerate(shuffled):
-        np.testing.assert_allclose(found.depth, depth_metres(i), atol=FLOAT32)
+        np.testing.assert_allclose(found.depth, depth_meters(i), atol=FLOAT32)
     timeless = open_scannet(write(tmp_path / "b.sens", [frame(i, time_us=0) for i in range(3)]))
     np.testing.assert_allclose(timeless.timestamps(), np.arange(3) / 30)
     twice = open_scannet(write(tmp_path / "c.sens", [frame(0), frame(1), frame(2, time_us=34_333)]))
@@ -121,9 +121,9 @@ def test_times(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"color": encoded(color_image(0), ".png")[:-30]}, "frame 1, colour: the image is truncated"),
-        ({"color": b""}, "frame 1, colour: the image is truncated"),
-        ({"color": b"IEND no image"}, "frame 1, colour: can't be decoded as an image"),
+        ({"color": encoded(color_image(0), ".png")[:-30]}, "frame 1, color: the image is truncated"),
+        ({"color": b""}, "frame 1, color: the image is truncated"),
+        ({"color": b"IEND no image"}, "frame 1, color: can't be decoded as an image"),
         ({"depth": zipped_depth(0)[:-8]}, "frame 1, depth: can't be decompressed"),
         ({"depth": b""}, "frame 1, depth: can't be decompressed"),
         ({"pose": np.ones((4, 4))}, "frame 1, pose: must be a rotation and a translation"),
@@ -135,13 +135,13 @@ def test_a_broken_frame_is_named_and_leaves_the_others(tmp_path, changes, messag
         dataset[1]
     assert "\n" not in str(error.value)
     assert dataset[0].pose is not None
-    np.testing.assert_allclose(dataset[2].depth, depth_metres(2), atol=FLOAT32)
+    np.testing.assert_allclose(dataset[2].depth, depth_meters(2), atol=FLOAT32)
 
 
 def test_images_of_another_size_than_announced(tmp_path):
     short = np.ones(5, "<u2").tobytes()
     path = write(tmp_path / "a.sens", [frame(0), frame(1, color=b"abc", depth=short)], color=0, depth=0)
-    with pytest.raises(DatasetError, match="frame 1, colour: must be 2304 bytes, got 3"):
+    with pytest.raises(DatasetError, match="frame 1, color: must be 2304 bytes, got 3"):
         open_scannet(path)[1]
     path = write(tmp_path / "b.sens", [frame(0), frame(1, depth=short)], depth=0)
     with pytest.raises(DatasetError, match="frame 1, depth: must be 1536 bytes, got 10"):
@@ -157,7 +157,7 @@ def test_a_file_that_was_cut_gives_its_whole_frames(tmp_path, missing):
     assert 2 <= last <= 3
     assert (np.diff(dataset.timestamps()) > 0).all()
     assert np.isfinite(dataset.poses()).all(axis=(1, 2)).tolist() == [True] * last + [False]
-    np.testing.assert_allclose(dataset[last - 1].depth, depth_metres(last - 1), atol=FLOAT32)
+    np.testing.assert_allclose(dataset[last - 1].depth, depth_meters(last - 1), atol=FLOAT32)
     with pytest.raises(DatasetError, match=f"a.sens: the file is truncated: {last} of 4 frames are whole"):
         dataset[last]
 

@@ -10,7 +10,7 @@ from spslam.datasets.seven_scenes import list_sequences, open_seven_scenes
 from spslam.errors import DatasetError
 from tests.datasets.layouts import (
     color_image,
-    depth_metres,
+    depth_meters,
     poses,
     shared_data,
     truncate,
@@ -27,7 +27,7 @@ def test_a_scene(tmp_path):
     assert dataset.camera == Camera(32, 24, 30, 31, 15.5, 11.5)
     frame = dataset[2]
     np.testing.assert_array_equal(frame.color, color_image(2))
-    np.testing.assert_allclose(frame.depth, depth_metres(2), atol=1e-6)
+    np.testing.assert_allclose(frame.depth, depth_meters(2), atol=1e-6)
     np.testing.assert_allclose(frame.pose, poses(4)[2], atol=1e-9)
     assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
     np.testing.assert_allclose(dataset.poses(), poses(4), atol=1e-9)
@@ -125,11 +125,11 @@ def test_broken_frames_name_their_file_and_leave_the_others(tmp_path):
         [
             "frame-000000.color.png: the image is truncated",
             "frame-000001.color.png: the depth image of this frame is missing",
-            "frame-000002.depth.png: the colour image of this frame is missing",
+            "frame-000002.depth.png: the color image of this frame is missing",
             "frame-000003.depth.png: the file is empty",
             "frame-000004.pose.txt: a pose must have 16 numbers, got 3",
             "frame-000005.pose.txt: must hold numbers only",
-            r"frame-000006.depth.png .*: depth must be as large as colour, got depth 16x12 and colour 32x24",
+            r"frame-000006.depth.png .*: depth must be as large as color, got depth 16x12 and color 32x24",
         ]
     ):
         with pytest.raises(DatasetError, match=message) as error:

@@ -6,7 +6,7 @@ import pytest
 from spslam.camera import Camera
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
 from spslam.errors import DatasetError
-from tests.datasets.layouts import color_image, depth_metres, poses, shared_data, write_depth, write_synthetic_rgbd
+from tests.datasets.layouts import color_image, depth_meters, poses, shared_data, write_depth, write_synthetic_rgbd
 
 
 def test_a_scene(tmp_path):
@@ -16,16 +16,16 @@ def test_a_scene(tmp_path):
     assert len(dataset) == 12
     frame = dataset[10]  # img10 sorts before img2 by name
     np.testing.assert_array_equal(frame.color, color_image(10))
-    np.testing.assert_allclose(frame.depth, depth_metres(10) + 0.1, atol=1e-6)
+    np.testing.assert_allclose(frame.depth, depth_meters(10) + 0.1, atol=1e-6)
     np.testing.assert_allclose(frame.pose, poses(12)[10], atol=1e-8)
     np.testing.assert_allclose(dataset.poses(), poses(12), atol=1e-8)
 
 
 def test_depth_variants(tmp_path):
     scene = write_synthetic_rgbd(tmp_path, count=2)
-    np.testing.assert_allclose(open_synthetic_rgbd(scene, "exact")[1].depth, depth_metres(1), atol=1e-6)
+    np.testing.assert_allclose(open_synthetic_rgbd(scene, "exact")[1].depth, depth_meters(1), atol=1e-6)
     shutil.rmtree(scene / "depth_filtered")
-    np.testing.assert_allclose(open_synthetic_rgbd(scene)[1].depth, depth_metres(1), atol=1e-6)
+    np.testing.assert_allclose(open_synthetic_rgbd(scene)[1].depth, depth_meters(1), atol=1e-6)
     with pytest.raises(DatasetError, match=r"depth_filtered: no such folder; there is depth \(depth_variant: exact\)"):
         open_synthetic_rgbd(scene, "filtered")
     with pytest.raises(DatasetError, match="depth_variant must be one of filtered, noisy, exact, got best"):
@@ -72,8 +72,8 @@ def test_noisy_depth_is_a_variant(tmp_path):
     scene = write_synthetic_rgbd(tmp_path, count=1)
     with pytest.raises(DatasetError, match="depth_with_noise: no such folder; there is depth_filtered"):
         open_synthetic_rgbd(scene, "noisy")
-    write_depth(scene / "depth_with_noise" / "depth0.png", depth_metres(0) + 0.2)
-    np.testing.assert_allclose(open_synthetic_rgbd(scene, "noisy")[0].depth, depth_metres(0) + 0.2, atol=1e-6)
+    write_depth(scene / "depth_with_noise" / "depth0.png", depth_meters(0) + 0.2)
+    np.testing.assert_allclose(open_synthetic_rgbd(scene, "noisy")[0].depth, depth_meters(0) + 0.2, atol=1e-6)
 
 
 def test_wrong_layouts(tmp_path):
@@ -88,7 +88,7 @@ def test_wrong_layouts(tmp_path):
         open_synthetic_rgbd(tmp_path.parent)
 
 
-def test_exact_depth_of_the_grey_room_agrees_between_views():
+def test_exact_depth_of_the_gray_room_agrees_between_views():
     dataset = open_synthetic_rgbd(shared_data("synthetic-grey-white-room"), "exact")
     assert len(dataset) == 400
     first, second = dataset[0], dataset[8]

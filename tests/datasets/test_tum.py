@@ -11,7 +11,7 @@ from tests.datasets.layouts import (
     HEIGHT,
     WIDTH,
     color_image,
-    depth_metres,
+    depth_meters,
     poses,
     shared_data,
     write_color,
@@ -27,7 +27,7 @@ def test_a_sequence(tmp_path):
     assert dataset.camera == Camera(640, 480, 525, 525, 319.5, 239.5).resized(WIDTH, HEIGHT)
     frame = dataset[1]
     np.testing.assert_array_equal(frame.color, color_image(1))
-    np.testing.assert_allclose(frame.depth, depth_metres(1), atol=1.1e-4)
+    np.testing.assert_allclose(frame.depth, depth_meters(1), atol=1.1e-4)
     assert frame.timestamp == pytest.approx(1000 + 1 / 30, abs=1e-6)
     # The truth's poses are 10 ms apart and begin 50 ms before the first frame.
     expected = interpolate_pose(poses(40)[8], poses(40)[9], 1 / 3)
@@ -47,7 +47,7 @@ def test_cameras_by_folder_name(tmp_path):
         assert (dataset.undistortion is None) == (focal in (535.4, 525.0))
 
 
-def test_colour_is_undistorted_and_depth_is_not(tmp_path):
+def test_color_is_undistorted_and_depth_is_not(tmp_path):
     folder = write_tum(tmp_path / "freiburg1_x", count=1)
     color = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8), (0, 0), 2)
     depth = np.random.default_rng(1).uniform(1, 3, (120, 160))

@@ -99,7 +99,7 @@ def test_names():
             find_source(name)
 
 
-def test_the_catalogue_is_consistent():
+def test_the_catalog_is_consistent():
     assert len({source.name for source in SOURCES}) == len(SOURCES)
     for source in SOURCES:
         assert source.run.split()[2] in config_names()

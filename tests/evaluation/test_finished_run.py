@@ -30,7 +30,7 @@ def output(tmp_path, room):
     poses = part.poses()
     Trajectory(part.timestamps(), TURN @ poses).save_tum(tmp_path / "trajectory.txt")
     (tmp_path / "previews").mkdir()
-    Trajectory(part.timestamps(), poses).save_tum(tmp_path / "previews" / "truth.txt")
+    Trajectory(part.timestamps(), poses).save_tum(tmp_path / "previews" / "ground_truth.txt")
     (tmp_path / "metrics.json").write_text('{"frames": 6}')
     vertices, faces, _ = room.room.mesh()
     moved = vertices @ TURN[:3, :3].T + TURN[:3, 3]
@@ -74,7 +74,7 @@ def test_pictures_need_a_map_and_a_mesh(output, room):
         view_figures(RunOutput.read(output), room)
     Scene(SceneSettings(0.04, 0.08, 0.04, 0.25, 1000), seed=0).save(output / "map.safetensors")
     figures = view_figures(RunOutput.read(output), room)
-    # The surface is the room's, the colours of an empty map are nothing like it.
+    # The surface is the room's, the colors of an empty map are nothing like it.
     assert figures["view_coverage"] > 99.9
     assert 3 < figures["psnr_db"] < 20
     assert figures["ssim"] < 0.9
@@ -94,7 +94,7 @@ def test_straight_path_leaves_no_rotation_open(output, room):
     line = run.trajectory.poses[:1].repeat(6, axis=0)
     line[:, :3, 3] += np.outer(np.arange(6), [0.02, 0, 0])
     Trajectory(run.trajectory.timestamps, line).save_tum(output / "trajectory.txt")
-    Trajectory(run.trajectory.timestamps, np.linalg.inv(TURN) @ line).save_tum(output / "previews" / "truth.txt")
+    Trajectory(run.trajectory.timestamps, np.linalg.inv(TURN) @ line).save_tum(output / "previews" / "ground_truth.txt")
     assert surface_figures(RunOutput.read(output), room, room.room)["accuracy_cm"] < 0.1
 
 
@@ -108,7 +108,7 @@ def test_shifted_mesh_is_found_out(output, room):
 
 
 def test_no_truth_gives_no_trajectory_figures(output):
-    (output / "previews" / "truth.txt").unlink()
+    (output / "previews" / "ground_truth.txt").unlink()
     assert trajectory_figures(RunOutput.read(output)) == {}
 
 

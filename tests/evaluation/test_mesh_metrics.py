@@ -12,7 +12,7 @@ from spslam.geometry import pose_from
 
 
 def square(width: float = 1.0, height: float = 0.0) -> TriangleSurface:
-    """A horizontal rectangle of one metre by a width, at a height."""
+    """A horizontal rectangle of one meter by a width, at a height."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * [width, 1, 1] + [0, 0, height]
     return TriangleSurface(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 

@@ -53,7 +53,7 @@ def path_of_poses():
     return np.stack([pose_from(np.eye(3), np.array([0.02 * i, 0.01 * np.sin(i), 0.03 * i])) for i in range(FRAMES)])
 
 
-def write_run(folder, mesh=True, truth=True, log=True, previews=True, config=True):
+def write_run(folder, mesh=True, ground_truth=True, log=True, previews=True, config=True):
     folder.mkdir(exist_ok=True)
     times, poses = np.arange(FRAMES) / 30, path_of_poses()
     lost = np.zeros(FRAMES, bool)
@@ -61,12 +61,12 @@ def write_run(folder, mesh=True, truth=True, log=True, previews=True, config=Tru
     Trajectory(times, poses, lost).save_tum(folder / "trajectory.txt")
     metrics = {"frames": FRAMES, "fps": 12.5, "ate_rmse_cm": 1.25, "wall_s": 3.0, "device_name": "<processor & co>"}
     (folder / "metrics.json").write_text(json.dumps(metrics))
-    if previews or truth:
+    if previews or ground_truth:
         (folder / "previews").mkdir(exist_ok=True)
         (folder / "previews" / "camera.json").write_text(json.dumps(vars(CAMERA)))
-    if truth:
+    if ground_truth:
         moved = pose_from(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([1.0, 2, 3])) @ poses
-        Trajectory(times[::2], moved[::2]).save_tum(folder / "previews" / "truth.txt")
+        Trajectory(times[::2], moved[::2]).save_tum(folder / "previews" / "ground_truth.txt")
     if previews:
         for row in (0, FRAMES - 1):
             cv2.imwrite(str(folder / "previews" / f"frame-{row:06d}.png"), np.full((48, 64, 3), 99, np.uint8))
@@ -78,7 +78,7 @@ def write_run(folder, mesh=True, truth=True, log=True, previews=True, config=Tru
     if log:
         lines = [
             {"frame": i, "tracking_ms": 9.0, "encode_ms": 0, "mapping_ms": 80.0 * (i % 5 == 0),
-             "residual_cm": None if i == 0 else 0.5, "inliers": 0.9}
+             "residual_cm": None if i == 0 else 0.5, "inlier_share": 0.9}
             for i in range(FRAMES)
         ]  # fmt: skip
         (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -98,21 +98,21 @@ def test_report_shows_everything_and_fetches_nothing(tmp_path):
     assert "http" not in re.sub('data:[^"]*', "", text)
     assert "<script" not in text
     for word in ("kitchen <1>", "<processor & co>", "Map", "Views", "Trajectory", "Error over time", "Time", "Tracking",
-                 "All figures", "Settings", "# a <comment>", "1.25 cm", "truth", "lost"):  # fmt: skip
+                 "All figures", "Settings", "# a <comment>", "1.25 cm", "ground truth", "lost"):  # fmt: skip
         assert any(word in part for part in page.text), word
 
 
-@pytest.mark.parametrize("missing", ["mesh", "truth", "log", "previews", "config"])
+@pytest.mark.parametrize("missing", ["mesh", "ground_truth", "log", "previews", "config"])
 def test_what_is_missing_is_left_out(tmp_path, missing):
     path = write_report(write_run(tmp_path, **{missing: False}))
     headings = re.findall("<h2>(.*?)</h2>", path.read_text())
-    gone = {"mesh": "Map", "truth": "Error over time", "log": "Time", "previews": "Views", "config": ""}[missing]
+    gone = {"mesh": "Map", "ground_truth": "Error over time", "log": "Time", "previews": "Views", "config": ""}[missing]
     assert gone not in headings
     read(path)
 
 
 def test_trajectory_and_metrics_alone_are_enough(tmp_path):
-    run = write_run(tmp_path, mesh=False, truth=False, log=False, previews=False, config=False)
+    run = write_run(tmp_path, mesh=False, ground_truth=False, log=False, previews=False, config=False)
     assert re.findall("<h2>(.*?)</h2>", write_report(run).read_text()) == [
         "Trajectory",
         "As in the paper",
@@ -121,7 +121,7 @@ def test_trajectory_and_metrics_alone_are_enough(tmp_path):
 
 
 def test_one_frame_is_enough(tmp_path):
-    run = write_run(tmp_path, truth=False)
+    run = write_run(tmp_path, ground_truth=False)
     Trajectory(np.zeros(1), np.eye(4)[None]).save_tum(run / "trajectory.txt")
     (run / "log.jsonl").write_text('{"tracking_ms": 0, "encode_ms": 1, "mapping_ms": 2}\n')
     read(write_report(run))

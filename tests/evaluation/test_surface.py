@@ -5,7 +5,7 @@ import trimesh
 from spslam.evaluation.surface import TriangleSurface, triangle_distance
 
 SQUARE = (np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
-# Double precision on coordinates of metres.
+# Double precision on coordinates of meters.
 EXACT_M = 1e-9
 
 

@@ -11,7 +11,7 @@ from spslam.evaluation.trajectory import absolute_errors, align, ate, rpe
 from spslam.geometry import pose_from
 from tests.datasets.layouts import shared_data
 
-# Both compute in double precision; centimetres of a trajectory of metres.
+# Both compute in double precision; centimeters of a trajectory of meters.
 EVO_TOLERANCE = 1e-6
 
 
@@ -37,10 +37,10 @@ def disturbed(poses: np.ndarray, seed: int, scale: float = 1.0) -> np.ndarray:
 
 
 def evo_ate(estimated, reference, with_scale):
-    path, truth = PosePath3D(poses_se3=list(estimated)), PosePath3D(poses_se3=list(reference))
-    path.align(truth, correct_scale=with_scale)
+    path, ground_truth = PosePath3D(poses_se3=list(estimated)), PosePath3D(poses_se3=list(reference))
+    path.align(ground_truth, correct_scale=with_scale)
     metric = metrics.APE(metrics.PoseRelation.translation_part)
-    metric.process_data((truth, path))
+    metric.process_data((ground_truth, path))
     return {name: 100 * value for name, value in metric.get_all_statistics().items()}
 
 

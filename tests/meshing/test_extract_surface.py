@@ -9,7 +9,7 @@ from spslam.meshing import cubes_per_cell, extract_surface
 from tests.meshing import fields
 
 CELL_M = 0.04
-# Samples are kept off block borders by some 1e-5 of a block, and positions are float32 of a few metres.
+# Samples are kept off block borders by some 1e-5 of a block, and positions are float32 of a few meters.
 LINEAR_ERROR_M = 1e-5
 
 

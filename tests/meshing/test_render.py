@@ -1,4 +1,4 @@
-"""The rasteriser against analytic depth."""
+"""The rasterizer against analytic depth."""
 
 import time
 
@@ -75,7 +75,7 @@ def test_colors_are_interpolated_in_space_not_in_the_image():
     picture, depth = render_mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), colors, CAMERA, np.eye(4))
     hit = (depth > 1.1) & (depth < 8.9)
     ratio = picture[hit][:, 0] / picture[hit][:, 1].astype(float)
-    np.testing.assert_allclose(ratio, 2 * (depth[hit] - 1) / 8, atol=0.04)  # of 8-bit colours
+    np.testing.assert_allclose(ratio, 2 * (depth[hit] - 1) / 8, atol=0.04)  # of 8-bit colors
 
 
 @pytest.mark.parametrize("colors", [None, np.zeros((0, 3), np.uint8)])

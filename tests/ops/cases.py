@@ -106,7 +106,9 @@ def _along_rays(generator, device, n):
 
 def _frame_pixels(generator, device, n):
     color = torch.randint(0, 256, (48, 64, 3), generator=generator).to(torch.uint8)
-    sampling = ops.PixelSampling(n, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, lattice_step=16, view_step=2)
+    sampling = ops.PixelSampling(
+        n, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, thumbnail_step=16, depth_image_step=2
+    )
     key = dict(seed=7, stream=ops.Stream.PIXEL_DATABASE, frame=3)
     return dict(depth=1 + 0.1 * uniform(generator, 48, 64), color=color, **CAMERA, sampling=sampling, **key)
 

@@ -44,7 +44,9 @@ def render_step(generator, device, n):
 
 def track(generator, device, n):
     scene = make_scene(generator, random_decoder=True, device=device)
-    steps = dict(num_pixels=32, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4, noise_depth=1.0)
+    steps = dict(
+        num_pixels=32, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4, noise_crossover_depth=1.0
+    )
     cells = torch.stack([uniform(generator, 6, 8), 1 + 0.05 * uniform(generator, 6, 8)], -1).to(device)
     reference = ops.ReferenceImage(cells, POSE.to(device), ops.Intrinsics(7.5, 7.5, 3.5, 2.5), weight=0.05, kernel=0.1)
     return dict(
@@ -110,9 +112,9 @@ def icp(generator, device, n):
 
 
 def views(generator, device, n):
-    lattices = (1 + uniform(generator, n, 3, 4)).half()
-    return on_device(device, dict(poses=POSE.repeat(n, 1), lattices=lattices)) | dict(
-        intrinsics=INTRINSICS, lattice_step=16
+    depth_thumbnails = (1 + uniform(generator, n, 3, 4)).half()
+    return on_device(device, dict(poses=POSE.repeat(n, 1), depth_thumbnails=depth_thumbnails)) | dict(
+        intrinsics=INTRINSICS, thumbnail_step=16
     )
 
 

@@ -91,7 +91,7 @@ def make_scene(generator: torch.Generator, random_decoder: bool, device: torch.d
     volume.embeddings.copy_(0.3 * torch.randn(len(near), 8, generator=generator))
     params = 0.3 * torch.randn(1473, generator=generator)
     if not random_decoder:
-        # atanh, so that the decoded value is the normalised distance itself.
+        # atanh, so that the decoded value is the normalized distance itself.
         volume.embeddings[:, 0] = 2 * torch.atanh((near / (4 * VOXEL)).clamp(-0.99, 0.99)) * 2
         params = linear_geometry_params()
     sizes = [(60, 60)] * 3

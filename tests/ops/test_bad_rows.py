@@ -44,7 +44,7 @@ ROWS = [
     ("query_color", "points", NAN, [math.nan]),
     ("gauss_newton_poses", "poses", NOT_FINITE, [0, 0, 0, 0]),
     ("frame_overlap", "poses", NOT_FINITE, [0]),
-    ("frame_overlap", "lattices", NOT_FINITE, [0]),
+    ("frame_overlap", "depth_thumbnails", NOT_FINITE, [0]),
 ]
 # Clamped to the border, as what lies outside of an image or plane is.
 CLAMPED = [("bilinear_interpolate", "uv"), ("tri_plane_interpolate", "points"), ("query_color", "points")]

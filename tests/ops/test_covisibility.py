@@ -14,13 +14,13 @@ POINTS = 256
 
 
 def make_frames(generator, count):
-    """Poses about the origin that look along z more or less, and lattices of a wall 2 m away with holes."""
+    """Poses about the origin that look along z more or less, and depth_thumbnails of a wall 2 m away with holes."""
     turns = 0.35 * torch.randn(count, 3, generator=generator)
     quaternions = torch.nn.functional.normalize(torch.cat([torch.ones(count, 1), turns], 1))
     poses = torch.cat([quaternions, 0.2 * torch.randn(count, 3, generator=generator)], 1)
-    lattices = 2 + 0.06 * torch.randn(count, *SHAPE, generator=generator)
-    lattices[torch.rand(count, *SHAPE, generator=generator) < 0.2] = 0
-    return poses, lattices.half()
+    depth_thumbnails = 2 + 0.06 * torch.randn(count, *SHAPE, generator=generator)
+    depth_thumbnails[torch.rand(count, *SHAPE, generator=generator) < 0.2] = 0
+    return poses, depth_thumbnails.half()
 
 
 def make_records(generator, count=2000):
@@ -51,15 +51,15 @@ def drawn_points(records, pose, seed, frame):
 
 def choose(frames, records, current, candidates, device, **options):
     settings = {"num_covisible": 40, "count": 100, "threshold": 0.3, **options}
-    poses, lattices = (tensor.to(device) for tensor in frames)
+    poses, depth_thumbnails = (tensor.to(device) for tensor in frames)
     return ops.select_covisible_frames(
         records.to(device),
         current,
         poses,
-        lattices,
+        depth_thumbnails,
         candidates.to(device),
         INTRINSICS,
-        lattice_step=STEP,
+        thumbnail_step=STEP,
         num_points=POINTS,
         seed=5,
         frame=7,
@@ -68,22 +68,22 @@ def choose(frames, records, current, candidates, device, **options):
 
 
 def test_overlap_is_the_reference(device, generator):
-    poses, lattices = make_frames(generator, 50)
+    poses, depth_thumbnails = make_frames(generator, 50)
     points = torch.rand(300, 3, generator=generator) * torch.tensor([3.0, 2.0, 0.6]) + torch.tensor([-1.5, -1.0, 1.7])
-    share = ops.frame_overlap(points.to(device), poses.to(device), lattices.to(device), INTRINSICS, STEP).cpu()
-    want = overlap(points, poses, lattices, INTRINSICS, STEP)
+    share = ops.frame_overlap(points.to(device), poses.to(device), depth_thumbnails.to(device), INTRINSICS, STEP).cpu()
+    want = overlap(points, poses, depth_thumbnails, INTRINSICS, STEP)
     assert torch.equal(share, want.float())
     assert share.max() > 0.1
 
 
 def test_overlap_knows_every_float16(device):
-    """A frame whose lattice holds each non-negative float16 in turn sees points at its depth only."""
+    """A frame whose depth_thumbnail holds each non-negative float16 in turn sees points at its depth only."""
     depths = torch.tensor([0.0625, 0.1, 0.999, 1.0, 5.5, 65504.0]).half()
-    lattices = depths[:, None, None].expand(-1, *SHAPE).contiguous()
+    depth_thumbnails = depths[:, None, None].expand(-1, *SHAPE).contiguous()
     poses = torch.tensor([1.0, 0, 0, 0, 0, 0, 0]).repeat(len(depths), 1)
     for row, depth in enumerate(depths.float().tolist()):
         point = torch.tensor([[0.0, 0.0, depth]], device=device)
-        share = ops.frame_overlap(point, poses.to(device), lattices.to(device), INTRINSICS, STEP)
+        share = ops.frame_overlap(point, poses.to(device), depth_thumbnails.to(device), INTRINSICS, STEP)
         assert share[row] == 1
 
 
@@ -127,10 +127,10 @@ def test_nothing_to_choose_from(device, generator):
     none = torch.zeros(0, dtype=torch.int64)
     assert choose(frames, records, 2, none, device).shape == (0,)
     assert choose(frames, records, 2, torch.tensor([0, 1]), device, count=0).shape == (0,)
-    poses, lattices = (tensor[:0].to(device) for tensor in frames)
-    assert ops.frame_overlap(torch.zeros(4, 3, device=device), poses, lattices, INTRINSICS, STEP).shape == (0,)
-    poses, lattices = (tensor.to(device) for tensor in frames)
-    nothing = ops.frame_overlap(torch.zeros(0, 3, device=device), poses, lattices, INTRINSICS, STEP)
+    poses, depth_thumbnails = (tensor[:0].to(device) for tensor in frames)
+    assert ops.frame_overlap(torch.zeros(4, 3, device=device), poses, depth_thumbnails, INTRINSICS, STEP).shape == (0,)
+    poses, depth_thumbnails = (tensor.to(device) for tensor in frames)
+    nothing = ops.frame_overlap(torch.zeros(0, 3, device=device), poses, depth_thumbnails, INTRINSICS, STEP)
     assert nothing.tolist() == [0, 0, 0]
 
 
@@ -156,14 +156,14 @@ def test_arguments_are_named(generator):
         choose(frames, records, 4, candidates, "cpu", count=-1)
     with pytest.raises(TypeError, match="select_covisible_frames: candidates must be int64, got int32"):
         choose(frames, records, 4, candidates.int(), "cpu")
-    with pytest.raises(TypeError, match="frame_overlap: lattices must be float16, got float32"):
+    with pytest.raises(TypeError, match="frame_overlap: depth_thumbnails must be float16, got float32"):
         ops.frame_overlap(torch.zeros(1, 3), frames[0], frames[1].float(), INTRINSICS, STEP)
 
 
 def test_opcheck(device, generator):
-    (poses, lattices), records = make_frames(generator, 6), make_records(generator)
+    (poses, depth_thumbnails), records = make_frames(generator, 6), make_records(generator)
     k = list(INTRINSICS)
     points = torch.rand(9, 3, generator=generator)
-    opcheck(torch.ops.spslam.frame_overlap.default, (points, poses, lattices, k, STEP), device)
-    arguments = (records, 5, poses, lattices, torch.arange(5), k, STEP, 64, 2, 3, 0.1, 0, 6, 0)
+    opcheck(torch.ops.spslam.frame_overlap.default, (points, poses, depth_thumbnails, k, STEP), device)
+    arguments = (records, 5, poses, depth_thumbnails, torch.arange(5), k, STEP, 64, 2, 3, 0.1, 0, 6, 0)
     opcheck(torch.ops.spslam.select_covisible_frames.default, arguments, device)

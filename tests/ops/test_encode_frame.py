@@ -24,7 +24,7 @@ TF32_TOLERANCE = 5e-3
 
 
 def wall(count, generator, extent=3.0):
-    """Points of a noisy wall of some metres, one in ten without a normal."""
+    """Points of a noisy wall of some meters, one in ten without a normal."""
     points = (torch.rand(count, 3, generator=generator) - 0.5) * extent
     points[:, 2] = 1.5 + 0.2 * points[:, 0] + 0.01 * torch.randn(count, generator=generator)
     _, normals = surface(count, generator)

@@ -136,8 +136,8 @@ def test_arguments_are_named(generator):
     records = corner_pixels(POSE, generator)
     with pytest.raises(ValueError, match="track_gauss_newton: iterations must be at least 1, got 0"):
         ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
-    with pytest.raises(ValueError, match="track_gauss_newton: kernel_judge must be positive, got 0"):
-        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **OPTIONS, frame=0, kernel_judge=0)
+    with pytest.raises(ValueError, match="track_gauss_newton: score_kernel must be positive, got 0"):
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **OPTIONS, frame=0, score_kernel=0)
     with pytest.raises(ValueError, match=r"predict_pose: before must have shape \[7\], got \[8\]"):
         ops.predict_pose(torch.zeros(8), torch.zeros(7))
     with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):

@@ -67,7 +67,7 @@ def test_equals_the_reference(name, dtype, channels, device, generator):
     weight = torch.randn(300, channels, generator=generator, dtype=dtype).to(device)
     got = _value_and_gradients(getattr(ops, name), arguments, differentiable, weight)
     want = _value_and_gradients(getattr(reference.interpolation, name), arguments, differentiable, weight)
-    # The gradient by a position in metres is 1 / CELL times larger than the values it comes from.
+    # The gradient by a position in meters is 1 / CELL times larger than the values it comes from.
     tolerance = ORDER_TOLERANCE if dtype == torch.float32 else dict(rtol=1e-10, atol=1e-10)
     for g, w in zip(got, want, strict=True):
         torch.testing.assert_close(g, w, rtol=tolerance["rtol"], atol=tolerance["atol"] * max(1, w.abs().max().item()))

@@ -108,7 +108,7 @@ def test_same_bits_from_run_to_run(device, options):
         assert_equal(run, runs[0])
 
 
-def test_without_colour_texels_stay(device, options):
+def test_without_color_texels_stay(device, options):
     scene, before = Map(device), Map(device)
     losses = scene.optimize(replace(options, weight_rgb=0.0), 2)
     assert not losses[:, 1].any()

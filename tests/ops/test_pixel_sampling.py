@@ -13,14 +13,16 @@ from tests.ops.arguments import opcheck
 from tests.reference import pixel_sampling as reference
 
 CAMERA = (61.0, 59.5, 33.2, 21.7)
-SAMPLING = ops.PixelSampling(1000, min_depth=0.1, max_depth=6.0, step_px=3, max_jump=0.05, lattice_step=16, view_step=2)
-# Float32 points within some metres.
+SAMPLING = ops.PixelSampling(
+    1000, min_depth=0.1, max_depth=6.0, step_px=3, max_jump=0.05, thumbnail_step=16, depth_image_step=2
+)
+# Float32 points within some meters.
 POINT_TOLERANCE_M = 2e-6
 KEY = (2**33 + 5, ops.Stream.PIXEL_DATABASE, 17)
 
 
 def frame(generator, height=50, width=70, noise=0.004):
-    """Depth of a slanted wall with a box before it, holes and what sensors return for nothing; random colours."""
+    """Depth of a slanted wall with a box before it, holes and what sensors return for nothing; random colors."""
     v, u = np.mgrid[:height, :width]
     depth = 2.0 + 0.01 * (u - 31) - 0.004 * (v - 23)
     depth[10:30, 20:40] -= 0.5
@@ -32,24 +34,29 @@ def frame(generator, height=50, width=70, noise=0.004):
 
 
 def split(buffer, sampling, shape):
-    """Records, normals, lattice and view as the buffer holds them."""
-    (h, w), (rows, columns) = sampling.lattice_shape(*shape), sampling.view_shape(*shape)
-    words, lattice, view = buffer.split([6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2])
+    """Records, normals, depth_thumbnail and view as the buffer holds them."""
+    (h, w), (rows, columns) = sampling.thumbnail_shape(*shape), sampling.depth_image_shape(*shape)
+    words, depth_thumbnail, view = buffer.split([6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2])
     records, normals = words.view(2, sampling.count, 3)
-    lattice, view = lattice.view(torch.float16), view.view(torch.uint16)
-    assert not lattice[h * w :].any()
+    depth_thumbnail, view = depth_thumbnail.view(torch.float16), view.view(torch.uint16)
+    assert not depth_thumbnail[h * w :].any()
     assert not view[rows * columns :].any()
-    return records, normals.view(torch.float32), lattice[: h * w].view(h, w), view[: rows * columns].view(rows, columns)
+    return (
+        records,
+        normals.view(torch.float32),
+        depth_thumbnail[: h * w].view(h, w),
+        view[: rows * columns].view(rows, columns),
+    )
 
 
 def check_against_numpy(depth, color, sampling):
     buffer, num_valid = ops.sample_frame_pixels(depth, color, *CAMERA, sampling, *KEY)
-    records, normals, lattice, view = split(buffer, sampling, depth.shape)
+    records, normals, depth_thumbnail, view = split(buffer, sampling, depth.shape)
     want = reference.sample_frame_pixels(depth.numpy(), color.numpy(), *CAMERA, sampling, *KEY)
     assert num_valid == want[4]
     np.testing.assert_array_equal(records.numpy(), want[0])
     np.testing.assert_array_equal(normals.numpy(), want[1])
-    np.testing.assert_array_equal(lattice.numpy(), want[2])
+    np.testing.assert_array_equal(depth_thumbnail.numpy(), want[2])
     np.testing.assert_array_equal(view.numpy(), want[3])
     return records, normals
 
@@ -69,14 +76,14 @@ def test_pixels_are_those_of_numpy(noise, generator):
         {"count": 16},
         {"count": 0},
         {"count": 40_003},
-        {"lattice_step": 1},
-        {"lattice_step": 7},
-        {"lattice_step": 500},
-        {"view_step": 0},
-        {"view_step": 1},
-        {"view_step": 7, "lattice_step": 7},
-        {"view_step": 500},
-        {"view_step": 1, "view_unit": 2e-5},
+        {"thumbnail_step": 1},
+        {"thumbnail_step": 7},
+        {"thumbnail_step": 500},
+        {"depth_image_step": 0},
+        {"depth_image_step": 1},
+        {"depth_image_step": 7, "thumbnail_step": 7},
+        {"depth_image_step": 500},
+        {"depth_image_step": 1, "depth_image_unit": 2e-5},
         {"step_px": 1},
         {"step_px": 30},
         {"max_jump": 10.0},
@@ -99,7 +106,7 @@ def test_half_precision_of_every_size_of_depth():
     exponents = torch.arange(-26, 9).repeat_interleave(64)
     depth = (2.0**exponents * (1 + torch.linspace(0, 1, 64).repeat(35) ** 2)).view(35, 64)
     depth[3, :33] = 1 + torch.arange(33) / 2**14  # ties, to even
-    sampling = dataclasses.replace(SAMPLING, count=0, lattice_step=1, min_depth=0.0, max_depth=1e9)
+    sampling = dataclasses.replace(SAMPLING, count=0, thumbnail_step=1, min_depth=0.0, max_depth=1e9)
     buffer, _ = ops.sample_frame_pixels(depth, torch.zeros(35, 64, 3, dtype=torch.uint8), *CAMERA, sampling, *KEY)
     assert torch.equal(split(buffer, sampling, depth.shape)[2], depth.half())
     huge = torch.tensor([[65519.0, 65520.0, 1e30]])
@@ -171,9 +178,9 @@ def test_wrong_arguments_are_named(generator):
         ({"min_depth": -1.0}, "min_depth must be at least 0, got -1.0"),
         ({"step_px": 0}, r"step_px must be in \[1, 65535\], got 0"),
         ({"max_jump": 0.0}, "max_jump must be positive, got 0.0"),
-        ({"view_step": -1}, r"view_step must be in \[0, 65535\], got -1"),
-        ({"view_unit": 0.0}, "view_unit must be positive, got 0.0"),
-        ({"lattice_step": 0}, r"lattice_step must be in \[1, 65535\], got 0"),
+        ({"depth_image_step": -1}, r"depth_image_step must be in \[0, 65535\], got -1"),
+        ({"depth_image_unit": 0.0}, "depth_image_unit must be positive, got 0.0"),
+        ({"thumbnail_step": 0}, r"thumbnail_step must be in \[1, 65535\], got 0"),
         ({"fx": 0.0}, "fx must be positive, got 0.0"),
         ({"color": color[1:]}, r"color must have shape \[50, 70, 3\], got \[49, 70, 3\]"),
         ({"depth": torch.zeros(1, 70_000), "color": color}, r"depth must fit 16 bits a side, got \(1, 70000\)"),

@@ -11,7 +11,7 @@ VOXEL = 0.04
 # Float32 networks of 64 hidden units against double precision, features of order 1.
 FEATURE_TOLERANCE = 2e-5
 WEIGHT_TOLERANCE = 1e-5
-# Float32 cross products of depths of some metres over 4 px.
+# Float32 cross products of depths of some meters over 4 px.
 NORMAL_TOLERANCE = 2e-3
 CAMERA = {"fx": 60.0, "fy": 62.0, "cx": 31.0, "cy": 23.0}
 

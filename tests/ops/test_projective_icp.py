@@ -82,18 +82,18 @@ def test_is_the_reference(device, iterations):
 
 @pytest.mark.parametrize(("shift_m", "angle_deg"), [(0.0, 0.0), (0.05, 5.0), (0.1, 8.0)])
 def test_recovers_the_motion(device, shift_m, angle_deg):
-    points, vertices, normals, truth = problem(shift_m, angle_deg, device)
+    points, vertices, normals, ground_truth = problem(shift_m, angle_deg, device)
     pose, stats, hessian = ops.projective_icp(points, vertices, normals, START.to(device), INTRINSICS, **OPTIONS)
     found = pose7_to_matrix(pose.cpu().double().numpy())
-    assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 1e-3
-    assert np.degrees(rotation_angle(found[:3, :3].T @ truth[:3, :3])) < 0.1
+    assert np.linalg.norm(found[:3, 3] - ground_truth[:3, 3]) < 1e-3
+    assert np.degrees(rotation_angle(found[:3, :3].T @ ground_truth[:3, :3])) < 0.1
     assert float(stats[-1, 1]) > 0.5
     assert torch.linalg.eigvalsh(hessian.cpu().double()).min() > 0
 
 
 def test_holes_and_strangers_take_no_part(device):
     """Pixels without vertex or normal, NaN, and things that were not there before change nothing but their share."""
-    points, vertices, normals, truth = problem(0.04, 3.0, device)
+    points, vertices, normals, ground_truth = problem(0.04, 3.0, device)
     vertices[10:20, 10:30, 2] = 0
     vertices[20:24, :20] = torch.nan
     normals[30:40, 30:50] = 0
@@ -101,7 +101,7 @@ def test_holes_and_strangers_take_no_part(device):
     points[::11] = torch.nan
     pose, _, _ = ops.projective_icp(points, vertices, normals, START.to(device), INTRINSICS, **OPTIONS)
     found = pose7_to_matrix(pose.cpu().double().numpy())
-    assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 2e-3
+    assert np.linalg.norm(found[:3, 3] - ground_truth[:3, 3]) < 2e-3
 
 
 def test_same_bits_every_time(device):

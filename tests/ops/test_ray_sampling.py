@@ -49,7 +49,7 @@ def test_samples_equal_the_reference(dtype, counts, device, generator):
     settings = PAPER | dict(zip(("num_uniform", "num_surface"), counts, strict=True))
     got = ops.sample_along_rays(depth, **settings, **KEY)
     want = reference.ray_sampling.sample_along_rays(depth, *settings.values(), *KEY.values())
-    # A few roundings of a depth of up to five metres.
+    # A few roundings of a depth of up to five meters.
     torch.testing.assert_close(got, want, rtol=0, atol=5e-6 if dtype == torch.float32 else 1e-14)
     assert (got.diff(dim=1) >= 0).all()
 

@@ -1,4 +1,4 @@
-"""Tracking beyond the plain surface: pixels weighed by depth, a kernel to judge by, colours of an earlier frame."""
+"""Tracking beyond the plain surface: pixels weighed by depth, a kernel to judge by, colors of an earlier frame."""
 
 import numpy as np
 import pytest
@@ -22,17 +22,17 @@ from tests.ops.tracking_scene import (
 )
 
 
-@pytest.mark.parametrize("noise_depth", [0.0, 0.7, 2.0])
-def test_far_pixels_weigh_less(device, generator, noise_depth):
+@pytest.mark.parametrize("noise_crossover_depth", [0.0, 0.7, 2.0])
+def test_far_pixels_weigh_less(device, generator, noise_crossover_depth):
     """By 1 / (1 + (z / z0)^4) in the equations, which are told at a mean weight of 1; the fit doesn't know of it."""
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
     drawn = drawn_pixels(records)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     depth = camera_points(drawn)[:, 2]
-    certain = weight / (1 + (depth / noise_depth) ** 4) if noise_depth else weight
+    certain = weight / (1 + (depth / noise_crossover_depth) ** 4) if noise_crossover_depth else weight
     _, stats, hessian = ops.track_gauss_newton(
-        scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, noise_depth=noise_depth,
+        scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, noise_crossover_depth=noise_crossover_depth,
         tf32=False,
     )  # fmt: skip
     want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * weight.sum() / certain.sum()
@@ -41,8 +41,8 @@ def test_far_pixels_weigh_less(device, generator, noise_depth):
     assert stats[0, 4].item() == pytest.approx(float(weight.mean()), rel=2e-3)
 
 
-@pytest.mark.parametrize("noise_depth", [0.0, 2.0])
-def test_a_pose_is_judged_by_a_kernel_of_its_own(device, generator, noise_depth):
+@pytest.mark.parametrize("noise_crossover_depth", [0.0, 2.0])
+def test_a_pose_is_judged_by_a_kernel_of_its_own(device, generator, noise_crossover_depth):
     """The step is that of the iteration's kernel; the fit and the size of the equations are those of the other."""
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
@@ -50,11 +50,11 @@ def test_a_pose_is_judged_by_a_kernel_of_its_own(device, generator, noise_depth)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     judged = surface_equations(scene, drawn, 0.05)[2]
     depth = camera_points(drawn)[:, 2]
-    certain = weight / (1 + (depth / noise_depth) ** 4) if noise_depth else weight
+    certain = weight / (1 + (depth / noise_crossover_depth) ** 4) if noise_crossover_depth else weight
     arguments = scene, records.to(device), pose7(POSE, device), INTRINSICS
-    options = dict(**ONE_STEP, **KEY, noise_depth=noise_depth, tf32=False)
+    options = dict(**ONE_STEP, **KEY, noise_crossover_depth=noise_crossover_depth, tf32=False)
     pose, plain, _ = ops.track_gauss_newton(*arguments, **options)
-    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, **options, kernel_judge=0.05)
+    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, **options, score_kernel=0.05)
     assert torch.equal(pose, same_pose)
     assert torch.equal(plain[:, 1:4], stats[:, 1:4])
     assert stats[0, 0].item() == pytest.approx(float((judged * residual**2).sum() / judged.sum()), rel=1e-3)
@@ -67,7 +67,7 @@ def test_the_iterations_own_kernel_judges_where_none_is_named(device, generator)
     scene = make_scene(generator, random_decoder=True, device=device)
     arguments = scene, corner_pixels(POSE, generator, 400).to(device), pose7(POSE, device), INTRINSICS
     plain = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY)
-    named = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY, kernel_judge=ONE_STEP["kernel_end"])
+    named = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY, score_kernel=ONE_STEP["kernel_end"])
     assert all(torch.equal(one, other) for one, other in zip(plain, named, strict=True))
 
 
@@ -92,15 +92,15 @@ def _paint(points):
 
 
 def _painted(records):
-    """The records with the colour of the waves where a camera at POSE sees them."""
-    grey = _paint(moved_points(camera_points(records), torch.zeros(6, dtype=torch.float64)))
-    level = (255 * grey).round().int()
+    """The records with the color of the waves where a camera at POSE sees them."""
+    gray = _paint(moved_points(camera_points(records), torch.zeros(6, dtype=torch.float64)))
+    level = (255 * gray).round().int()
     return torch.stack([records[:, 0], records[:, 1], level | level << 8 | level << 16], 1)
 
 
 def _intensity_equations(reference, records):
     """Jacobian [P, 6] (m) by autograd through torch's bilinear sampling, and weight [P], at POSE."""
-    local, grey = camera_points(records), (records[:, 2] & 0xFF).double() / 255
+    local, gray = camera_points(records), (records[:, 2] & 0xFF).double() / 255
     cells, k = reference.cells.cpu().double(), reference.intrinsics
     pose = torch.from_numpy(pose7_to_matrix(reference.pose.cpu().double().numpy()))
     size = torch.tensor([cells.shape[1] - 1, cells.shape[0] - 1], dtype=torch.float64)
@@ -115,7 +115,7 @@ def _intensity_equations(reference, records):
     def difference(increment):
         grid = (2 * place(increment) / size - 1)[None, None]
         image = cells[None, ..., 0][None]
-        return torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, 0, 0] - grey
+        return torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, 0, 0] - gray
 
     zero = torch.zeros(6, dtype=torch.float64)
     left_top, depth = place(zero).floor().long(), seen(zero)[:, 2]
@@ -127,7 +127,7 @@ def _intensity_equations(reference, records):
     return reference.weight * torch.autograd.functional.jacobian(difference, zero), weight
 
 
-def test_colour_equations_are_those_of_autograd(device, generator):
+def test_color_equations_are_those_of_autograd(device, generator):
     """On a map without voxels the equations are the reference image's alone."""
     scene = ops.SceneView.empty(device=device)
     reference = _reference(moved_pose(POSE, 0.01, 0.03), device)
@@ -143,25 +143,25 @@ def test_colour_equations_are_those_of_autograd(device, generator):
     assert stats[0, [0, 1, 4]].tolist() == [0, 0, 0]
 
 
-def test_colours_count_by_their_luma(device, generator):
-    """Rec. 601's: a colour of the same luma as a grey gives the same equations."""
+def test_colors_count_by_their_luma(device, generator):
+    """Rec. 601's: a color of the same luma as a gray gives the same equations."""
     assert ops.LUMA_WEIGHTS == (299, 587, 114)
     red, green, blue = 11, 1, -34  # that weigh nothing together
-    grey = _painted(corner_pixels(POSE, generator, 400))
-    level = grey[:, 2] & 0xFF
-    coloured = torch.stack([grey[:, 0], grey[:, 1], (level + red) | (level + green) << 8 | (level + blue) << 16], 1)
+    gray = _painted(corner_pixels(POSE, generator, 400))
+    level = gray[:, 2] & 0xFF
+    colored = torch.stack([gray[:, 0], gray[:, 1], (level + red) | (level + green) << 8 | (level + blue) << 16], 1)
     reference, scene = _reference(moved_pose(POSE, 0.01, 0.03), device), ops.SceneView.empty(device=device)
     (pose, _, hessian), (want_pose, _, want) = (
         ops.track_gauss_newton(
             scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, reference=reference
         )
-        for records in (coloured, grey)
+        for records in (colored, gray)
     )
     torch.testing.assert_close(pose, want_pose, rtol=0, atol=1e-6)
     assert torch.allclose(hessian, want, rtol=0, atol=1e-5 * float(want.abs().max()))
 
 
-def test_colours_alone_find_the_pose(device, generator):
+def test_colors_alone_find_the_pose(device, generator):
     """Three painted walls, of which nothing is mapped."""
     reference = _reference(POSE, device)
     records = _painted(corner_pixels(POSE, generator)).to(device)
@@ -177,7 +177,7 @@ def test_colours_alone_find_the_pose(device, generator):
 
 
 def test_devices_agree_with_a_reference(device, generator):
-    """The CPU's pose and equations, with weights by depth and colours."""
+    """The CPU's pose and equations, with weights by depth and colors."""
     records, start = _painted(corner_pixels(POSE, generator)), pose7(moved_pose(POSE, 0.01, 0.02))
     results = []
     for place in ("cpu", device):
@@ -190,7 +190,7 @@ def test_devices_agree_with_a_reference(device, generator):
                 INTRINSICS,
                 **OPTIONS,
                 frame=4,
-                noise_depth=1.0,
+                noise_crossover_depth=1.0,
                 reference=_reference(POSE, place),
                 tf32=False,
             )  # fmt: skip

@@ -85,7 +85,7 @@ def test_losses_and_gradients_are_those_of_the_composition(device, options, gene
     rays, options = noisy_rays(generator, device=device), replace(options, **change)
     want_losses, want = render_step(scene, rays, options)
     if options.weight_rgb == 0:
-        want_losses[1] = 0  # colour is not evaluated
+        want_losses[1] = 0  # color is not evaluated
     losses, got = _step(scene, rays, options, gradient_buffers(scene))
     torch.testing.assert_close(losses.cpu().double(), want_losses, **_loss_tolerance(options))
     for name in want:
@@ -154,15 +154,15 @@ def test_tracking_leaves_the_scene_and_gives_the_same_pose_gradient(device, opti
     assert torch.equal(tracking.grad_poses, with_scene["poses"])
 
 
-def test_frozen_geometry_still_teaches_colour(device, options, generator):
+def test_frozen_geometry_still_teaches_color(device, options, generator):
     scene = make_scene(generator, random_decoder=True, device=device)
-    rays, everything, colour = noisy_rays(generator, device=device), gradient_buffers(scene), gradient_buffers(scene)
+    rays, everything, color = noisy_rays(generator, device=device), gradient_buffers(scene), gradient_buffers(scene)
     full = ops.render_step(scene, rays, options, everything)
-    colour = replace(colour, embeddings=None, embedding_stamps=None)
-    step = ops.render_step(scene, rays, replace(options, pose_gradient=False), colour)
+    color = replace(color, embeddings=None, embedding_stamps=None)
+    step = ops.render_step(scene, rays, replace(options, pose_gradient=False), color)
     assert step.grad_poses is None and step.grad_geometry is None
     assert torch.equal(step.losses, full.losses) and torch.equal(step.grad_color, full.grad_color)
-    assert torch.equal(colour.texels, everything.texels)
+    assert torch.equal(color.texels, everything.texels)
 
 
 def test_stamps_mark_the_rows_that_rays_reach(device, options, generator):

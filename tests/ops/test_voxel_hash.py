@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from spslam import ops
 from tests.reference.voxel_hash import LIMIT, DictVolume
 
-# Float32 points within a few metres and 4 cm voxels: local coordinates carry the rounding of p / voxel_size.
+# Float32 points within a few meters and 4 cm voxels: local coordinates carry the rounding of p / voxel_size.
 LOCAL_TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
 
 
@@ -78,7 +78,7 @@ def test_find_is_minus_one_out_of_range(device):
     assert ops.voxel_hash_find(keys, values, outside).tolist() == [-1, -1, 1, -1]
 
 
-def test_corner_rows_of_older_neighbours_are_completed(device, generator):
+def test_corner_rows_of_older_neighbors_are_completed(device, generator):
     reference = DictVolume()
     keys, values = ops.new_voxel_hash(1 << 12, device)
     buffer = torch.full((1000, 8), -1, dtype=torch.int32, device=device)

@@ -16,7 +16,7 @@ from spslam.prior.model import (
     weighted_means,
     without_position,
 )
-from spslam.prior.views import ViewSettings, observe
+from spslam.prior.patches import PatchSettings, observe
 
 # float32 sums of up to some hundred pairs in another order.
 ROUNDING = 2e-5
@@ -57,7 +57,7 @@ def test_decoding_is_that_of_the_op(decoder, generator):
 
 
 def test_patches_are_encoded_each_for_itself(encoder, generator):
-    patches = observe("box_on_plane", 5, generator, ViewSettings())
+    patches = observe("box_on_plane", 5, generator, PatchSettings())
     fields = encode_patches(patches, encoder, 64, 1e-3)
     lattice = torch.cartesian_prod(*[torch.arange(-6, 7)] * 3)
     embeddings, weights = fields.embeddings.view(5, len(lattice), 8), fields.weights.view(5, len(lattice))

@@ -9,12 +9,12 @@ import torch
 from spslam.errors import WeightsError
 from spslam.prior import load_prior
 from spslam.prior import pretrain as pretraining
+from spslam.prior.patches import PatchSettings
 from spslam.prior.pretrain import pretrain, training_files
 from spslam.prior.training import PretrainSettings, initial_networks, split_networks
 from spslam.prior.validation import first_zero_crossing, validate
-from spslam.prior.views import ViewSettings
 
-SMALL = PretrainSettings(steps=20, patches_per_kind=2, views=ViewSettings(rays=48))
+SMALL = PretrainSettings(steps=20, patches_per_kind=2, views=PatchSettings(rays=48))
 
 
 @pytest.fixture

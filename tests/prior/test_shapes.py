@@ -23,8 +23,8 @@ def test_surface_passes_near_the_origin(kind, generator):
 @pytest.mark.parametrize("kind", KINDS)
 def test_distance_is_never_more_than_the_way_to_another_point(kind, generator):
     solid = random_solid(kind, 16, generator)
-    centre = nearest_surface(solid, torch.randn(16, 1, 3, generator=generator))
-    here, there = (centre + 2 * torch.rand(16, 200, 3, generator=generator) - 1 for _ in range(2))
+    center = nearest_surface(solid, torch.randn(16, 1, 3, generator=generator))
+    here, there = (center + 2 * torch.rand(16, 200, 3, generator=generator) - 1 for _ in range(2))
     change = (solid.signed_distance(here) - solid.signed_distance(there)).abs()
     share = (change <= (here - there).norm(dim=-1) + ROUNDING).float().mean()
     assert share > (0.99 if kind == "superquadric" else 0.9999)
@@ -67,8 +67,8 @@ def _samples(part):
 def test_concave_solids_are_hollow(generator):
     rooms = random_solid("room", 8, generator)
     assert (rooms.orientation == -1).all()
-    centres = rooms.place - (rooms.anchor[:, None] @ rooms.rotation.transpose(1, 2))[:, 0]
-    assert (rooms.signed_distance(centres[:, None]) > 0).all()
+    centers = rooms.place - (rooms.anchor[:, None] @ rooms.rotation.transpose(1, 2))[:, 0]
+    assert (rooms.signed_distance(centers[:, None]) > 0).all()
 
 
 def test_rotations_are_proper(generator):

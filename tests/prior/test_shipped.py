@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.prior_accuracy import measure
+from experiments.prior_accuracy import measure
 from spslam.prior import load_prior
 from spslam.prior.validation import validate
 

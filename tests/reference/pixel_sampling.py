@@ -1,4 +1,4 @@
-"""Sampling a frame's pixels, in NumPy: mask, draw, normals, packing, lattice, view, one after the other."""
+"""Sampling a frame's pixels, in NumPy: mask, draw, normals, packing, depth_thumbnail, view, one after the other."""
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ def usable_depth(depth: np.ndarray, min_depth: float, max_depth: float) -> np.nd
 
 
 def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSampling, seed, stream, frame):
-    """Records int32 [P, 3], normals float32 [P, 3], lattice float16, view uint16, and the number of valid pixels."""
+    """Records int32 [P, 3], normals float32 [P, 3], depth_thumbnail float16, view uint16, and the number of valid pixels."""
     depth = usable_depth(depth, sampling.min_depth, sampling.max_depth)
     valid = np.flatnonzero(depth)
     count = sampling.count if len(valid) else 0
@@ -31,14 +31,14 @@ def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSamplin
     records[:, 0] = u.astype(np.uint32) | (v.astype(np.uint32) << 16)
     records[:, 1] = depth.ravel()[chosen].view(np.uint32)
     records[:, 2] = rgbc.view(np.uint32)[:, 0]
-    step = sampling.lattice_step
-    lattice = depth[step // 2 :: step, step // 2 :: step].astype(np.float16)
-    return records.view(np.int32), normals, lattice, _view(depth, sampling), len(valid)
+    step = sampling.thumbnail_step
+    depth_thumbnail = depth[step // 2 :: step, step // 2 :: step].astype(np.float16)
+    return records.view(np.int32), normals, depth_thumbnail, _view(depth, sampling), len(valid)
 
 
 def _view(depth: np.ndarray, sampling: ops.PixelSampling) -> np.ndarray:
-    if sampling.view_step == 0:
+    if sampling.depth_image_step == 0:
         return np.zeros((0, 0), np.uint16)
-    kept = depth[:: sampling.view_step, :: sampling.view_step]
-    units = np.floor(kept * (np.float32(1) / np.float32(sampling.view_unit)) + np.float32(0.5))
+    kept = depth[:: sampling.depth_image_step, :: sampling.depth_image_step]
+    units = np.floor(kept * (np.float32(1) / np.float32(sampling.depth_image_unit)) + np.float32(0.5))
     return np.where(units < 65536, units, 0).astype(np.uint16)

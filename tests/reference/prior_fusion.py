@@ -36,12 +36,12 @@ def depth_normal(depth: np.ndarray, u: int, v: int, fx, fy, cx, cy, step: int, m
         return np.array([(x - cx) / fx * z, (y - cy) / fy * z, z])
 
     center = point(u, v)
-    neighbours = [point(u + step, v), point(u - step, v), point(u, v + step), point(u, v - step)]
-    if center[2] <= 0 or any(p[2] <= 0 for p in neighbours):
+    neighbors = [point(u + step, v), point(u - step, v), point(u, v + step), point(u, v - step)]
+    if center[2] <= 0 or any(p[2] <= 0 for p in neighbors):
         return np.zeros(3)
-    if max(abs(p[2] - center[2]) for p in neighbours) >= max_jump * center[2]:
+    if max(abs(p[2] - center[2]) for p in neighbors) >= max_jump * center[2]:
         return np.zeros(3)
-    normal = np.cross(neighbours[0] - neighbours[1], neighbours[2] - neighbours[3])
+    normal = np.cross(neighbors[0] - neighbors[1], neighbors[2] - neighbors[3])
     length = np.linalg.norm(normal)
     return normal / length * (-1 if normal @ center > 0 else 1) if length > 0 else np.zeros(3)
 

@@ -23,7 +23,7 @@ def _mlp(x, params, outputs):
 
 
 def unpack(pixels):
-    """Pixel records to (u, v, depth, colour in [0, 1], foreshortening), float64."""
+    """Pixel records to (u, v, depth, color in [0, 1], foreshortening), float64."""
     words = np.ascontiguousarray(pixels.cpu().numpy()).view(np.uint32)
     color = np.stack([words[:, 2] >> shift & 255 for shift in (0, 8, 16)], 1) / 255
     fields = words[:, 0] & 0xFFFF, words[:, 0] >> 16, words[:, 1].view(np.float32), color, (words[:, 2] >> 24) / 128
@@ -58,7 +58,7 @@ def _corner_ids(scene, points):
 
 
 def sdf(scene, parameters, points):
-    """Normalised SDF [N] and whether a point is inside, of float64 points [N, 3]."""
+    """Normalized SDF [N] and whether a point is inside, of float64 points [N, 3]."""
     corners = _corner_ids(scene, points)
     u = points / scene.voxel_size
     feature = trilinear_interpolate(parameters["embeddings"], corners, u - u.detach().floor())

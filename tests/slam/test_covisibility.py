@@ -1,4 +1,4 @@
-"""Which frames a mapping call optimises."""
+"""Which frames a mapping call optimizes."""
 
 import torch
 
@@ -12,7 +12,7 @@ SIZES = ("mapping.frames=12", "mapping.recent=4", "mapping.covisible=5")
 
 
 def views(count, seen):
-    """Pixels, poses and lattices of frames that look at a wall at z = 2 m; those not in `seen` look the other way."""
+    """Pixels, poses and depth_thumbnails of frames that look at a wall at z = 2 m; those not in `seen` look the other way."""
     poses = torch.tensor([1.0, 0, 0, 0, 0, 0, 0]).repeat(count, 1)
     away = torch.tensor([i not in seen for i in range(count)])
     poses[away, :4] = torch.tensor([0.0, 0, 1, 0])
@@ -20,8 +20,8 @@ def views(count, seen):
     u, v = (torch.randint(0, size, (500,), generator=generator) for size in (CAMERA.width, CAMERA.height))
     depth = torch.full((500,), 2.0).view(torch.int32)
     records = torch.stack([(u | v << 16).int(), depth, torch.zeros(500, dtype=torch.int32)], 1)
-    lattice = torch.full(FrameTable(CAMERA).lattices.shape[1:], 2.0, dtype=torch.float16)
-    return records.expand(count, -1, -1), poses, lattice.expand(count, -1, -1)
+    depth_thumbnail = torch.full(FrameTable(CAMERA).depth_thumbnails.shape[1:], 2.0, dtype=torch.float16)
+    return records.expand(count, -1, -1), poses, depth_thumbnail.expand(count, -1, -1)
 
 
 def select(frames, seen, *overrides, usable=None):

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from spslam.slam.frame_report import FrameMarks, PendingReport
-from spslam.slam.timeline import marker
+from spslam.slam.device_events import marker
+from spslam.slam.frame_report import FrameEvents, PendingReport
 
 
 class At:
@@ -13,7 +13,7 @@ class At:
     def __init__(self, ms: float, passed: bool = True):
         self.ms, self.passed, self.waited = ms, passed, False
 
-    def has_passed(self):
+    def is_complete(self):
         return self.passed
 
     def wait(self):
@@ -23,7 +23,7 @@ class At:
         return self.ms - earlier.ms
 
 
-def mapped_frame(**changes) -> FrameMarks:
+def mapped_frame(**changes) -> FrameEvents:
     marks = {
         "asked": At(10),
         "began": At(13),
@@ -33,7 +33,7 @@ def mapped_frame(**changes) -> FrameMarks:
         "upload": (At(4), At(4.5)),
         "done": At(22),
     }
-    return FrameMarks(**{**marks, **changes})
+    return FrameEvents(**{**marks, **changes})
 
 
 def test_stages_and_the_rest_add_up():
@@ -56,10 +56,10 @@ def test_stages_that_did_not_take_place_have_no_length():
 
 def test_a_report_is_done_with_the_frames_last_mark():
     known = {
-        "frame": 3, "index": 4, "timestamp": 0.1, "lost": False, "valid_depth": 0.9, "tracking_iterations": 8,
-        "residual_cm": 0.2, "inliers": 0.8, "support": 0.7, "information": 0.01, "jump_cm": 0.3,
-        "jump_deg": 0.2, "conflict": None, "hidden": None, "coverage": None, "likeness": None, "doubt": 0.01,
-        "rescued": False, "relocalised": False, "mapping_iterations": 5, "voxels": 100, "decode_ms": 6.0,
+        "frame": 3, "index": 4, "timestamp": 0.1, "lost": False, "valid_depth_share": 0.9, "tracking_iterations": 8,
+        "residual_cm": 0.2, "inlier_share": 0.8, "mean_robust_weight": 0.7, "min_eigenvalue": 0.01, "prediction_error_cm": 0.3,
+        "prediction_error_deg": 0.2, "free_space_violation": None, "occluded_share": None, "map_coverage": None, "brightness_correlation": None, "error_probability": 0.01,
+        "recovered": False, "relocalized": False, "mapping_iterations": 5, "voxels": 100, "decode_ms": 6.0,
     }  # fmt: skip
     marks = mapped_frame(done=At(22, passed=False))
     pending = PendingReport(known, marks, 0.0, torch.tensor(0.25))
@@ -75,6 +75,6 @@ def test_marks_of_a_device_are_in_order(device):
     torch.ones(1000, device=device).sum()
     second = mark()
     second.wait()
-    assert first.has_passed()
-    assert second.has_passed()
+    assert first.is_complete()
+    assert second.is_complete()
     assert second.ms_since(first) >= 0

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from spslam import ops
-from spslam.slam.pixels import LATTICE_STEP_PX, sample_frame, unpack_points
+from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame, unpack_points
 from spslam.slam.state import FrameTable, pose_tensor
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
@@ -44,11 +44,11 @@ def test_kernels_unpack_the_same_points(dataset):
     scene, records = system.state.scene, sample_frame(dataset[1], camera, config).records[:2000]
     rotation = torch.from_numpy(frame.pose[:3, :3]).float()
     sdf, valid = scene.sdf(unpack_points(records, camera) @ rotation.T + pose[4:])
-    _, _, _, inliers = ops.gauss_newton_poses(
+    _, _, _, inlier_share = ops.gauss_newton_poses(
         scene.view(), records[None], pose[None], system.tracker.intrinsics, truncation=0.08, kernel=0.02
     )
-    assert float(inliers) > 0.3
-    assert float(inliers) == pytest.approx(float((valid & (sdf.abs() < 0.98)).float().mean()), abs=2e-3)
+    assert float(inlier_share) > 0.3
+    assert float(inlier_share) == pytest.approx(float((valid & (sdf.abs() < 0.98)).float().mean()), abs=2e-3)
 
 
 def test_the_draw_depends_on_seed_and_frame_alone(dataset):
@@ -68,7 +68,7 @@ def test_only_usable_depth_is_drawn(dataset):
     u, v = pixels.records[:, 0] & 0xFFFF, pixels.records[:, 0] >> 16
     assert (u >= 100).all()
     assert (v >= 40).all()
-    assert pixels.valid_share == pytest.approx(60 * 80 / (160 * 120))
+    assert pixels.valid_depth_share == pytest.approx(60 * 80 / (160 * 120))
 
 
 def test_a_frame_without_depth_has_no_records(dataset):
@@ -76,25 +76,25 @@ def test_a_frame_without_depth_has_no_records(dataset):
     frame.depth[:] = 0
     pixels = sample_frame(frame, dataset.camera, settings())
     assert pixels.records.shape == pixels.normals.shape == (0, 3)
-    assert pixels.valid_share == 0
-    assert not pixels.lattice.any()
+    assert pixels.valid_depth_share == 0
+    assert not pixels.depth_thumbnail.any()
 
 
 def test_the_lattice_fits_the_frame_table(dataset):
     frame = dataset[0]
-    lattice = sample_frame(frame, dataset.camera, settings()).lattice
-    assert lattice.shape == FrameTable(dataset.camera).lattices.shape[1:]
-    half = LATTICE_STEP_PX // 2
-    np.testing.assert_allclose(lattice[2, 3], frame.depth[half + 32, half + 48], rtol=1e-3)
+    depth_thumbnail = sample_frame(frame, dataset.camera, settings()).depth_thumbnail
+    assert depth_thumbnail.shape == FrameTable(dataset.camera).depth_thumbnails.shape[1:]
+    half = THUMBNAIL_STEP_PX // 2
+    np.testing.assert_allclose(depth_thumbnail[2, 3], frame.depth[half + 32, half + 48], rtol=1e-3)
 
 
 def test_one_buffer_holds_everything(dataset):
     frame, camera = dataset[0], dataset.camera
     pixels = sample_frame(frame, camera, settings())
     copy = pixels.holding(pixels.buffer.clone())
-    for name in ("records", "normals", "lattice"):
+    for name in ("records", "normals", "depth_thumbnail"):
         assert torch.equal(getattr(copy, name), getattr(pixels, name))
         storage = getattr(copy, name).untyped_storage()
         assert storage.data_ptr() == copy.buffer.untyped_storage().data_ptr()
     assert copy.count == len(copy.records) == 15000
-    assert pixels.to(torch.device("cpu")).valid_share == pixels.valid_share
+    assert pixels.to(torch.device("cpu")).valid_depth_share == pixels.valid_depth_share

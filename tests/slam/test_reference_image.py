@@ -1,13 +1,13 @@
-"""The small grey image of a mapped frame, and tracking with it."""
+"""The small gray image of a mapped frame, and tracking with it."""
 
 import numpy as np
 import pytest
 import torch
 
 from spslam.camera import Camera
-from spslam.slam.past import Past
+from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import sample_frame, unpack_points
-from spslam.slam.reference_image import ReferenceKeeper, reference_cells
+from spslam.slam.reference_image import ReferenceCache, reference_cells
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
 
@@ -32,7 +32,7 @@ def test_cells_are_means_of_their_records():
 
 
 def test_a_reference_is_made_once_a_frame_and_follows_its_pose():
-    keeper = ReferenceKeeper(CAMERA, weight_m=0.3, kernel=0.4)
+    keeper = ReferenceCache(CAMERA, weight_m=0.3, kernel=0.4)
     records = torch.tensor([record(10, 10, 1.0, (9, 9, 9))], dtype=torch.int32)
     first, again = (keeper.of(5, records, torch.full((7,), pose)) for pose in (1.0, 2.0))
     assert again.cells is first.cells and again.pose[0] == 2.0
@@ -53,17 +53,17 @@ def processed(dataset, count, *overrides):
 
 def test_the_reference_is_the_last_mapped_frame(dataset):
     system = processed(dataset, 8, "mapping.every=3")
-    past = Past(system.state, dataset.camera)
-    row, frame = past.mapped(every=3)
+    history = FrameHistory(system.state, dataset.camera)
+    row, frame = history.mapped(every=3)
     assert row == 6 and torch.equal(frame.pose, system.state.frames.poses[6])
     system.state.frames.lost[6] = True
-    assert past.mapped(every=3)[0] == 3
+    assert history.mapped(every=3)[0] == 3
     system.state.frames.lost[:] = True
-    assert past.mapped(every=3) is None
+    assert history.mapped(every=3) is None
 
 
-def test_colours_take_part_only_where_asked(dataset):
-    """Colour moves the pose a little; a weight of 0 leaves it to the bit what it is."""
+def test_colors_take_part_only_where_asked(dataset):
+    """Color moves the pose a little; a weight of 0 leaves it to the bit what it is."""
     plain, off, on = (
         processed(dataset, 8, *overrides).state.frames.poses
         for overrides in ((), ("tracking.color_kernel=0.1",), ("tracking.color_weight_m=0.1",))

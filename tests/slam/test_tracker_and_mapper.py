@@ -23,7 +23,9 @@ def shifted(x):
 def table(camera, xs, lost=()):
     frames = FrameTable(camera)
     for row, x in enumerate(xs):
-        frames.append(pose_tensor(shifted(x), CPU), row / 30, row, row in lost, torch.zeros(frames.lattices.shape[1:]))
+        frames.append(
+            pose_tensor(shifted(x), CPU), row / 30, row, row in lost, torch.zeros(frames.depth_thumbnails.shape[1:])
+        )
     return frames
 
 
@@ -44,7 +46,7 @@ def processed(dataset, count, *overrides, preset=None):
 
 def test_frame_table_grows_and_keeps_its_rows(dataset):
     frames = table(dataset.camera, range(200), lost={7})
-    assert len(frames) == len(frames.poses) == len(frames.lattices) == 200
+    assert len(frames) == len(frames.poses) == len(frames.depth_thumbnails) == 200
     assert frames.poses[:, 4].tolist() == list(range(200))
     assert frames.lost.nonzero()[:, 0].tolist() == [7]
     np.testing.assert_allclose(frames.matrices(-2), [shifted(198), shifted(199)])
@@ -126,7 +128,7 @@ def test_the_first_pose_is_held_and_others_move(dataset):
     torch.testing.assert_close(after[:, :4].norm(dim=1), torch.ones(6))
 
 
-def test_poses_stay_where_they_are_not_optimised(dataset):
+def test_poses_stay_where_they_are_not_optimized(dataset):
     system = processed(dataset, 4, "mapping.every=100", preset="fast")
     before = system.state.frames.poses.clone()
     geometry, texels = system.state.scene.volume.embeddings.clone(), system.state.scene.planes.texels.clone()
@@ -136,7 +138,7 @@ def test_poses_stay_where_they_are_not_optimised(dataset):
     assert not torch.equal(system.state.scene.planes.texels, texels)
 
 
-def test_nothing_to_optimise_is_no_error(dataset):
+def test_nothing_to_optimize_is_no_error(dataset):
     system = SlamSystem(settings(), dataset.camera)
     assert system.mapper.optimize(system.state, 5) is None
     system.process(dataset[0])
@@ -152,7 +154,7 @@ def test_moments_follow_the_map_as_it_grows(dataset):
     pixels = sample_frame(far, dataset.camera, system.config)
     pose = dataset.poses()[0]
     pose[:3, 3] -= 3
-    state.frames.append(pose_tensor(pose, CPU), 0.1, 1, False, pixels.lattice)
+    state.frames.append(pose_tensor(pose, CPU), 0.1, 1, False, pixels.depth_thumbnail)
     state.pixels.add(pixels.records)
     voxels = state.scene.volume.num_voxels
     system.mapper.integrate(state, pixels)

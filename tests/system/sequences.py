@@ -12,7 +12,7 @@ from spslam.config import Config, load_config
 from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.generated import GeneratedDataset
-from spslam.slam.run import run_sequence
+from spslam.run.sequence import run_sequence
 from tests.datasets.layouts import matrix_text, write_color, write_depth
 
 WIDTH, HEIGHT = 160, 120

@@ -22,13 +22,13 @@ DEPTH_CM = {"balanced": 0.25, "fast": 0.25, "paper": 0.4}
 @pytest.mark.parametrize("preset", ATE_CM)
 def test_path_and_surface_are_found(preset):
     dataset = Recorded(FRAMES)
-    truth = dataset.poses()
-    system = SlamSystem(settings(preset=preset), dataset.camera, truth[0])
+    ground_truth = dataset.poses()
+    system = SlamSystem(settings(preset=preset), dataset.camera, ground_truth[0])
     reports = [system.process(frame) for frame in dataset]
     system.finish()
     assert not any(report.lost for report in reports)
     trajectory = system.trajectory()
-    assert ate(trajectory.poses, truth)["ate_rmse_cm"] < ATE_CM[preset]
+    assert ate(trajectory.poses, ground_truth)["ate_rmse_cm"] < ATE_CM[preset]
     frames = dataset.frames[::6]
     errors = [zero_crossing_errors(system.state.scene, frame, dataset.camera, trajectory) for frame in frames]
     found = np.concatenate([error[np.isfinite(error)] for error in errors])
@@ -77,7 +77,7 @@ def test_a_run_leaves_every_file(monkeypatch, tmp_path):
     log = [json.loads(line) for line in (output / "log.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in log] == list(range(12))
     assert log[0]["tracking_iterations"] == 0
-    assert log[0]["inliers"] is None
+    assert log[0]["inlier_share"] is None
     assert [line["frame"] for line in log if line["mapping_iterations"]] == [0, 5, 10]
 
 
@@ -100,10 +100,10 @@ def test_the_first_pose_is_the_data_sets_or_the_identity(monkeypatch, tmp_path):
 @pytest.mark.parametrize("distance_m", [1000.0, 5000.0])
 def test_far_from_the_origin_all_is_the_same(distance_m):
     dataset = Recorded(15)
-    truth = dataset.poses()
-    truth[:, :3, 3] += distance_m * np.array([0.8, -0.6, 0])
-    system = SlamSystem(settings(preset="fast"), dataset.camera, truth[0])
+    ground_truth = dataset.poses()
+    ground_truth[:, :3, 3] += distance_m * np.array([0.8, -0.6, 0])
+    system = SlamSystem(settings(preset="fast"), dataset.camera, ground_truth[0])
     reports = [system.process(frame) for frame in dataset]
     found = system.trajectory().poses
     assert not any(report.lost for report in reports)
-    assert np.abs(found[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
+    assert np.abs(found[:, :3, 3] - ground_truth[:, :3, 3]).max() < 0.01

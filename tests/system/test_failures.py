@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from spslam.errors import DeviceError
-from spslam.slam.device import explained_failures, resolve_device
-from spslam.slam.interruption import Interruption
+from spslam.run.device import explained_failures, resolve_device
+from spslam.run.interruption import Interruption
 from spslam.slam.mapper import Mapper
 from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, results, run_on

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from spslam.benchmark.faults import COVERS, black_out, plan, run_trials
+from experiments.fault_injection import COVERS, black_out, plan, run_trials
 from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.generated import GeneratedDataset
-from spslam.slam.run import run_sequence
+from spslam.run.sequence import run_sequence
 from spslam.trajectory import Trajectory
 from tests.datasets.layouts import shared_data
 from tests.system.sequences import Recorded, results, run_on, settings
@@ -25,7 +25,7 @@ def outcomes():
 
 
 def test_every_fault_is_noticed_and_the_camera_found_again(outcomes):
-    assert sorted(outcome.trial.fault for outcome in outcomes) == ["black-out", "cover", "jump", "return"]
+    assert sorted(outcome.trial.fault for outcome in outcomes) == ["black-out", "cover", "prediction_error", "return"]
     for outcome in outcomes:
         assert outcome.passed, outcome
         assert outcome.wrong_unflagged == 0, outcome
@@ -83,13 +83,13 @@ def test_the_trajectory_has_a_gap_where_the_camera_was_lost(monkeypatch, tmp_pat
     metrics = run_on(monkeypatch, dataset, tmp_path / "out", "run.previews=4", mesh=True)
     lines = (tmp_path / "out" / "trajectory.txt").read_text().splitlines()[1:]
     assert [i for i, line in enumerate(lines) if line.startswith("# lost")] == list(BLACK)
-    assert (metrics["lost_frames"], metrics["losses"]) == (6, 1)
+    assert (metrics["lost_frames"], metrics["tracking_failures"]) == (6, 1)
     assert metrics["ate_max_cm"] < 3  # of the frames whose pose is known
     found = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt")
     np.testing.assert_allclose(found.poses[18:, :3, 3], dataset.poses()[18:, :3, 3], atol=0.03)
     log = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert all(log[i]["mapping_iterations"] == 0 for i in (*BLACK, 18, 19))
-    assert all(line["doubt"] < 0.1 for line in log[1:] if not line["lost"])
+    assert all(line["error_probability"] < 0.1 for line in log[1:] if not line["lost"])
 
 
 def test_a_run_killed_while_lost_goes_on_to_the_same_bytes(monkeypatch, tmp_path):

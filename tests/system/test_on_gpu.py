@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from spslam.evaluation.trajectory import ate
+from spslam.run.frame_feed import FrameFeed
 from spslam.slam.checkpoint import take_snapshot
-from spslam.slam.frame_feed import FrameFeed
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, results, run_on, settings
 
 pytestmark = pytest.mark.cuda
 FRAMES = 25
 RUNS = 3
-# The two devices add in another order, and optimisation amplifies that; both are this near the truth's path.
+# The two devices add in another order, and optimization amplifies that; both are this near the truth's path.
 AGREEMENT_CM = 0.1
 # The pose of each frame must be known before it is decided whether to map it; mapping waits for the size of the map.
 WAITS_A_FRAME = 1
@@ -26,13 +26,13 @@ WAITS_A_MAPPING_CALL = 1
 @pytest.mark.parametrize("preset", ["balanced", "fast", "paper"])
 def test_cpu_and_cuda_agree(preset):
     dataset = Recorded(FRAMES)
-    truth, errors = dataset.poses(), []
+    ground_truth, errors = dataset.poses(), []
     for device in ("cpu", "cuda"):
-        system = SlamSystem(settings(preset=preset), dataset.camera, truth[0], device)
+        system = SlamSystem(settings(preset=preset), dataset.camera, ground_truth[0], device)
         for frame in dataset:
             assert not system.process(frame).lost
         system.finish()
-        errors.append(ate(system.trajectory().poses, truth)["ate_rmse_cm"])
+        errors.append(ate(system.trajectory().poses, ground_truth)["ate_rmse_cm"])
     assert abs(errors[0] - errors[1]) < AGREEMENT_CM, errors
 
 

@@ -12,8 +12,8 @@ import pytest
 
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
-from spslam.slam import run_loop
-from spslam.slam.run import run_sequence
+from spslam.run.sequence import run_sequence
+from spslam.run import loop as run_loop
 from tests.cli.command import ROOT
 from tests.system.sequences import FAST_SETTINGS, Recorded, results, run_on, settings, write_room
 
@@ -152,7 +152,7 @@ def test_skipped_frames_are_counted_once(monkeypatch, tmp_path):
     ]
 
 
-def test_the_last_optimisation_is_not_forgotten(monkeypatch, tmp_path):
+def test_the_last_optimization_is_not_forgotten(monkeypatch, tmp_path):
     """The frames after the checkpoint can't be read, so only the checkpoint knows that a mapping call is due."""
 
     def change(frame):

@@ -10,7 +10,7 @@ from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError, OutputError, SpslamError
 from spslam.scene import Scene
-from spslam.slam import run as run_module
+from spslam.run import sequence as run_module
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, run_on, settings
@@ -35,8 +35,8 @@ def unreadable(*indices):
 def path_error_m(output, dataset, rows):
     """Largest distance from the true path at some rows of the trajectory, which starts at the true first pose."""
     found = Trajectory.load_tum(output / "trajectory.txt").poses
-    truth = dataset.poses()[-len(found) :] if len(found) < len(dataset) else dataset.poses()
-    return np.linalg.norm(found[rows, :3, 3] - truth[rows, :3, 3], axis=1).max()
+    ground_truth = dataset.poses()[-len(found) :] if len(found) < len(dataset) else dataset.poses()
+    return np.linalg.norm(found[rows, :3, 3] - ground_truth[rows, :3, 3], axis=1).max()
 
 
 def test_unreadable_frame_is_skipped_and_counted(monkeypatch, tmp_path):
@@ -189,7 +189,7 @@ def test_full_disk_keeps_the_checkpoint_before(monkeypatch, tmp_path, tiny_disk)
 
 
 class Tiny(RgbdDataset):
-    """Frames of one size, too small for a co-visibility lattice of more than a cell."""
+    """Frames of one size, too small for a co-visibility depth_thumbnail of more than a cell."""
 
     name, camera = "tiny", Camera(16, 16, 14, 14, 7.5, 7.5)
 

@@ -26,7 +26,7 @@ struct RayStepArguments {
   PhiloxKey key;
   LossWeights scale;  // weights of the terms over the number of rays
   bool cosine_targets;
-  bool color, pose;                    // whether colour is rendered, whether poses have a gradient
+  bool color, pose;                    // whether color is rendered, whether poses have a gradient
   bool geometry_params, color_params;  // whether the decoders have one
   TableSums embeddings, texels;
   float fixed_point_scale;

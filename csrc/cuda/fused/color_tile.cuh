@@ -1,4 +1,4 @@
-// Colour of a tile of 16 rendered samples: texels gathered, decoded, and the way back.
+// Color of a tile of 16 rendered samples: texels gathered, decoded, and the way back.
 //
 // Lanes 4 g + q hold rows g and g + 8, of the texel channels 4 q .. 4 q + 3 and 16 + 4 q .. 16 + 4 q + 3.
 #pragma once
@@ -19,7 +19,7 @@ struct ColorTile {
   float rgb[2][3];
 };
 
-// Rows of the texel table to the neighbours along u and v; 0 where the plane has but one.
+// Rows of the texel table to the neighbors along u and v; 0 where the plane has but one.
 __device__ __forceinline__ int step_u(const PlaneLayout& plane) {
   return plane.size_u > 1 ? plane.size_v : 0;
 }
@@ -121,7 +121,7 @@ __device__ __forceinline__ void color_forward(const RayStepArguments& a, const f
   }
 }
 
-// Gradient of the decoder's input from those by the colour of the lane's rows. Stages deltas where `stage` is not null.
+// Gradient of the decoder's input from those by the color of the lane's rows. Stages deltas where `stage` is not null.
 template <Precision kPrecision>
 __device__ __forceinline__ void color_backward(const float* image, const ColorTile& tile, const float (&grad_rgb)[2][3],
                                                int lane, float (&grad_x)[4][4], Stage<kPrecision>* stage) {

@@ -66,7 +66,7 @@ __device__ __forceinline__ void step_pose(const MapUpdateArguments& a, std::int6
             a.poses.exp_avg_sq + at);
 }
 
-// Takes four neighbouring sums, and leaves zeros.
+// Takes four neighboring sums, and leaves zeros.
 __device__ __forceinline__ float4 take_sums(std::int64_t* sums, float inverse_scale) {
   longlong2* p = reinterpret_cast<longlong2*>(sums);
   const longlong2 low = __ldcg(p), high = __ldcg(p + 1);

@@ -1,7 +1,7 @@
 // The ray kernel: a warp a ray, forward and back in one go.
 //
 // Blocks take groups of rays in a fixed order and leave their sums in partials, to be added in the order of the blocks:
-// where the scene is optimised the gradients of the decoders and the loss terms, where it is frozen the loss terms and
+// where the scene is optimized the gradients of the decoders and the loss terms, where it is frozen the loss terms and
 // the gradient of the one pose.
 #pragma once
 
@@ -24,7 +24,7 @@ struct WarpSums {
   float pull[kPoseGradientSize];  // where there is but one pose
 };
 
-// A block's shared memory: decoders, warps, and staged tiles where the scene is optimised.
+// A block's shared memory: decoders, warps, and staged tiles where the scene is optimized.
 template <Precision kPrecision, bool kTrain, int kWarps>
 struct BlockMemory {
   alignas(16) float image[Image::size];

@@ -13,7 +13,7 @@ struct RayRendering {
   int num_rendered;
 };
 
-// Normalised weights to scratch.weight, and the list of the samples that are rendered.
+// Normalized weights to scratch.weight, and the list of the samples that are rendered.
 __device__ __forceinline__ RayRendering weigh_samples(const WarpRay& ray, float truncation, int lane,
                                                       RayScratch& scratch) {
   RayRendering out{};
@@ -55,7 +55,7 @@ __device__ __forceinline__ RayRendering weigh_samples(const WarpRay& ray, float 
 }
 
 // Losses of a ray, added to `losses`, whose sum over the lanes counts; gradients by the SDF to scratch.grad_sdf, and by
-// the rendered colour to grad_color.
+// the rendered color to grad_color.
 __device__ __forceinline__ void supervise_ray(const RayStepArguments& a, const WarpRay& ray,
                                               const RayRendering& rendering, int lane, RayScratch& scratch,
                                               RayLosses<float>& losses, float (&grad_color)[3]) {

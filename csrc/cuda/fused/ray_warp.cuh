@@ -70,7 +70,7 @@ class RayWarp {
     return staged;
   }
 
-  // d L / d pose: by translation, and by a turn about the camera's centre. In all lanes.
+  // d L / d pose: by translation, and by a turn about the camera's center. In all lanes.
   __device__ __forceinline__ void pull(float (&out)[kPoseGradientSize]) const {
     const Vec3<float> force{sum_warp(force_.x), sum_warp(force_.y), sum_warp(force_.z)};
     const Vec3<float> moment{sum_warp(moment_.x), sum_warp(moment_.y), sum_warp(moment_.z)};

@@ -15,7 +15,7 @@ struct StageElement<Precision::kFp32> {
   using type = float;
 };
 
-// Row lengths are such that neighbouring rows fall on different banks.
+// Row lengths are such that neighboring rows fall on different banks.
 template <Precision kPrecision>
 struct alignas(16) Stage {
   using Element = typename StageElement<kPrecision>::type;

@@ -72,7 +72,7 @@ class WeightGradients<Precision::kTf32, kWarps> {
   }
 
  private:
-  // 0: first geometry layer; 1, 2: second; 3, 4: first colour layer; 5, 6: second; 7: both output layers.
+  // 0: first geometry layer; 1, 2: second; 3, 4: first color layer; 5, 6: second; 7: both output layers.
   static constexpr int kStrips = 8, kOutputStrip = 7, kOwned = kStrips / kWarps;
   static constexpr int kElement = sizeof(__nv_bfloat16);
 
@@ -193,7 +193,7 @@ class WeightGradients<Precision::kTf32, kWarps> {
   float sums_[kOwned][4][4] = {}, biases_[kOwned][4][4] = {};
 };
 
-// ---- float: lane n holds unit n, its warp some neighbouring rows of the matrices.
+// ---- float: lane n holds unit n, its warp some neighboring rows of the matrices.
 
 template <int kWarps>
 class WeightGradients<Precision::kFp32, kWarps> {

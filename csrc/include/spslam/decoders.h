@@ -1,4 +1,4 @@
-// The small networks that turn interpolated features into SDF and colour: input -> hidden -> hidden -> output, ReLU
+// The small networks that turn interpolated features into SDF and color: input -> hidden -> hidden -> output, ReLU
 // between.
 //
 // Parameters lie flat: W1 [hidden, input], b1, W2 [hidden, hidden], b2, W3 [output, hidden], b3, row-major.

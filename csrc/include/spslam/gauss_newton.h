@@ -17,7 +17,7 @@ constexpr int kTrackingStatSize = 5;
 // pixels can be summed exactly. Python reads them by the op luma_weights.
 constexpr std::int64_t kLumaWeights[3] = {299, 587, 114};
 
-// A small grey image of an earlier frame, which tracking compares colours with; none where height is 0.
+// A small gray image of an earlier frame, which tracking compares colors with; none where height is 0.
 struct ReferenceImage {
   const float* cells;  // [height, width, 2] intensity in [0, 1], depth (m; 0 where unknown)
   const float* pose;   // [7] T_world_camera of the frame
@@ -27,10 +27,10 @@ struct ReferenceImage {
   float kernel;           // width of the robust kernel, intensity
 };
 
-constexpr int kMaxDepthViews = 8;
+constexpr int kMaxDepthKeyframes = 8;
 
 // Depth images of earlier frames, which tracking holds surface points against; none where count is 0.
-struct DepthViews {
+struct DepthKeyframes {
   const std::uint16_t* images;  // [R, height, width] depth in `unit`, 0 where unknown
   const float* poses;           // [F, 7] T_world_camera
   std::int64_t height, width;
@@ -39,7 +39,7 @@ struct DepthViews {
   float kernel_end;              // m, width of the robust kernel at the last iterations
   std::int64_t first_iteration;  // from which on they take part
   int count;
-  std::int64_t image_rows[kMaxDepthViews], pose_rows[kMaxDepthViews];  // of each view
+  std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each view
 };
 
 struct TrackingOptions {
@@ -47,12 +47,12 @@ struct TrackingOptions {
   std::int64_t num_pixels, iterations;
   float truncation;                // m
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
-  float kernel_judge;              // m, width of the kernel of cost and mean weight; 0: the iteration's own
+  float score_kernel;              // m, width of the kernel of cost and mean weight; 0: the iteration's own
   double damping;
   PhiloxKey key;      // its iteration is replaced by the running one
-  float noise_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
+  float noise_crossover_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
   ReferenceImage reference;
-  DepthViews views;
+  DepthKeyframes views;
   bool tf32;  // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
 };
 

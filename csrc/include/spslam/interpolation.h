@@ -37,7 +37,7 @@ void bilinear_interpolate_backward(Device device, const T* grad, const T* texels
                                    std::int64_t width, std::int64_t channels, const T* uv, std::int64_t num_points,
                                    T* grad_texels, T* grad_uv, std::int64_t* workspace);
 
-// texels [num_rows, channels], points [N, 3] in metres, clamped to each plane, out [N, channels]. If a plane is empty
+// texels [num_rows, channels], points [N, 3] in meters, clamped to each plane, out [N, channels]. If a plane is empty
 // the value is 0.
 template <class Device, class T>
 void tri_plane_interpolate(Device device, const T* texels, std::int64_t num_rows, std::int64_t channels,

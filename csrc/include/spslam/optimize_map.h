@@ -1,4 +1,4 @@
-// A whole mapping call: all iterations of the joint optimisation of scene and poses (section III.D).
+// A whole mapping call: all iterations of the joint optimization of scene and poses (section III.D).
 #pragma once
 
 #include <cstdint>
@@ -28,7 +28,7 @@ struct AdamTable {
 
 struct MapOptimization {
   SceneView scene;
-  RaySource rays;  // its draw and its poses are those of the first iteration; the slots are the frames optimised
+  RaySource rays;  // its draw and its poses are those of the first iteration; the slots are the frames optimized
   Intrinsics intrinsics;
   RenderOptions options;  // of the first iteration
   AdamTable embeddings, texels;

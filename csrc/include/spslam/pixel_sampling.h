@@ -21,24 +21,24 @@ struct PixelSampling {
   float min_depth, max_depth;  // m; others, 0 and not finite ones are not drawn
   std::int32_t step_px;        // of the normals' differences
   float max_jump;              // of depth beside a normal, as a share
-  std::int32_t lattice_step;   // px; the first lattice pixel lies at half of it
-  std::int32_t view_step;      // px; the first of the view lies at 0; 0: no view
-  float view_unit;             // m, of the view's depth
+  std::int32_t thumbnail_step;   // px; the first depth thumbnail pixel lies at half of it
+  std::int32_t depth_image_step;      // px; the first of the view lies at 0; 0: no view
+  float depth_image_unit;             // m, of the view's depth
 };
 
 // Where the results go.
 struct SampledPixels {
   std::int32_t* records;   // [count, 3], see kernels/pixel_record.h
   float* normals;          // [count, 3], camera axes, towards the camera; 0 where unknown
-  std::uint16_t* lattice;  // [lattice_size(height), lattice_size(width)] float16 depth (m), 0 where invalid
-  std::uint16_t* view;     // [view_size(height), view_size(width)] depth in units, 0 where invalid or too far
+  std::uint16_t* depth_thumbnail;  // [thumbnail_size(height), thumbnail_size(width)] float16 depth (m), 0 where invalid
+  std::uint16_t* view;     // [depth_image_size(height), depth_image_size(width)] depth in units, 0 where invalid or too far
 };
 
-constexpr std::int32_t lattice_size(std::int32_t size, std::int32_t step) {
+constexpr std::int32_t thumbnail_size(std::int32_t size, std::int32_t step) {
   return size > step / 2 ? (size - step / 2 + step - 1) / step : 0;
 }
 
-constexpr std::int32_t view_size(std::int32_t size, std::int32_t step) {
+constexpr std::int32_t depth_image_size(std::int32_t size, std::int32_t step) {
   return step > 0 ? (size + step - 1) / step : 0;
 }
 

@@ -11,7 +11,7 @@
 namespace spslam {
 
 constexpr int kLossTerms = 5;         // total, then the four terms of the objective, not weighted
-constexpr int kPoseGradientSize = 6;  // d L / d translation, d L / d rotation (left increment about the camera centre)
+constexpr int kPoseGradientSize = 6;  // d L / d translation, d L / d rotation (left increment about the camera center)
 
 struct RayBatch {
   const std::int32_t* pixels;      // [num_rays, 3] packed, see kernels/pixel_record.h

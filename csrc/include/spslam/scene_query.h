@@ -1,4 +1,4 @@
-// Point queries of the scene: SDF (equation 2) and colour (equations 3 and 4).
+// Point queries of the scene: SDF (equation 2) and color (equations 3 and 4).
 #pragma once
 
 #include <cstdint>

@@ -1,6 +1,6 @@
 // Volume rendering of rays and the loss terms of tracking and mapping, with gradients (equations 5, 6, 8-11).
 //
-// R rays of S samples: sdf [R, S] normalised by the truncation distance, color [R, S, 3], t [R, S] depth in metres,
+// R rays of S samples: sdf [R, S] normalized by the truncation distance, color [R, S, 3], t [R, S] depth in meters,
 // valid [R, S] whether a sample lies inside the volume. All sums run in a fixed order.
 #pragma once
 

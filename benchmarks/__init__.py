@@ -1,1 +1,0 @@
-"""Speed measurements, and what they compare with. Run as modules: `python -m benchmarks.step`."""

@@ -1,0 +1,1 @@
+"""Speed measurements, and what they compare with. Run as modules: `python -m experiments.step`."""

@@ -1,0 +1,92 @@
+"""Faults injected into a sequence: is loss flagged, and is the camera found again when it sees a place it knows?
+
+    python -m experiments.faults --config 7scenes --data path/to/redkitchen --preset fast --trials 10 --json faults.json
+
+Faults are 30 black frames, a jump over 60, 20 frames of a covered lens, and a return to the start without anything in
+between; each trial comes back to another place (spslam/benchmark/faults.py). Exits with 1 where a bar is missed: loss
+flagged within 3 frames in every trial, and a pose within 3 cm within 10 frames of coming back in 9 of 10.
+"""
+
+import argparse
+import statistics
+import sys
+from pathlib import Path
+
+import torch
+
+from experiments import timing
+from experiments.fault_injection import FLAG_WITHIN, Outcome, plan, run_trials
+from spslam.cli.arguments import parse_frames
+from spslam.config import load_config
+from spslam.datasets import open_sequence
+from spslam.options import PRESETS
+from spslam.run.device import resolve_device
+
+RECOVERED_SHARE = 0.9
+
+
+def main() -> None:
+    """Parses the arguments, runs the trials, prints a line for each that failed and a table of all."""
+    args = _parser().parse_args()
+    device = resolve_device(args.device)
+    config = load_config(args.config, args.preset, [f"device={args.device}", *args.set])
+    dataset = open_sequence(config.dataset, args.data, args.frames)
+    outcomes = []
+    for outcome in run_trials(config, dataset, plan(dataset, args.trials, args.seed), device):
+        outcomes.append(outcome)
+        if args.verbose or not outcome.passed:
+            print(describe(outcome), flush=True)
+    rows = [summarize(fault, outcomes) for fault in sorted({outcome.trial.fault for outcome in outcomes})]
+    timing.report(
+        f"{dataset.name}, {args.preset or config.preset}, {args.trials} trials a fault", rows, device, args.json
+    )
+    if not all(row["flagged"] == row["trials"] and row["recovered"] >= RECOVERED_SHARE * row["trials"] for row in rows):
+        sys.exit("a bar is missed")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", default="demo", help="configuration file or name")
+    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--preset", choices=PRESETS)
+    parser.add_argument("--trials", type=int, default=10, help="of each fault")
+    parser.add_argument("--seed", type=int, default=0, help="of where the camera comes back and of noise")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
+    parser.add_argument("--verbose", action="store_true", help="a line for each trial")
+    parser.add_argument("--json", type=Path, help="file to write the results to")
+    return parser
+
+
+def describe(outcome: Outcome) -> str:
+    """A trial in a line."""
+    trial, back = outcome.trial, outcome.recovered_after
+    found = "not found again" if back is None else f"found again after {back}"
+    return (
+        f"{trial.fault} at {trial.place}, back at frame {trial.back[0].index}: flagged after {outcome.flagged_after}, "
+        f"{outcome.wrong_unflagged} wrong poses not flagged, {found}, {outcome.error_cm:.2f} cm at the end, "
+        f"{outcome.voxels_added} voxels added"
+    )
+
+
+def summarize(fault: str, outcomes: list[Outcome]) -> dict[str, object]:
+    """A row of the table."""
+    of_fault = [outcome for outcome in outcomes if outcome.trial.fault == fault]
+    found = [outcome.recovered_after for outcome in of_fault if outcome.recovered_after is not None]
+    return {
+        "fault": fault,
+        "trials": len(of_fault),
+        "flagged": sum(outcome.flagged_after <= FLAG_WITHIN for outcome in of_fault),
+        "flagged_after_most": max(outcome.flagged_after for outcome in of_fault),
+        "wrong_unflagged": sum(outcome.wrong_unflagged for outcome in of_fault),
+        "recovered": sum(outcome.passed for outcome in of_fault),
+        "recovered_after_median": statistics.median(found) if found else None,
+        "recovered_after_most": max(found, default=None),
+        "voxels_added": sum(outcome.voxels_added for outcome in of_fault),
+    }
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()

@@ -1,0 +1,65 @@
+"""Frames a second of reading alone: decoding, sampling and, for a GPU, the upload, by number of threads.
+
+python -m experiments.reading --config 7scenes --data path/to/redkitchen --frames 0:300 --workers 1 2 4 8 16
+"""
+
+import argparse
+import os
+import statistics
+import time
+from pathlib import Path
+
+import cv2
+import torch
+
+from experiments import timing
+from spslam.config import Config, load_config
+from spslam.datasets import open_sequence
+from spslam.datasets.base import RgbdDataset
+from spslam.run.device import resolve_device
+from spslam.run.frame_feed import FrameFeed
+
+
+def main() -> None:
+    """Parses the arguments and prints a row for each number of threads."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", default="demo", help="configuration file or name")
+    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser.add_argument("--frames", default="0:300", help="START:STOP")
+    parser.add_argument("--device", default="cpu", help="cuda counts the upload in")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", type=Path, help="file to write the results to")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    device = resolve_device(args.device)
+    rows = []
+    for workers in args.workers:
+        config = load_config(args.config, None, [f"run.prefetch_workers={workers}"])
+        dataset = open_sequence(config.dataset, args.data, slice(*map(int, args.frames.split(":"))))
+        rounds = [read_all(dataset, config, device) for _ in range(args.rounds)]
+        rows.append({"workers": workers, **{name: statistics.median(r[name] for r in rounds) for name in rounds[0]}})
+    timing.report(f"{args.config}, {len(dataset)} frames, {os.cpu_count()} cores", rows, device, args.json)
+
+
+def read_all(dataset: RgbdDataset, config: Config, device: torch.device) -> dict[str, float]:
+    """Frames a second, and milliseconds a frame of a thread and of the processors."""
+    started, before = time.perf_counter(), os.times()
+    with FrameFeed(dataset, config, device) as feed:
+        for _ in feed:
+            pass
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds = time.perf_counter() - started
+        frames, after = len(dataset), os.times()
+        return {
+            "frames_s": frames / seconds,
+            "thread_ms": 1e3 * feed.decode_seconds / frames,
+            "user_ms": 1e3 * (after.user - before.user) / frames,
+            "system_ms": 1e3 * (after.system - before.system) / frames,
+        }
+
+
+if __name__ == "__main__":
+    main()

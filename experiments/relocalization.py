@@ -1,0 +1,146 @@
+"""Is a lost camera found where it is, and never where it is not?
+
+    python -m experiments.relocalization --config 7scenes --data path/to/redkitchen --save kitchen.npz
+    python -m experiments.relocalization --saved kitchen.npz room.npz
+
+Every second frame of a sequence is mapped. At four places the camera is cut off, and frames from all over the sequence
+are shown to it one by one, each as the first after the loss: some show what was seen before, others what never was.
+Every third of them is shown again as a plain wall, of one color and somewhere between 0.8 and 2.7 m away, which is
+nowhere. Printed is how many poses are believed, at once or if four frames agree, with what colors say and without. The
+first form measures one sequence, the second judges what was saved.
+"""
+
+import argparse
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from experiments.basin import matrix
+from experiments.fault_injection import (
+    STEP,
+    WRONG_CM,
+    WRONG_DEG,
+    apart,
+    black_out,
+    copy_of,
+    cover_wall,
+    expected_pose,
+    true_poses,
+)
+from spslam.cli.arguments import parse_frames
+from spslam.config import Config, load_config
+from spslam.datasets import open_sequence
+from spslam.datasets.base import RgbdDataset
+from spslam.options import PRESETS
+from spslam.slam.pixels import sample_frame
+from spslam.slam.recovery.pose_confidence import Fit
+from spslam.slam.system import SlamSystem
+from spslam.slam.tracker import AGREEING_DOUBT
+
+PLACES, FIRST_PLACE = 4, 0.25  # of the sequence
+LOST_FRAMES = 6
+WALL_EVERY, NEARER_M, FARTHER_M = 3, 0.7, 1.2
+QUANTILES = (0.5, 0.9, 0.95, 0.99, 1.0)
+# A pose that is given up would be the start's.
+KEEPING = ["tracking.lost_threshold=1", "tracking.min_inlier_share=0", "tracking.relocalization_threshold=1"]
+
+
+def main() -> None:
+    """Parses the arguments; measures a sequence, or judges saved measures."""
+    args = _parser().parse_args()
+    config = load_config(args.config, args.preset, ["device=cpu", *args.set, *KEEPING])
+    if args.saved is None:
+        dataset = open_sequence(config.dataset, args.data, args.frames)
+        table = np.array(list(measure(config, dataset, args.every)))
+    else:
+        table = np.concatenate([np.load(path)["table"] for path in args.saved])
+    if args.save:
+        np.savez(args.save, table=table)
+    at_once = load_config(args.config, args.preset, args.set).tracking.relocalization_threshold
+    judge(table, (at_once, AGREEING_DOUBT))
+
+
+def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:
+    """For each frame shown: whether it is a wall, distance (cm) and angle (degrees) to where it is, and its fit."""
+    ground_truth, random = true_poses(dataset), np.random.default_rng(0)
+    system = SlamSystem(config, dataset.camera, ground_truth[0])
+    rows = len(dataset) // STEP
+    for place in np.linspace(FIRST_PLACE * rows, rows - 1, PLACES).astype(int).tolist():
+        while len(system.state.frames) < place:
+            system.process(dataset[STEP * len(system.state.frames)])
+        lost = cut_off(system, dataset, ground_truth)
+        for number, index in enumerate(range(1, len(dataset), STEP * every)):
+            for is_wall in (False, True) if number % WALL_EVERY == 0 else (False,):
+                fit, pose = shown(lost, dataset, index, is_wall, random)
+                yield [is_wall, *apart(pose, expected_pose(system, ground_truth, place, index)), *astuple(fit)]
+
+
+def cut_off(system: SlamSystem, dataset: RgbdDataset, ground_truth: np.ndarray) -> SlamSystem:
+    """A copy of the system that has seen nothing but black for some frames."""
+    with tempfile.TemporaryDirectory() as folder:
+        lost = copy_of(system, ground_truth[0], Path(folder) / "state")
+    for _ in range(LOST_FRAMES):
+        frame = dataset[0]
+        black_out(frame, np.random.default_rng(0))
+        lost.process(frame)
+    return lost
+
+
+def shown(
+    lost: SlamSystem, dataset: RgbdDataset, index: int, is_wall: bool, random: np.random.Generator
+) -> tuple[Fit, np.ndarray]:
+    """What the lost system makes of a frame, or of a wall in its stead: fit and pose [4, 4]; it stays as it is."""
+    frame = dataset[index]
+    if is_wall:
+        cover_wall(frame, random)
+        frame.depth[:] += np.float32(random.uniform(-NEARER_M, FARTHER_M))
+    pixels = sample_frame(frame, dataset.camera, lost.config)
+    frames = lost.state.frames
+    start = lost.tracker.predict(frames)
+    result = lost.tracker.track(lost.state.scene, pixels, start, len(frames), lost.history)
+    return result.fit, matrix(result.pose)
+
+
+def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
+    """Prints how many poses are believed at once, and if neighbors agree, for what is right, wrong and nowhere."""
+    wall, is_wrong = table[:, 0] > 0, (table[:, 1] > WRONG_CM) | (table[:, 2] > WRONG_DEG)
+    groups = {"right": ~wall & ~is_wrong, "wrong": ~wall & is_wrong, "of a wall": wall}
+    fits = [Fit(*line) for line in table[:, 3:].tolist()]
+    error_probabilities = {
+        "with colors": np.array([fit.error_probability for fit in fits]),
+        "without": np.array([replace(fit, brightness_correlation=math.nan).error_probability for fit in fits]),
+    }
+    brightness_correlation = np.array([fit.brightness_correlation for fit in fits])
+    for name, group in groups.items():
+        known = brightness_correlation[group & np.isfinite(brightness_correlation)]
+        span = " to ".join(f"{number:.2f}" for number in (known.min(), known.max())) if len(known) else "unknown"
+        print(f"{group.sum()} poses {name}, likeness {span}")
+        for how, error_probability in error_probabilities.items():
+            if not group.any():
+                continue
+            shares = ", ".join(f"{(error_probability[group] <= bound).sum()} below {bound:g}" for bound in bounds)
+            quantiles = " ".join(f"{value:.3f}" for value in np.quantile(error_probability[group], QUANTILES))
+            print(f"  error probability {how:12s} {shares}; quantiles {QUANTILES}: {quantiles}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", default="demo", help="configuration file or name")
+    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser.add_argument("--every", type=int, default=3, help="show every n-th of the frames that are not mapped")
+    parser.add_argument("--preset", choices=PRESETS)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
+    parser.add_argument("--save", type=Path, help="file for the measures")
+    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to judge together")
+    return parser
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()

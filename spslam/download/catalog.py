@@ -1,0 +1,135 @@
+"""Where the data sets are, and under which terms."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass
+
+from spslam.errors import DatasetError
+
+_SEVEN_SCENES = "https://download.microsoft.com/download/2/8/5/28564B23-0828-408F-8631-23B1EFF1DAC8"
+_TUM = "https://cvg.cit.tum.de/rgbd/dataset"
+_REPLICA = "https://cvg-data.inf.ethz.ch/nice-slam"
+_NEURAL_RGBD = "http://kaldir.vc.in.tum.de/neural_rgbd"
+_TUM_NAME = re.compile(r"(?:rgbd_dataset_)?freiburg([123])_(\w+)")
+_TUM_SHORT = {
+    "fr1_desk": "freiburg1_desk",
+    "fr2_xyz": "freiburg2_xyz",
+    "fr3_office": "freiburg3_long_office_household",
+}
+_SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
+SCANNET_TERMS = (
+    "scannet can't be downloaded without a form: its authors give the address to whoever signs the terms of use at "
+    "http://www.scan-net.org; fetch scans with their script (--type .sens) and run: spslam run scannet --data SCAN"
+)
+
+
+@dataclass(frozen=True)
+class Archive:
+    """A file to fetch.
+
+    Attributes
+    ----------
+    url : its address; the last part is the file's name.
+    folder : where it is unpacked, below the data folder.
+    sha256 : its checksum where the publisher gives one, else None: then the archive's own checksums have to do.
+    """
+
+    url: str
+    folder: str = "."
+    sha256: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.url.rsplit("/", 1)[-1]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A data set, or a part of one, that can be asked for by name.
+
+    Attributes
+    ----------
+    name : what to ask for.
+    title : what it is.
+    terms : its license in words, and the page that has it.
+    gigabytes : about what comes over the line.
+    archives : its files.
+    run : the command that it is for, below the data folder.
+    """
+
+    name: str
+    title: str
+    terms: str
+    gigabytes: float
+    archives: tuple[Archive, ...]
+    run: str
+
+
+def find_source(name: str) -> Source:
+    """The source of a name: one of ``SOURCES``, or any sequence of TUM RGB-D as ``tum/freiburg1_rpy``.
+
+    Raises
+    ------
+    DatasetError
+        For an unknown name, with a suggestion, and for ScanNet, which asks for a form.
+    """
+    if name.partition("/")[0] == "scannet":
+        raise DatasetError(SCANNET_TERMS)
+    known = {source.name: source for source in SOURCES}
+    if name in known:
+        return known[name]
+    sequence = _TUM_NAME.fullmatch(name.removeprefix("tum/"))
+    if name.startswith("tum/") and sequence is not None:
+        return _tum(name, f"freiburg{sequence.group(1)}_{sequence.group(2)}")
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]}?" if near else "spslam download lists the names"
+    raise DatasetError(f"{name} is no data set to download; {hint}")
+
+
+def _tum(name: str, sequence: str) -> Source:
+    folder = f"rgbd_dataset_{sequence}"
+    return Source(
+        name,
+        f"TUM RGB-D, {sequence}",
+        "CC BY 4.0; https://cvg.cit.tum.de/data/datasets/rgbd-dataset",
+        1.5,
+        (Archive(f"{_TUM}/{sequence.partition('_')[0]}/{folder}.tgz", "tum"),),
+        f"spslam run tum --data tum/{folder}",
+    )
+
+
+def _seven_scenes(scene: str) -> Source:
+    return Source(
+        f"7scenes/{scene}",
+        f"7-Scenes, {scene}",
+        "Microsoft Research's license, research alone; "
+        "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes",
+        3.0,
+        (Archive(f"{_SEVEN_SCENES}/{scene}.zip", "7scenes"),),
+        f"spslam run 7scenes --data 7scenes/{scene}",
+    )
+
+
+SOURCES: tuple[Source, ...] = (
+    Source(
+        "replica",
+        "Replica, eight rooms as rendered for NICE-SLAM, and their meshes",
+        "the Replica research terms, no commercial use; https://github.com/facebookresearch/Replica-Dataset",
+        12.4,
+        (Archive(f"{_REPLICA}/data/Replica.zip"), Archive(f"{_REPLICA}/cull_replica_mesh.zip")),
+        "spslam run replica --data Replica/room0",
+    ),
+    Source(
+        "synthetic_rgbd",
+        "Synthetic RGB-D (Neural RGB-D), its rooms and their culled meshes",
+        "by the scenes' authors, CC-BY or CC-0; https://github.com/dazinovic/neural-rgbd-surface-reconstruction",
+        7.5,
+        (Archive(f"{_NEURAL_RGBD}/neural_rgbd_data.zip"), Archive(f"{_NEURAL_RGBD}/meshes.zip")),
+        "spslam run synthetic_rgbd --data neural_rgbd_data/grey_white_room",
+    ),
+    *(_tum(f"tum/{name}", sequence) for name, sequence in _TUM_SHORT.items()),
+    *(_seven_scenes(scene) for scene in _SCENES),
+)

@@ -1,0 +1,62 @@
+"""A rehearsal before the first frame: a GPU loads a kernel at its first use, which takes longer than its work."""
+
+import numpy as np
+import torch
+
+from spslam.camera import Camera
+from spslam.config import Config
+from spslam.datasets.base import RgbdFrame
+from spslam.slam.device_events import marker
+from spslam.slam.frame_report import FrameReport
+from spslam.slam.pixels import sample_frame
+from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.system import SlamSystem
+from spslam.slam.upload import Uploader
+
+FRAMES = 4
+DEPTH_M = 2.0
+RELIEF_M = 0.1
+WAVES = 6  # across the image
+
+
+def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameReport]:
+    """Takes a few views of a made-up wall through a system that is then let go.
+
+    Args:
+        config: of the run. Its sizes and options are used, with few iterations.
+        camera: of the run's frames.
+        device: where it will run.
+
+    Returns:
+        The reports of those frames. Nothing else remains but loaded kernels and reserved memory.
+    """
+    rehearsal = _shortened(config)
+    system = SlamSystem(rehearsal, camera, device=device)
+    uploader = Uploader(device) if device.type == "cuda" else None
+    reports = []
+    for index in range(FRAMES):
+        pixels = sample_frame(_view_of_wall(camera, config, index), camera, rehearsal)
+        sent = uploader.send(pixels) if uploader else pixels
+        reports.append(system.submit(PreparedFrame(index, float(index), sent)).result())
+    system.finish()
+    marker(device)().wait()
+    return reports
+
+
+def _shortened(config: Config) -> Config:
+    """The same with few iterations, mapping after each frame, and more frames than a mapping call takes."""
+    mapping = config.mapping.model_copy(
+        update={"every": 1, "iterations": 2, "first_iterations": 4, "frames": 2, "recent": 1, "covisible": 1}
+    )
+    return config.model_copy(update={"mapping": mapping})
+
+
+def _view_of_wall(camera: Camera, config: Config, index: int) -> RgbdFrame:
+    """A wall with some relief, within the range that counts as measured."""
+    dataset = config.dataset
+    depth_m = float(np.clip(DEPTH_M, 1.1 * dataset.min_depth_m, 0.9 * dataset.max_depth_m))
+    v, u = np.mgrid[: camera.height, : camera.width] * (2 * np.pi * WAVES / camera.width)
+    relief = np.sin(u) * np.cos(v)
+    depth = (depth_m * (1 + RELIEF_M / DEPTH_M / 2 * relief)).astype(np.float32)
+    color = np.repeat((127 + 100 * relief).astype(np.uint8)[..., None], 3, axis=2)
+    return RgbdFrame(index, float(index), color, depth)

@@ -1,0 +1,86 @@
+"""Depth images of earlier frames, which tracking holds a frame's surface against beside the map."""
+
+import torch
+
+from spslam import ops
+from spslam.camera import Camera
+
+EVERY = 10  # frames; of these the images are kept for a while
+AGES = (1, 4)  # of the kept images that are used, in units of EVERY
+COLUMNS = 640  # of an image, at most
+UNITS = 2**16 - 1  # a depth has 16 bits
+
+
+class DepthKeyframeStore:
+    """The last frame's depth image, and those of every tenth frame for as long as they are of use.
+
+    Attributes:
+        images: uint16 [S, h, w] depth in units of `unit` m, 0 where unknown; the first is the last frame's.
+        frames: number of the frame that each image is of, -1 for none.
+        unit: m.
+    """
+
+    def __init__(self, camera: Camera, max_depth_m: float, kernel_m: float, device: torch.device | str = "cpu"):
+        """A store without images.
+
+        Args:
+            camera: of all frames.
+            max_depth_m: the largest depth that images hold.
+            kernel_m: last width of the robust kernel of distances from what they show.
+            device: where the images are.
+        """
+        self.step = depth_image_step(camera)
+        self.unit = max_depth_m / UNITS
+        self._kernel_m = kernel_m
+        slots = 2 + max(AGES)
+        rows, columns = (-(-size // self.step) for size in (camera.height, camera.width))
+        self.images = torch.zeros(slots, rows, columns, dtype=torch.uint16, device=device)
+        self.frames = [-1] * slots
+        fx, fy, cx, cy = (number / self.step for number in (camera.fx, camera.fy, camera.cx, camera.cy))
+        self.intrinsics = ops.Intrinsics(fx, fy, cx, cy)
+
+    def add(self, frame: int, image: torch.Tensor) -> None:
+        """Takes in the depth image uint16 [h, w] of frame number `frame`; the host waits for nothing."""
+        slots = [0] if frame % EVERY else [0, self._slot(frame)]
+        for slot in slots:
+            self.images[slot].copy_(image)
+            self.frames[slot] = frame
+
+    def views(self, frame: int, lost: torch.Tensor, poses: torch.Tensor) -> ops.DepthKeyframes | None:
+        """What to hold frame number `frame` against: the last frame, one 10 to 19 back and one 40 to 49 back.
+
+        Args:
+            frame: its number.
+            lost: bool [F] on the CPU, whether a frame's pose is unknown.
+            poses: float32 [F, 7] of the frames before.
+
+        Returns:
+            The views of which the pose is known; None where there is none.
+        """
+        wanted = [(0, frame - 1)]
+        for age in AGES:
+            kept = (frame // EVERY - age) * EVERY
+            if kept != frame - 1:
+                wanted.append((self._slot(kept), kept))
+        rows = tuple((slot, of) for slot, of in wanted if of >= 0 and self.frames[slot] == of and not lost[of])
+        if not rows:
+            return None
+        return ops.DepthKeyframes(self.images, self.unit, poses, rows, self.intrinsics, self._kernel_m)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All that a checkpoint needs."""
+        return {"images": self.images, "frames": torch.tensor(self.frames)}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Replaces the content by a copy of what `tensors()` gave."""
+        self.images.copy_(state["images"])
+        self.frames = state["frames"].tolist()
+
+    @staticmethod
+    def _slot(frame: int) -> int:
+        return 1 + frame // EVERY % (1 + max(AGES))
+
+
+def depth_image_step(camera: Camera) -> int:
+    """Distance of the pixels that a depth image keeps, px."""
+    return -(-camera.width // COLUMNS)

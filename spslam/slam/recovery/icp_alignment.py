@@ -1,0 +1,62 @@
+"""Further starts for tracking: the frame is laid onto earlier ones by projective ICP, which needs no map."""
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix
+from spslam.slam.cell_grid import CellGrid
+from spslam.slam.frame_history import Keyframe
+from spslam.slam.pixels import FramePixels, unpack_points
+
+POINTS = 4096  # of the earlier frame
+ITERATIONS = 20  # from 10 cm and 10 degrees off; 15 are just too few
+
+
+class IcpAlignment:
+    """Poses of one frame by ICP against earlier ones, from any number of starts.
+
+    Attributes:
+        vertices, normals, intrinsics: the frame's surface maps, see `surface_maps`.
+    """
+
+    def __init__(self, pixels: FramePixels, camera: Camera):
+        self._camera = camera
+        self.vertices, self.normals, self.intrinsics = surface_maps(pixels, camera)
+
+    def pose(self, earlier: Keyframe, start: torch.Tensor) -> torch.Tensor:
+        """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
+        origin = _matrix(earlier.pose)
+        between = _pose(compose(inverse(_matrix(start)), origin), start.device)
+        points = unpack_points(earlier.records[:POINTS], self._camera)
+        maps = self.vertices, self.normals
+        between, _, _ = ops.projective_icp(points, *maps, between, self.intrinsics, iterations=ITERATIONS)
+        return _pose(compose(origin, inverse(_matrix(between))), start.device)
+
+
+def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:
+    """What a frame's pixel records show of the surface, as maps with the cells of a `CellGrid`.
+
+    A cell holds the first record that falls in it and has a normal, so both devices choose the same.
+
+    Returns:
+        vertices float32 [h, w, 3] (m, camera axes; 0 where there is none), normals float32 [h, w, 3], and the
+        intrinsics of the maps.
+    """
+    grid, records, normals = CellGrid.of(camera), pixels.records, pixels.normals
+    shape, count = (grid.rows, grid.columns, 3), len(records)
+    order = torch.where(normals.any(1), torch.arange(count, device=records.device), count)
+    first = torch.full((grid.rows * grid.columns,), count, device=records.device)
+    first.scatter_reduce_(0, grid.cells(records), order, "amin")
+    points = torch.cat([unpack_points(records, camera), normals.new_zeros(1, 3)])
+    normals = torch.cat([normals, normals.new_zeros(1, 3)])
+    return points[first].view(shape), normals[first].view(shape), grid.intrinsics
+
+
+def _matrix(pose: torch.Tensor) -> np.ndarray:
+    return pose7_to_matrix(pose.cpu().numpy().astype(np.float64))
+
+
+def _pose(matrix: np.ndarray, device: torch.device) -> torch.Tensor:
+    return torch.from_numpy(matrix_to_pose7(matrix)).to(device, torch.float32)

@@ -1,0 +1,22 @@
+"""The plan of trials: nothing is shown that was mapped before, and all comes back to what was seen."""
+
+import pytest
+
+from experiments.fault_injection import BACK_FRAMES, STEP, plan
+from spslam.datasets.generated import GeneratedDataset
+
+
+@pytest.mark.parametrize("frames", [150, 400])
+def test_plan(frames):
+    trials = plan(GeneratedDataset(frames, 16, 16), 10, seed=3)
+    assert len(trials) == 40
+    assert [trial.place for trial in trials] == sorted(trial.place for trial in trials)
+    for trial in trials:
+        assert trial.place > BACK_FRAMES
+        assert len(trial.back) == BACK_FRAMES
+        for shown in trial.back:
+            assert shown.index % STEP == 1
+            assert 0 < shown.index < STEP * (trial.place - 1)
+        assert all(STEP * trial.place <= shown.index < frames for shown in trial.during)
+    assert len({trial.back[0].index for trial in trials}) > 5
+    assert plan(GeneratedDataset(frames, 16, 16), 10, seed=3) == trials

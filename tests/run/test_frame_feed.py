@@ -1,0 +1,71 @@
+"""Frames made ready ahead of need: order, content, times, and the way to the device."""
+
+import pytest
+import torch
+
+from spslam.datasets.base import RgbdFrame
+from spslam.errors import DatasetError
+from spslam.run.frame_feed import FrameFeed, automatic_workers
+from spslam.run import frame_feed
+from spslam.slam.pixels import sample_frame
+from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.upload import Upload, Uploader
+from tests.system.sequences import Recorded, settings
+
+FRAMES = 9
+
+
+def break_third(frame: RgbdFrame) -> None:
+    if frame.index == 2:
+        raise DatasetError("frame 2 is broken")
+
+
+def pixels_of(item: PreparedFrame) -> torch.Tensor:
+    received = item.pixels.received() if isinstance(item.pixels, Upload) else item.pixels
+    return received.buffer.cpu()
+
+
+@pytest.mark.parametrize(
+    ("reader", "workers", "ahead"), [("threads", 1, 8), ("threads", 3, 8), ("process", 1, 1), ("process", 3, 4)]
+)
+def test_frames_come_in_order_with_their_pixels(device, reader, workers, ahead):
+    options = f"run.reader={reader}", f"run.prefetch_workers={workers}", f"run.prefetch_ahead={ahead}"
+    dataset, config = Recorded(FRAMES, break_third), settings(*options)
+    with FrameFeed(dataset, config, device, start=1) as feed:
+        items = list(feed)
+        assert feed.decode_seconds > 0
+    assert isinstance(items[1], DatasetError)
+    prepared = items[:1] + items[2:]
+    assert [item.index for item in prepared] == [1, 3, 4, 5, 6, 7, 8]
+    for item in prepared:
+        frame = Recorded(FRAMES)[item.index]
+        assert torch.equal(pixels_of(item), sample_frame(frame, dataset.camera, config).buffer)
+        assert item.timestamp == frame.timestamp
+        assert item.decode_ms > 0
+        assert item.wait_ms >= 0
+
+
+@pytest.mark.cuda
+def test_an_upload_waits_for_nothing():
+    dataset, config, device = Recorded(2), settings(), torch.device("cuda")
+    uploader = Uploader(device)
+    pixels = sample_frame(dataset[0], dataset.camera, config)
+    uploader.send(pixels).received()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        upload = uploader.send(pixels)
+        received = upload.received()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(received.buffer.cpu(), pixels.buffer)
+    assert upload.end.ms_since(upload.begin) > 0
+
+
+@pytest.mark.parametrize(
+    ("cores", "kind", "workers"),
+    [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (64, "cuda", 16), (16, "cuda", 8)],
+)
+def test_number_of_threads_suits_cores_and_device(monkeypatch, cores, kind, workers):
+    monkeypatch.setattr(frame_feed.os, "sched_getaffinity", lambda _: range(cores), raising=False)
+    assert automatic_workers(torch.device(kind)) == workers

@@ -1,0 +1,163 @@
+"""Frames read by another process: what happens where that can't be, or where either side goes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+
+import pytest
+import torch
+
+from spslam.errors import SpslamError
+from spslam.run.frame_feed import FrameFeed
+from spslam.run.reader_launch import end_standby, has_standby, launch_standby
+from spslam.run.reader_process import ReaderProcess
+from spslam.run import reader_launch
+from spslam.slam.device_events import HostEvent
+from spslam.slam.pixels import sample_frame
+from spslam.slam.upload import Upload
+from tests.system.sequences import Recorded, settings
+
+CPU = torch.device("cpu")
+FRAMES = 6
+PATIENCE_S = 60
+ROOT = Path(__file__).parents[2]
+
+
+def feed_of(dataset: Recorded) -> FrameFeed:
+    return FrameFeed(dataset, settings("run.reader=process", "run.prefetch_workers=1", "run.prefetch_ahead=2"), CPU)
+
+
+def fail(frame):
+    raise ZeroDivisionError("a bug")
+
+
+def has_ended(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except FileNotFoundError:
+        return True
+    return state == "Z"
+
+
+def test_a_data_set_that_cannot_be_pickled_is_read_by_threads():
+    with feed_of(Recorded(FRAMES, lambda frame: None)) as feed:
+        assert not isinstance(feed.prepare(), ReaderProcess)
+        assert [frame.index for frame in feed] == list(range(FRAMES))
+
+
+def test_a_data_set_unknown_to_another_process_is_read_by_threads(monkeypatch):
+    class Stranger(Recorded):
+        pass
+
+    Stranger.__module__, Stranger.__qualname__ = "spslam_nowhere", "Stranger"
+    module = types.ModuleType("spslam_nowhere")
+    module.Stranger = Stranger
+    monkeypatch.setitem(sys.modules, "spslam_nowhere", module)
+    with feed_of(Stranger(FRAMES)) as feed:
+        assert not isinstance(feed.prepare(), ReaderProcess)
+        assert [frame.index for frame in feed] == list(range(FRAMES))
+
+
+def test_a_process_started_early_is_used_once():
+    launch_standby(settings("run.reader=process"))
+    launch_standby(settings("run.reader=process"))
+    pid = reader_launch._standby[0].process.pid
+    with feed_of(Recorded(FRAMES)) as feed:
+        assert feed.prepare()._process.pid == pid
+        assert [frame.index for frame in feed] == list(range(FRAMES))
+    assert not has_standby()
+
+
+class LateUploader:
+    """As `Uploader`, without a device: copies end some frames later; notes what happens to the pages."""
+
+    def __init__(self, can_lock):
+        self.can_lock, self.notes, self.sent = can_lock, [], 0
+
+    def send(self, pixels):
+        self.sent += 1
+        return Upload(pixels.holding(pixels.buffer.clone()), pixels, HostEvent(), LateEvent(self, self.sent + 1))
+
+    def lock_pages(self, memory):
+        self.notes.append("lock")
+        return self.can_lock
+
+    def unlock_pages(self, memory):
+        self.notes.append("unlock")
+
+
+class LateEvent(HostEvent):
+    def __init__(self, uploader, ends_with):
+        super().__init__()
+        self.uploader, self.ends_with = uploader, ends_with
+
+    def is_complete(self):
+        return self.uploader.sent >= self.ends_with
+
+
+@pytest.mark.parametrize(("can_lock", "notes"), [(True, ["lock", "unlock"]), (False, ["lock"])])
+def test_slots_are_given_back_when_their_copies_have_ended(can_lock, notes):
+    dataset, config, uploader = Recorded(FRAMES), settings(), LateUploader(can_lock)
+    reader = ReaderProcess.start(dataset, config, start=0, workers=1, ahead=4, uploader=uploader)
+    assert reader.is_ready()
+    frames = list(reader)
+    assert [frame.index for frame in frames] == list(range(FRAMES))
+    for frame in frames:
+        want = sample_frame(dataset[frame.index], dataset.camera, config)
+        assert torch.equal(frame.pixels.pixels.buffer, want.buffer)
+    assert uploader.notes == notes
+
+
+def test_a_process_that_nobody_takes_is_ended():
+    launch_standby(settings("run.reader=process"))
+    pid = reader_launch._standby[0].process.pid
+    end_standby()
+    assert has_ended(pid) and not has_standby()
+
+
+@pytest.mark.parametrize("options", [("device=cpu",), ("run.reader=threads", "device=cuda")])
+def test_a_run_that_wants_no_process_starts_none(options):
+    launch_standby(settings(*options))
+    assert not has_standby()
+
+
+def test_a_bug_in_a_data_set_shows_where_it_is():
+    with feed_of(Recorded(FRAMES, fail)) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
+        next(feed)
+
+
+def test_a_reader_that_was_killed_is_told_of_in_one_line():
+    with feed_of(Recorded(FRAMES)) as feed:
+        next(feed)
+        feed.prepare()._process.send_signal(signal.SIGKILL)
+        with pytest.raises(SpslamError, match=r"^the process that reads frames ended by SIGKILL; .*run.reader=threads"):
+            list(feed)
+
+
+def test_closing_half_way_leaves_no_process():
+    with feed_of(Recorded(FRAMES)) as feed:
+        next(feed)
+        pid = feed.prepare()._process.pid
+    assert has_ended(pid)
+
+
+def test_the_reader_ends_with_a_loop_that_was_killed():
+    script = (
+        "import time\nfrom tests.run.test_reader_process import FRAMES, Recorded, feed_of\n"
+        "feed = feed_of(Recorded(FRAMES))\nnext(feed)\n"
+        "print(feed.prepare()._process.pid, flush=True)\ntime.sleep(600)"
+    )
+    loop = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    reader = int(loop.stdout.readline())
+    assert not has_ended(reader)
+    os.kill(loop.pid, signal.SIGKILL)
+    loop.wait()
+    loop.stdout.close()
+    deadline = time.monotonic() + PATIENCE_S
+    while not has_ended(reader):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)

@@ -1,0 +1,28 @@
+"""The rehearsal before a run uses all that the run will, and leaves no trace in its results."""
+
+import pytest
+
+from spslam.run.warm_up import FRAMES, warm_up
+from tests.system.sequences import Recorded, results, run_on, settings
+
+
+@pytest.mark.parametrize("preset", ["balanced", "paper"])
+def test_frames_are_tracked_and_mapped(device, preset):
+    reports = warm_up(settings(preset=preset), Recorded(1).camera, device)
+    assert len(reports) == FRAMES
+    assert not any(report.lost for report in reports)
+    assert all(report.mapping_iterations for report in reports)
+    assert all(report.tracking_iterations for report in reports[1:])
+
+
+def test_a_range_without_the_walls_depth_does_not_matter(device):
+    config = settings("dataset.min_depth_m=3", "dataset.max_depth_m=4")
+    assert not any(report.lost for report in warm_up(config, Recorded(1).camera, device))
+
+
+def test_results_do_not_depend_on_it(monkeypatch, tmp_path, device):
+    options = ("mapping.first_iterations=5", f"device={device}")
+    run_on(monkeypatch, Recorded(6), tmp_path / "one", *options)
+    warm_up(settings("seed=5"), Recorded(1).camera, device)
+    run_on(monkeypatch, Recorded(6), tmp_path / "two", *options)
+    assert results(tmp_path / "one") == results(tmp_path / "two")

@@ -1,0 +1,187 @@
+"""What tracking asks of the frames before: which are alike, and whether a pose looks through known surface."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam.datasets.base import RgbdFrame
+from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle, transform_points
+from spslam.slam.frame_history import (
+    APART,
+    FrameHistory,
+    surface_counts,
+    surface_shares,
+    thumbnail_difference,
+    turned,
+    turned_differences,
+)
+from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
+from spslam.slam.recovery.icp_alignment import surface_maps
+from spslam.slam.state import SlamState, pose_tensor
+from tests.system.sequences import Recorded, settings
+
+FRAMES = 20
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return Recorded(25)
+
+
+@pytest.fixture(scope="module")
+def pixels(dataset):
+    return [sample_frame(dataset[i], dataset.camera, settings()) for i in range(25)]
+
+
+def state_of(dataset, pixels, device=CPU, lost=()):
+    """The first frames at their true poses, and no map."""
+    state = SlamState.start(settings(), dataset.camera, np.eye(4), None, device)
+    for i in range(FRAMES):
+        moved = pixels[i].to(device)
+        pose = pose_tensor(dataset.poses()[i], device)
+        state.frames.append(pose, i / 30, i, i in lost, moved.depth_thumbnail)
+        state.pixels.add(moved.records)
+    return state
+
+
+def test_difference_of_depth_images(device):
+    depth_thumbnail = torch.tensor([[1.0, 2.0, 0.0, 0.0]], dtype=torch.float16, device=device)
+    others = torch.tensor(
+        [[[1.0, 2.0, 0.0, 0.0]], [[1.1, 2.0, 0.0, 0.0]], [[9.0, 0.0, 3.0, 0.0]], [[0.0, 0.0, 0.0, 0.0]]],
+        dtype=torch.float16,
+        device=device,
+    )
+    found = thumbnail_difference(depth_thumbnail, others).cpu()
+    torch.testing.assert_close(
+        found, torch.tensor([0.0, 0.5 * np.log(1.1), 0.2, 0.15], dtype=torch.float32), rtol=1e-2, atol=1e-3
+    )
+    assert thumbnail_difference(torch.zeros_like(depth_thumbnail), others[3:]).tolist() == [0]
+
+
+def test_the_likest_frames_come_first_and_apart(dataset, pixels, device):
+    history = FrameHistory(state_of(dataset, pixels, device), dataset.camera)
+    found = history.similar(pixels[8].to(device), 6)
+    poses = torch.stack([alike.frame.pose for alike in found]).cpu()
+    torch.testing.assert_close(found[0].start, found[0].frame.pose)
+    rows = [int((poses[i] - history._state.frames.poses.cpu()).norm(dim=1).argmin()) for i in range(len(found))]
+    assert rows[0] == 8
+    assert 1 <= len(rows) <= 6
+    assert min(abs(a - b) for i, a in enumerate(rows) for b in rows[:i]) > APART if len(rows) > 1 else True
+    assert history.similar(pixels[8].to(device), 0) == []
+
+
+@pytest.mark.parametrize(("yaw", "pitch"), [(16.0, 0.0), (-16.0, 0.0), (0.0, 12.0), (0.0, -12.0), (14.0, 11.0)])
+def test_a_turned_camera_is_put_where_it_would_look_alike(dataset, yaw, pitch):
+    """The same place, looking elsewhere: the start is nearer to the truth than the frame's own pose."""
+    base = dataset.poses()[8]
+    half = np.radians([yaw, pitch]) / 2
+    turns = [
+        np.array([np.cos(half[0]), 0, np.sin(half[0]), 0, 0, 0, 0]),
+        np.array([np.cos(half[1]), np.sin(half[1]), *[0] * 5]),
+    ]
+    true = base @ pose7_to_matrix(turns[0]) @ pose7_to_matrix(turns[1])
+    depth_thumbnails = []
+    for pose in (base, true):
+        color, depth = dataset.room.room.render(dataset.camera, pose)
+        frame = RgbdFrame(0, 0.0, color, depth)
+        depth_thumbnails.append(sample_frame(frame, dataset.camera, settings()).depth_thumbnail)
+    shifts, differences = turned_differences(depth_thumbnails[1], depth_thumbnails[0][None])
+    assert (0, 0) in shifts
+    start = turned(pose_tensor(base, CPU), shifts[int(differences[:, 0].argmin())], dataset.camera).double().numpy()
+    left = np.degrees(rotation_angle(pose7_to_matrix(start)[:3, :3].T @ true[:3, :3]))
+    assert left < 0.6 * np.degrees(rotation_angle(base[:3, :3].T @ true[:3, :3]))
+    np.testing.assert_allclose(start[4:], base[:3, 3], atol=1e-6)
+
+
+def test_tiny_images_are_compared_too():
+    shifts, differences = turned_differences(torch.ones(1, 1).half(), torch.ones(3, 1, 1).half())
+    assert shifts == [(0, 0)]
+    assert differences.tolist() == [[0, 0, 0]]
+
+
+def test_lost_frames_are_not_offered(dataset, pixels):
+    history = FrameHistory(state_of(dataset, pixels, lost={8, 18, 19}), dataset.camera)
+    assert history.is_lost
+    assert history.consecutive_lost_frames == 2
+    torch.testing.assert_close(history.last().pose, pose_tensor(dataset.poses()[17], CPU))
+    assert not torch.equal(history.similar(pixels[8], 1)[0].frame.pose, pose_tensor(dataset.poses()[8], CPU))
+
+
+def test_without_a_known_frame_there_is_nothing(dataset, pixels):
+    history = FrameHistory(state_of(dataset, pixels, lost=set(range(FRAMES))), dataset.camera)
+    assert history.last() is None
+    assert history.similar(pixels[3], 5) == []
+    assert history.consecutive_lost_frames == FRAMES
+    assert free_space_violation(history, pixels[3], pose_tensor(dataset.poses()[3], CPU), dataset.camera) == (0.11, 0)
+
+
+def free_space_violation(history, pixels, pose, camera):
+    vertices, _, intrinsics = surface_maps(pixels, camera)
+    return surface_shares(*history.surface_counts(vertices, intrinsics, pose).tolist())
+
+
+def test_a_wrong_pose_looks_through_known_surface(dataset, pixels, device):
+    history = FrameHistory(state_of(dataset, pixels, device), dataset.camera)
+    true, seen = dataset.poses()[21], pixels[21].to(device)
+    through, occluded_share = free_space_violation(history, seen, pose_tensor(true, device), dataset.camera)
+    assert through < 0.04
+    assert occluded_share < 0.1
+    ahead = true.copy()
+    ahead[:3, 3] -= 0.5 * true[:3, 2]
+    turned = true @ pose7_to_matrix(np.array([np.cos(0.2), 0, np.sin(0.2), 0, 0, 0, 0]))
+    for wrong in (ahead, turned):
+        assert free_space_violation(history, seen, pose_tensor(wrong, device), dataset.camera)[0] > 0.15
+
+
+def test_what_hides_surface_is_told_from_a_wrong_pose(dataset, pixels):
+    history = FrameHistory(state_of(dataset, pixels), dataset.camera)
+    frame = dataset[21]
+    frame.depth[30:, :90] = 0.3
+    seen = sample_frame(frame, dataset.camera, settings())
+    through, occluded_share = free_space_violation(history, seen, pose_tensor(dataset.poses()[21], CPU), dataset.camera)
+    assert through < 0.04
+    assert occluded_share > 0.3
+
+
+def test_counts_by_the_formula(dataset, pixels, device):
+    """Point by point in NumPy."""
+    camera, rows = dataset.camera, [0, 5, 10]
+    pose = dataset.poses()[12]
+    pose[:3, 3] += [0.1, -0.1, 0.2]
+    vertices, _, k = surface_maps(pixels[12], camera)
+    counts = [0, 0, 0]
+    for row in rows:
+        into = np.linalg.inv(pose) @ dataset.poses()[row]
+        depth_thumbnail = pixels[row].depth_thumbnail.double().numpy()
+        for line, column in np.argwhere(depth_thumbnail > 0):
+            u, v = (THUMBNAIL_STEP_PX * (cell + 0.5) for cell in (column, line))
+            ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1])
+            x, y, z = transform_points(into, depth_thumbnail[line, column] * ray[None])[0]
+            i, j = int(np.floor(y / z * k.fy + k.cy + 0.5)), int(np.floor(x / z * k.fx + k.cx + 0.5))
+            if z <= 0.05 or not (0 <= i < vertices.shape[0] and 0 <= j < vertices.shape[1]) or vertices[i, j, 2] == 0:
+                continue
+            behind, tolerance = float(vertices[i, j, 2]) - z, 0.05 + 0.02 * z
+            counts[0] += abs(behind) < tolerance
+            counts[1] += behind > 1.5 * tolerance
+            counts[2] += behind < -1.5 * tolerance
+    found = surface_counts(
+        vertices.to(device),
+        k,
+        pose_tensor(pose, device),
+        torch.from_numpy(matrix_to_pose7(dataset.poses()[rows])).float().to(device),
+        torch.stack([pixels[row].depth_thumbnail for row in rows]).to(device),
+        camera,
+    )
+    assert min(counts) > 2
+    # Single precision moves a point or two over a cell's edge.
+    np.testing.assert_allclose(found.tolist(), counts, atol=2)
+
+
+def test_conflict_of_nothing_is_none(dataset, pixels):
+    pose = pose_tensor(np.eye(4), CPU)
+    vertices, _, k = surface_maps(pixels[0], dataset.camera)
+    depth_thumbnails = pixels[0].depth_thumbnail[None]
+    assert not surface_counts(0 * vertices, k, pose, pose[None], depth_thumbnails, dataset.camera).any()
+    assert not surface_counts(vertices, k, pose, pose[None], 0 * depth_thumbnails, dataset.camera).any()
+    assert not surface_counts(vertices, k, pose, pose[None][:0], depth_thumbnails[:0], dataset.camera).any()
