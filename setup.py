@@ -51,7 +51,11 @@ class PlatformWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
-CONFIG_PACKAGES = {"spslam.configs": "configs", "spslam.configs.presets": "configs/presets"}
+CONFIG_PACKAGES = {
+    "spslam.configs": "configs",
+    "spslam.configs.presets": "configs/presets",
+    "spslam.configs.models": "configs/models",
+}
 
 setup(
     packages=[*find_packages(include=["spslam", "spslam.*"]), *CONFIG_PACKAGES],

@@ -21,8 +21,9 @@ from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
 from spslam.geometry import pose7_to_matrix, rotation_angle
 from spslam.slam.pixels import sample_frame
-from spslam.slam.state import pose_tensor
+from spslam.slam.poses import pose_tensor
 from spslam.slam.system import SlamSystem
+from spslam.slam.tracker import TrackingProblem
 
 OFFSETS = ((2, 2), (5, 5), (10, 10))  # cm, degrees
 BACK_M, BACK_RAD = 0.01, np.radians(0.5)
@@ -61,7 +62,7 @@ def measure(args: argparse.Namespace) -> dict[tuple[int, int], dict[str, list[bo
     ground_truth = dataset.poses()
     system = SlamSystem(config, dataset.camera, None if ground_truth is None else ground_truth[0], device)
     random = np.random.default_rng(0)
-    came_back: dict = {offset: {"tracking": [], "with rescue": []} for offset in OFFSETS}
+    came_back: dict = {offset: {"tracking": [], "with recovery": []} for offset in OFFSETS}
     for i, frame in enumerate(dataset):
         if i and i % args.every == 0:
             pixels = sample_frame(frame, dataset.camera, config).to(device)
@@ -75,10 +76,12 @@ def measure(args: argparse.Namespace) -> dict[tuple[int, int], dict[str, list[bo
 def try_start(system: SlamSystem, pixels, number: int, offset: tuple[int, int], random, back: dict) -> None:
     """Adds whether one random start of that offset comes back to `back`."""
     tracker, frames, scene = system.tracker, system.state.frames, system.state.scene
-    wanted = matrix(tracker.track(scene, pixels, tracker.predict(frames), number).pose)
+    wanted = matrix(tracker.track(TrackingProblem(scene, pixels.records, tracker.predict(frames), number)).pose)
     start = pose_tensor(moved(wanted, offset, random), frames.poses.device)
-    for name, help_ in (("tracking", None), ("with rescue", system.history)):
-        found = matrix(tracker.track(scene, pixels, start, number, help_).pose)
+    alone = system.recovery.judge(tracker.track(TrackingProblem(scene, pixels.records, start, number)))
+    with_recovery = system.localize(pixels, start, number)
+    for name, tracked in (("tracking", alone), ("with recovery", with_recovery)):
+        found = matrix(start if tracked.lost else tracked.pose)
         distance = np.linalg.norm(found[:3, 3] - wanted[:3, 3])
         back[name].append(distance < BACK_M and rotation_angle(found[:3, :3].T @ wanted[:3, :3]) < BACK_RAD)
 

@@ -21,14 +21,14 @@ from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.geometry import rotation_angle
 from spslam.options import PRESETS
-from spslam.slam.frame_history import surface_shares
+from spslam.slam.fit import Fit
 from spslam.slam.pixels import FramePixels, sample_frame
-from spslam.slam.recovery.appearance import POINTS, brightness_correlation, brightness_sums
+from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.icp_alignment import IcpAlignment
-from spslam.slam.recovery.pose_confidence import JUMP_CM, JUMP_DEG, LEAST_INFORMATION, MOST_CONFLICT, Fit
-from spslam.slam.state import pose_tensor
+from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.verifier import Verifier
 from spslam.slam.system import SlamSystem
-from spslam.slam.tracker import Tracker
+from spslam.slam.tracker import TrackingProblem
 
 EVERY, FIRST, STARTS = 3, 6, 5  # frames whose wrong starts are tried, from which frame on, and how many
 WRONG_CM, WRONG_DEG = 6.0, 4.0
@@ -59,9 +59,7 @@ def measure(args: argparse.Namespace) -> dict[str, np.ndarray]:
     dataset = open_sequence(config.dataset, args.data, slice(None, None, args.step))
     ground_truth, random = dataset.poses(), np.random.default_rng(0)
     system = SlamSystem(config, dataset.camera, ground_truth[0])
-    # A pose that is given up would be the start's.
-    keeping = ["tracking.lost_threshold=1", "tracking.min_inlier_share=0"]
-    tracker = Tracker(load_config(args.config, args.preset, ["device=cpu", *args.set, *keeping]), dataset.camera)
+    tracker, verifier = system.tracker, Verifier(config, dataset.camera, PoseConfidenceModel.load())
     right, wrong = [], []
     for number, frame in enumerate(dataset):
         pixels, tried = sample_frame(frame, dataset.camera, config), []
@@ -70,30 +68,22 @@ def measure(args: argparse.Namespace) -> dict[str, np.ndarray]:
             starts = [poses[random.integers(number)].clone() for _ in range(STARTS - 2)]
             away = [(random.uniform(10, 60), random.uniform(5, 40)) for _ in range(2)]
             starts += [pose_tensor(moved(matrix(poses[-1]), offset, random), system.device) for offset in away]
-            tried = [fit_from(system, tracker, pixels, start, number) for start in starts]
+            tried = [fit_from(system, verifier, pixels, start, number) for start in starts]
         if number > 1:
-            right.append(row(fit_from(system, tracker, pixels, tracker.predict(system.state.frames), number)[0]))
+            right.append(row(fit_from(system, verifier, pixels, tracker.predict(system.state.frames), number)[0]))
         system.process(frame)
         wrong += [row(fit) for fit, pose in tried if is_apart(pose, matrix(system.state.frames.poses[-1]))]
     return {"right": np.array(right), "wrong": np.array(wrong)}
 
 
 def fit_from(
-    system: SlamSystem, tracker: Tracker, pixels: FramePixels, start: torch.Tensor, number: int
+    system: SlamSystem, verifier: Verifier, pixels: FramePixels, start: torch.Tensor, number: int
 ) -> tuple[Fit, np.ndarray]:
-    """What tracking makes of a start alone, with its conflict and likeness, and the pose."""
-    result = tracker.track(system.state.scene, pixels, start, number)
+    """The fit of what tracking alone makes of a start, verified, and its pose."""
+    estimate = system.tracker.track(TrackingProblem(system.state.scene, pixels.records, start, number))
     alignment = IcpAlignment(pixels, system.camera)
-    counts = system.history.surface_counts(alignment.vertices, alignment.intrinsics, result.pose)
-    free_space_violation, occluded_share = surface_shares(*counts.tolist())
-    sums = brightness_sums(system.state.scene, pixels.records[:POINTS], result.pose, system.camera)
-    fit = replace(
-        result.fit,
-        free_space_violation=free_space_violation,
-        occluded_share=occluded_share,
-        brightness_correlation=brightness_correlation(*sums.tolist()),
-    )
-    return fit, matrix(result.pose)
+    fit = verifier.verified(estimate.fit, estimate.pose, system.state.scene, alignment, system.history, pixels.records)
+    return fit, matrix(estimate.pose)
 
 
 def row(fit: Fit) -> list[float]:
@@ -109,12 +99,14 @@ def is_apart(pose: np.ndarray, other: np.ndarray) -> bool:
 
 def judge(right: np.ndarray, wrong: np.ndarray) -> None:
     """Prints the doubt of both at the first look, at the second, and after a loss; and fitted coefficients."""
+    model = PoseConfidenceModel.load()
     print(f"{len(right)} right poses, {len(wrong)} wrong ones")
     unseen = {"free_space_violation": math.nan, "brightness_correlation": math.nan}
     looks = {"first look": unseen, "second look": {}, "after loss": {"prediction_error_cm": math.nan}}
     for name, unknown in looks.items():
         error_probabilities = [
-            np.array([replace(as_fit(line), **unknown).error_probability for line in table]) for table in (right, wrong)
+            np.array([model.error_probability(replace(as_fit(line), **unknown)) for line in table])
+            for table in (right, wrong)
         ]
         quantiles = " ".join(f"{value:.3f}" for value in np.quantile(error_probabilities[0], QUANTILES))
         shares = ", ".join(
@@ -134,9 +126,13 @@ def coefficients(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
     """Logistic regression by Newton's method, both kinds of pose weighing the same, the slopes held back a little."""
     table = np.concatenate([right, wrong])
     mean_robust_weight, min_eigenvalue, prediction_error_cm, prediction_error_deg, free_space_violation = table.T[:5]
-    prediction_error = np.log1p(prediction_error_cm / JUMP_CM + prediction_error_deg / JUMP_DEG)
-    lg = np.log10(np.maximum(min_eigenvalue, LEAST_INFORMATION))
-    features = np.stack([mean_robust_weight, lg, prediction_error, np.minimum(free_space_violation, MOST_CONFLICT)], 1)
+    model = PoseConfidenceModel.load()
+    scales = model.prediction_error_scale_cm, model.prediction_error_scale_deg
+    prediction_error = np.log1p(prediction_error_cm / scales[0] + prediction_error_deg / scales[1])
+    lg = np.log10(np.maximum(min_eigenvalue, model.eigenvalue_floor))
+    features = np.stack(
+        [mean_robust_weight, lg, prediction_error, np.minimum(free_space_violation, model.max_free_space_violation)], 1
+    )
     target = np.repeat([0.0, 1.0], [len(right), len(wrong)])
     weight = np.repeat([0.5 / len(right), 0.5 / len(wrong)], [len(right), len(wrong)])
     mean, deviation = features.mean(0), features.std(0)

@@ -37,10 +37,11 @@ from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
 from spslam.options import PRESETS
+from spslam.slam.fit import Fit
 from spslam.slam.pixels import sample_frame
-from spslam.slam.recovery.pose_confidence import Fit
+from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.recovery import LIKELY_ERROR_PROBABILITY
 from spslam.slam.system import SlamSystem
-from spslam.slam.tracker import AGREEING_DOUBT
 
 PLACES, FIRST_PLACE = 4, 0.25  # of the sequence
 LOST_FRAMES = 6
@@ -62,7 +63,7 @@ def main() -> None:
     if args.save:
         np.savez(args.save, table=table)
     at_once = load_config(args.config, args.preset, args.set).tracking.relocalization_threshold
-    judge(table, (at_once, AGREEING_DOUBT))
+    judge(table, (at_once, LIKELY_ERROR_PROBABILITY))
 
 
 def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:
@@ -102,7 +103,7 @@ def shown(
     pixels = sample_frame(frame, dataset.camera, lost.config)
     frames = lost.state.frames
     start = lost.tracker.predict(frames)
-    result = lost.tracker.track(lost.state.scene, pixels, start, len(frames), lost.history)
+    result = lost.localize(pixels, start, len(frames))
     return result.fit, matrix(result.pose)
 
 
@@ -111,9 +112,10 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
     wall, is_wrong = table[:, 0] > 0, (table[:, 1] > WRONG_CM) | (table[:, 2] > WRONG_DEG)
     groups = {"right": ~wall & ~is_wrong, "wrong": ~wall & is_wrong, "of a wall": wall}
     fits = [Fit(*line) for line in table[:, 3:].tolist()]
+    model = PoseConfidenceModel.load()
     error_probabilities = {
-        "with colors": np.array([fit.error_probability for fit in fits]),
-        "without": np.array([replace(fit, brightness_correlation=math.nan).error_probability for fit in fits]),
+        "with colors": np.array([model.error_probability(fit) for fit in fits]),
+        "without": np.array([model.error_probability(replace(fit, brightness_correlation=math.nan)) for fit in fits]),
     }
     brightness_correlation = np.array([fit.brightness_correlation for fit in fits])
     for name, group in groups.items():

@@ -78,6 +78,11 @@ def resolve_config_path(path: str | os.PathLike) -> Path:
     raise ConfigError(f"{given}: no such configuration; {hint}")
 
 
+def read_shipped(name: str) -> dict[str, Any]:
+    """The content of a YAML file in the shipped ``configs`` folder, say ``models/pose_confidence.yaml``."""
+    return _read(_config_dir() / name)
+
+
 def config_names() -> list[str]:
     """Names of the shipped configurations."""
     return sorted(path.stem for path in _config_dir().glob("*.yaml") if path.stem != "defaults")

@@ -36,7 +36,8 @@ IMPORTS = {
     "slam": GROUND | {"ops", "scene", "prior", "datasets"},
     "run": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
     "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run"},
-    "cli": GROUND | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "benchmark"},
+    "cli": GROUND
+    | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "benchmark"},
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import time
@@ -84,8 +85,8 @@ def describe(report: Any) -> str:
     if report is None:
         return "unreadable frame skipped"
     parts = ["LOST" if report.lost else "ok"]
-    if report.residual_cm is not None:
-        parts.append(f"{report.residual_cm:.2f} cm off")
+    if not math.isnan(report.fit.residual_cm):
+        parts.append(f"residual {report.fit.residual_cm:.2f} cm")
     if report.loss is not None:
         parts.append(f"loss {report.loss:.3f}")
     return ", ".join(parts)

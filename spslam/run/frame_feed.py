@@ -14,7 +14,7 @@ from spslam.datasets.prefetch import Prefetcher, prefetch
 from spslam.errors import DatasetError
 from spslam.run.reader_launch import has_standby
 from spslam.run.reader_process import ReaderProcess
-from spslam.slam.device_events import marker
+from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 from spslam.slam.upload import Uploader
 
@@ -33,7 +33,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
     """
 
     def __init__(self, dataset: RgbdDataset, config: Config, device: torch.device, start: int = 0):
-        self._mark = marker(device)
+        self._record = event_recorder(device)
         run = config.run
         workers = automatic_workers(device) if run.prefetch_workers is None else run.prefetch_workers
         ahead = max(2 * workers, LEAST_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
@@ -62,10 +62,10 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
     def __next__(self) -> PreparedFrame | DatasetError:
         reader = self.prepare()
-        asked, began = self._mark(), time.perf_counter()
+        requested, started = self._record(), time.perf_counter()
         item = next(reader)
         if isinstance(item, PreparedFrame):
-            item.asked, item.wait_ms = asked, 1e3 * (time.perf_counter() - began)
+            item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
         return item
 
     def __exit__(

@@ -100,7 +100,7 @@ class RunLoop:
             done, pending = self._pending.popleft()
             report = pending.result() if pending else None
             if report:
-                log.write(json.dumps(vars(report)) + "\n")
+                log.write(json.dumps(report.log_row()) + "\n")
             if self.progress:
                 self.progress(done, self.total, report)
 

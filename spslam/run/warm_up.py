@@ -6,7 +6,7 @@ import torch
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
-from spslam.slam.device_events import marker
+from spslam.slam.device_events import event_recorder
 from spslam.slam.frame_report import FrameReport
 from spslam.slam.pixels import sample_frame
 from spslam.slam.prepared_frame import PreparedFrame
@@ -39,7 +39,7 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
         sent = uploader.send(pixels) if uploader else pixels
         reports.append(system.submit(PreparedFrame(index, float(index), sent)).result())
     system.finish()
-    marker(device)().wait()
+    event_recorder(device)().wait()
     return reports
 
 

@@ -11,12 +11,13 @@ from typing import Any
 
 import torch
 
-from spslam.config import Config
+from spslam.config import Config, read_shipped
 from spslam.errors import OutputError, SpslamError
 from spslam.scene.tensor_file import load_tensors, save_tensors
+from spslam.slam.recovery.pose_confidence import MODEL_FILE
 from spslam.slam.state import Moments, SlamState
 
-FORMAT = "spslam-checkpoint-1"
+FORMAT = "spslam-checkpoint-2"
 
 
 def fingerprint(config: Config) -> str:
@@ -28,6 +29,7 @@ def fingerprint(config: Config) -> str:
     # A run that met a limit goes on when the limit is raised.
     for limit in ("max_voxels", "max_texels"):
         content["scene"].pop(limit)
+    content["pose_confidence"] = read_shipped(MODEL_FILE)["constants"]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -62,8 +64,8 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
         **_prefixed("frames.", state.frames.tensors()),
         **_prefixed("pixels.", {"records": state.pixels.records, "has_pixels": state.pixels.has_pixels}),
     }
-    if state.views is not None:
-        tensors.update(_prefixed("views.", state.views.tensors()))
+    if state.depth_keyframes is not None:
+        tensors.update(_prefixed("depth_keyframes.", state.depth_keyframes.tensors()))
     # Moments that the next mapping call resets anyway need no place.
     if not config.mapping.reset_moments:
         for name, moments in state.moments.items():
@@ -123,8 +125,8 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
     state.scene.load_state_dict(_section(tensors, "scene."))
     state.frames.load_state_dict(_section(tensors, "frames."))
     state.pixels.load_state_dict(_section(tensors, "pixels."))
-    if state.views is not None:
-        state.views.load_state_dict(_section(tensors, "views."))
+    if state.depth_keyframes is not None:
+        state.depth_keyframes.load_state_dict(_section(tensors, "depth_keyframes."))
     device = state.scene.device
     state.moments = {
         name.removesuffix(".first"): Moments.of(

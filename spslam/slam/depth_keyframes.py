@@ -46,7 +46,7 @@ class DepthKeyframeStore:
             self.images[slot].copy_(image)
             self.frames[slot] = frame
 
-    def views(self, frame: int, lost: torch.Tensor, poses: torch.Tensor) -> ops.DepthKeyframes | None:
+    def select(self, frame: int, lost: torch.Tensor, poses: torch.Tensor) -> ops.DepthKeyframes | None:
         """What to hold frame number `frame` against: the last frame, one 10 to 19 back and one 40 to 49 back.
 
         Args:

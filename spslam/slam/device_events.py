@@ -1,4 +1,4 @@
-"""Marks on a device's own time line: what runs asynchronously is timed without waiting for it."""
+"""Events in a device's queue: what runs asynchronously is timed without waiting for it."""
 
 import time
 from abc import ABC, abstractmethod
@@ -9,23 +9,23 @@ import torch
 
 
 class DeviceEvent(ABC):
-    """A place on a device's time line; marks of one kind can be compared."""
+    """A place in a device's queue; events of one kind can be compared."""
 
     @abstractmethod
     def is_complete(self) -> bool:
-        """Whether all work before the mark is done."""
+        """Whether all work before the event is done."""
 
     @abstractmethod
     def wait(self) -> None:
-        """Returns once all work before the mark is done; what other streams do is not waited for."""
+        """Returns once all work before the event is done; other streams are not waited for."""
 
     @abstractmethod
     def ms_since(self, earlier: Any) -> float:
-        """Milliseconds from an earlier mark to this one; both must have passed."""
+        """Milliseconds from an earlier event to this one; both must be complete."""
 
 
 class HostEvent(DeviceEvent):
-    """Now, for work that is done when its call returns."""
+    """The present time, for work that is done when its call returns."""
 
     def __init__(self):
         self._time_s = time.perf_counter()
@@ -41,7 +41,7 @@ class HostEvent(DeviceEvent):
 
 
 class StreamEvent(DeviceEvent):
-    """When a CUDA stream gets to this place in its queue."""
+    """A CUDA event, complete when its stream gets to this place in its queue."""
 
     def __init__(self, stream: torch.cuda.Stream):
         self.event = torch.cuda.Event(enable_timing=True)
@@ -57,8 +57,8 @@ class StreamEvent(DeviceEvent):
         return earlier.event.elapsed_time(self.event)
 
 
-def marker(device: torch.device) -> Callable[[], DeviceEvent]:
-    """Makes marks of when the device has done all it was given so far: on CUDA by this thread's current stream."""
+def event_recorder(device: torch.device) -> Callable[[], DeviceEvent]:
+    """Records events of all work given to the device so far: on CUDA in this thread's current stream."""
     if device.type != "cuda":
         return HostEvent
     stream = torch.cuda.current_stream(device)

@@ -25,11 +25,11 @@ class FramePixels:
     """What tracking and mapping need of a frame, in one buffer, so that an upload is one copy.
 
     Attributes:
-        buffer: int32 words of the records, the normals, the depth_thumbnail and the view, as `ops.sample_frame_pixels` returns
-            them.
+        buffer: int32 words of the records, normals, depth thumbnail and depth image, as `ops.sample_frame_pixels`
+            returns them.
         capacity: records that the buffer holds; without depth they are 0 and none of them counts.
-        thumbnail_shape: rows and columns of the depth_thumbnail.
-        depth_image_shape: rows and columns of the view; 0 and 0 without one.
+        thumbnail_shape: rows and columns of the depth thumbnail.
+        depth_image_shape: rows and columns of the depth image; 0 and 0 without one.
         valid_depth_share: share of the image's pixels with usable depth.
     """
 
@@ -56,13 +56,13 @@ class FramePixels:
 
     @cached_property
     def depth_thumbnail(self) -> torch.Tensor:
-        """float16 [h, w] depth (m) at every `THUMBNAIL_STEP_PX`-th pixel, 0 where invalid, for co-visibility; a view."""
+        """float16 [h, w] depth (m) at every `THUMBNAIL_STEP_PX`-th pixel, 0 where invalid; a view of the buffer."""
         rows, columns = self.thumbnail_shape
         return self.buffer[6 * self.capacity :].view(torch.float16)[: rows * columns].view(rows, columns)
 
     @cached_property
-    def view(self) -> torch.Tensor:
-        """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown, for tracking; a view."""
+    def depth_image(self) -> torch.Tensor:
+        """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown; a view of the buffer."""
         rows, columns = self.depth_image_shape
         words = self.buffer[len(self.buffer) - -(-rows * columns // 2) :]
         return words.view(torch.uint16)[: rows * columns].view(rows, columns)

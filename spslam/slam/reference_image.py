@@ -58,7 +58,7 @@ class ReferenceCache:
         self._key: tuple[int, int] | None = None
         self._cells = torch.empty(0)
 
-    def of(self, row: int, records: torch.Tensor, pose: torch.Tensor) -> ops.ReferenceImage:
+    def get(self, row: int, records: torch.Tensor, pose: torch.Tensor) -> ops.ReferenceImage:
         """The reference of frame `row`, with its pose as it is now.
 
         Args:

@@ -9,7 +9,7 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.geometry import matrix_to_pose7, pose7_to_matrix
+from spslam.geometry import pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import resize_rows
 from spslam.slam.depth_keyframes import DepthKeyframeStore
@@ -177,7 +177,7 @@ class SlamState:
         scene: the map.
         frames: poses and bookkeeping of every frame.
         pixels: pixel records of every frame.
-        views: depth images of some earlier frames; None where tracking does not use them.
+        depth_keyframes: depth images of some earlier frames; None where tracking does not use them.
         moments: optimizer state by parameter name.
         steps: Adam steps since the moments were last reset.
         stamp: number of mapping iterations ever done; marks rows touched by the current one.
@@ -187,7 +187,7 @@ class SlamState:
     scene: Scene
     frames: FrameTable
     pixels: PixelDatabase
-    views: DepthKeyframeStore | None = None
+    depth_keyframes: DepthKeyframeStore | None = None
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
     stamp: int = 0
@@ -220,14 +220,7 @@ class SlamState:
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
         pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device, config.pixels.keyframe_every)
         tracking, depth_m = config.tracking, config.dataset.max_depth_m
-        views = (
-            DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
-            if tracking.depth_keyframes
-            else None
-        )
-        return cls(scene, FrameTable(camera, device), pixels, views)
-
-
-def pose_tensor(matrix: np.ndarray, device: torch.device) -> torch.Tensor:
-    """float32 [7] of a float64 [4, 4] pose."""
-    return torch.from_numpy(matrix_to_pose7(matrix)).to(device, torch.float32)
+        depth_keyframes = None
+        if tracking.depth_keyframes:
+            depth_keyframes = DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
+        return cls(scene, FrameTable(camera, device), pixels, depth_keyframes)

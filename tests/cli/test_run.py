@@ -12,6 +12,7 @@ import pytest
 
 from spslam.cli.progress import ProgressBar, ProgressLines, summarize
 from spslam.config import load_config
+from spslam.slam.fit import Fit
 from tests.cli.command import ROOT, assert_refused, spslam
 
 SMALL = [
@@ -147,7 +148,7 @@ def test_check_data_describes_the_room(tmp_path):
 
 
 class Report:
-    lost, residual_cm, loss = False, 0.31, 0.2
+    lost, fit, loss = False, Fit(residual_cm=0.31), 0.2
 
 
 def test_progress_without_a_terminal_is_lines(capsys):
@@ -156,7 +157,7 @@ def test_progress_without_a_terminal_is_lines(capsys):
     lines(2, 3, Report())
     lines(3, 3, Report())
     error = capsys.readouterr().err
-    assert re.fullmatch(r"3/3 frames, [\d.]+ frames/s, ok, 0\.31 cm off, loss 0\.200\n", error)
+    assert re.fullmatch(r"3/3 frames, [\d.]+ frames/s, ok, residual 0\.31 cm, loss 0\.200\n", error)
 
 
 def test_progress_on_a_terminal_is_a_bar_that_ends_its_line(capsys):
@@ -167,7 +168,7 @@ def test_progress_on_a_terminal_is_a_bar_that_ends_its_line(capsys):
     bar.close()
     error = capsys.readouterr().err
     assert "| 5/9 [" in error
-    assert "frames/s, ok, 0.31 cm off, loss 0.200]" in error
+    assert "frames/s, ok, residual 0.31 cm, loss 0.200]" in error
     assert error.endswith("\n")
 
 

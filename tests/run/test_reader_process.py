@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from spslam.errors import SpslamError
+from spslam.run import reader_launch
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.reader_launch import end_standby, has_standby, launch_standby
 from spslam.run.reader_process import ReaderProcess
-from spslam.run import reader_launch
 from spslam.slam.device_events import HostEvent
 from spslam.slam.pixels import sample_frame
 from spslam.slam.upload import Upload

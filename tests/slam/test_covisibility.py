@@ -12,7 +12,7 @@ SIZES = ("mapping.frames=12", "mapping.recent=4", "mapping.covisible=5")
 
 
 def views(count, seen):
-    """Pixels, poses and depth_thumbnails of frames that look at a wall at z = 2 m; those not in `seen` look the other way."""
+    """Pixels, poses and thumbnails of frames that look at a wall at z = 2 m; those not in `seen` look the other way."""
     poses = torch.tensor([1.0, 0, 0, 0, 0, 0, 0]).repeat(count, 1)
     away = torch.tensor([i not in seen for i in range(count)])
     poses[away, :4] = torch.tensor([0.0, 0, 1, 0])

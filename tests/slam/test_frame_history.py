@@ -6,22 +6,24 @@ import torch
 
 from spslam.datasets.base import RgbdFrame
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle, transform_points
-from spslam.slam.frame_history import (
-    APART,
-    FrameHistory,
-    surface_counts,
-    surface_shares,
+from spslam.slam.frame_history import FrameHistory
+from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
+from spslam.slam.poses import pose_tensor
+from spslam.slam.recovery.free_space import surface_counts, surface_shares
+from spslam.slam.recovery.icp_alignment import surface_maps
+from spslam.slam.recovery.place_recognition import (
+    MIN_SEPARATION,
+    retrieve,
     thumbnail_difference,
     turned,
     turned_differences,
 )
-from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
-from spslam.slam.recovery.icp_alignment import surface_maps
-from spslam.slam.state import SlamState, pose_tensor
+from spslam.slam.state import SlamState
 from tests.system.sequences import Recorded, settings
 
 FRAMES = 20
 CPU = torch.device("cpu")
+UNKNOWN_SHARE = 0.11
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +62,15 @@ def test_difference_of_depth_images(device):
 
 
 def test_the_likest_frames_come_first_and_apart(dataset, pixels, device):
-    history = FrameHistory(state_of(dataset, pixels, device), dataset.camera)
-    found = history.similar(pixels[8].to(device), 6)
-    poses = torch.stack([alike.frame.pose for alike in found]).cpu()
-    torch.testing.assert_close(found[0].start, found[0].frame.pose)
+    history = FrameHistory(state_of(dataset, pixels, device))
+    found = retrieve(history, pixels[8].to(device), 6, dataset.camera)
+    poses = torch.stack([candidate.keyframe.pose for candidate in found]).cpu()
+    torch.testing.assert_close(found[0].start, found[0].keyframe.pose)
     rows = [int((poses[i] - history._state.frames.poses.cpu()).norm(dim=1).argmin()) for i in range(len(found))]
     assert rows[0] == 8
     assert 1 <= len(rows) <= 6
-    assert min(abs(a - b) for i, a in enumerate(rows) for b in rows[:i]) > APART if len(rows) > 1 else True
-    assert history.similar(pixels[8].to(device), 0) == []
+    assert min(abs(a - b) for i, a in enumerate(rows) for b in rows[:i]) > MIN_SEPARATION if len(rows) > 1 else True
+    assert retrieve(history, pixels[8].to(device), 0, dataset.camera) == []
 
 
 @pytest.mark.parametrize(("yaw", "pitch"), [(16.0, 0.0), (-16.0, 0.0), (0.0, 12.0), (0.0, -12.0), (14.0, 11.0)])
@@ -101,28 +103,36 @@ def test_tiny_images_are_compared_too():
 
 
 def test_lost_frames_are_not_offered(dataset, pixels):
-    history = FrameHistory(state_of(dataset, pixels, lost={8, 18, 19}), dataset.camera)
+    history = FrameHistory(state_of(dataset, pixels, lost={8, 18, 19}))
     assert history.is_lost
     assert history.consecutive_lost_frames == 2
     torch.testing.assert_close(history.last().pose, pose_tensor(dataset.poses()[17], CPU))
-    assert not torch.equal(history.similar(pixels[8], 1)[0].frame.pose, pose_tensor(dataset.poses()[8], CPU))
+    assert not torch.equal(
+        retrieve(history, pixels[8], 1, dataset.camera)[0].keyframe.pose, pose_tensor(dataset.poses()[8], CPU)
+    )
 
 
 def test_without_a_known_frame_there_is_nothing(dataset, pixels):
-    history = FrameHistory(state_of(dataset, pixels, lost=set(range(FRAMES))), dataset.camera)
+    history = FrameHistory(state_of(dataset, pixels, lost=set(range(FRAMES))))
     assert history.last() is None
-    assert history.similar(pixels[3], 5) == []
+    assert retrieve(history, pixels[3], 5, dataset.camera) == []
     assert history.consecutive_lost_frames == FRAMES
-    assert free_space_violation(history, pixels[3], pose_tensor(dataset.poses()[3], CPU), dataset.camera) == (0.11, 0)
+    assert free_space_violation(history, pixels[3], pose_tensor(dataset.poses()[3], CPU), dataset.camera) == (
+        UNKNOWN_SHARE,
+        0,
+    )
 
 
 def free_space_violation(history, pixels, pose, camera):
     vertices, _, intrinsics = surface_maps(pixels, camera)
-    return surface_shares(*history.surface_counts(vertices, intrinsics, pose).tolist())
+    rows = history.compared_rows()
+    known = history.poses[rows], history.depth_thumbnails[rows]
+    counts = surface_counts(vertices, intrinsics, pose, *known, camera)
+    return surface_shares(*counts.tolist(), UNKNOWN_SHARE)
 
 
 def test_a_wrong_pose_looks_through_known_surface(dataset, pixels, device):
-    history = FrameHistory(state_of(dataset, pixels, device), dataset.camera)
+    history = FrameHistory(state_of(dataset, pixels, device))
     true, seen = dataset.poses()[21], pixels[21].to(device)
     through, occluded_share = free_space_violation(history, seen, pose_tensor(true, device), dataset.camera)
     assert through < 0.04
@@ -135,7 +145,7 @@ def test_a_wrong_pose_looks_through_known_surface(dataset, pixels, device):
 
 
 def test_what_hides_surface_is_told_from_a_wrong_pose(dataset, pixels):
-    history = FrameHistory(state_of(dataset, pixels), dataset.camera)
+    history = FrameHistory(state_of(dataset, pixels))
     frame = dataset[21]
     frame.depth[30:, :90] = 0.3
     seen = sample_frame(frame, dataset.camera, settings())

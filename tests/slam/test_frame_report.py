@@ -1,14 +1,17 @@
 """Times of a frame's stages: they add up, and nobody is blamed for what ran beside."""
 
+import json
+
 import pytest
 import torch
 
-from spslam.slam.device_events import marker
-from spslam.slam.frame_report import FrameEvents, PendingReport
+from spslam.slam.device_events import event_recorder
+from spslam.slam.fit import Fit
+from spslam.slam.frame_report import FrameEvents, FrameReport, PendingReport
 
 
 class At:
-    """A mark at a given millisecond."""
+    """An event at a given millisecond."""
 
     def __init__(self, ms: float, passed: bool = True):
         self.ms, self.passed, self.waited = ms, passed, False
@@ -24,16 +27,16 @@ class At:
 
 
 def mapped_frame(**changes) -> FrameEvents:
-    marks = {
-        "asked": At(10),
-        "began": At(13),
+    events = {
+        "requested": At(10),
+        "started": At(13),
         "tracking": (At(13), At(15)),
         "encode": (At(16), At(17)),
         "mapping": (At(17), At(21)),
         "upload": (At(4), At(4.5)),
-        "done": At(22),
+        "finished": At(22),
     }
-    return FrameEvents(**{**marks, **changes})
+    return FrameEvents(**{**events, **changes})
 
 
 def test_stages_and_the_rest_add_up():
@@ -45,7 +48,7 @@ def test_stages_and_the_rest_add_up():
 
 def test_waiting_counts_only_where_the_device_was_idle():
     assert mapped_frame().times_ms(host_wait_ms=50)["wait_ms"] == 3
-    assert mapped_frame(began=At(10)).times_ms(host_wait_ms=50)["wait_ms"] == 0
+    assert mapped_frame(started=At(10)).times_ms(host_wait_ms=50)["wait_ms"] == 0
 
 
 def test_stages_that_did_not_take_place_have_no_length():
@@ -54,26 +57,45 @@ def test_stages_that_did_not_take_place_have_no_length():
     assert times["other_ms"] == 12
 
 
-def test_a_report_is_done_with_the_frames_last_mark():
-    known = {
-        "frame": 3, "index": 4, "timestamp": 0.1, "lost": False, "valid_depth_share": 0.9, "tracking_iterations": 8,
-        "residual_cm": 0.2, "inlier_share": 0.8, "mean_robust_weight": 0.7, "min_eigenvalue": 0.01, "prediction_error_cm": 0.3,
-        "prediction_error_deg": 0.2, "free_space_violation": None, "occluded_share": None, "map_coverage": None, "brightness_correlation": None, "error_probability": 0.01,
-        "recovered": False, "relocalized": False, "mapping_iterations": 5, "voxels": 100, "decode_ms": 6.0,
-    }  # fmt: skip
-    marks = mapped_frame(done=At(22, passed=False))
-    pending = PendingReport(known, marks, 0.0, torch.tensor(0.25))
+REPORT = FrameReport(
+    frame=3,
+    index=4,
+    timestamp=0.1,
+    lost=False,
+    valid_depth_share=0.9,
+    tracking_iterations=8,
+    fit=Fit(residual_cm=0.2, mean_robust_weight=0.7),
+    error_probability=0.01,
+    recovered=False,
+    relocalized=False,
+    mapping_iterations=5,
+    voxels=100,
+    decode_ms=6.0,
+)
+
+
+def test_a_report_is_done_with_the_last_event_of_the_frame():
+    events = mapped_frame(finished=At(22, passed=False))
+    pending = PendingReport(REPORT, events, 0.0, torch.tensor(0.25))
     assert not pending.is_done()
     report = pending.result()
-    assert marks.done.waited
+    assert events.finished.waited
     assert (report.frame, report.loss, report.mapping_ms) == (3, 0.25, 4)
 
 
-def test_marks_of_a_device_are_in_order(device):
-    mark = marker(device)
-    first = mark()
+def test_a_log_row_is_flat_and_without_nan():
+    row = REPORT.log_row()
+    assert (row["frame"], row["residual_cm"], row["mean_robust_weight"], row["loss"]) == (3, 0.2, 0.7, None)
+    assert row["free_space_violation"] is None
+    assert "fit" not in row
+    assert json.loads(json.dumps(row, allow_nan=False)) == row
+
+
+def test_events_of_a_device_are_in_order(device):
+    record = event_recorder(device)
+    first = record()
     torch.ones(1000, device=device).sum()
-    second = mark()
+    second = record()
     second.wait()
     assert first.is_complete()
     assert second.is_complete()

@@ -7,9 +7,10 @@ import torch
 from spslam.geometry import pose7_to_matrix, rotation_angle
 from spslam.slam.frame_history import FrameHistory, Keyframe
 from spslam.slam.pixels import sample_frame, unpack_points
+from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.icp_alignment import IcpAlignment, surface_maps
-from spslam.slam.state import pose_tensor
 from spslam.slam.system import SlamSystem
+from spslam.slam.tracker import TrackingProblem
 from tests.system.sequences import Recorded, settings
 
 
@@ -91,8 +92,8 @@ def test_icp_leads_to_where_tracking_finds_the_pose(dataset, system, pixels, shi
 def test_a_wrong_start_is_rescued(dataset, system, pixels, shift_m, angle_deg):
     ground_truth = dataset.poses()[10]
     start = moved(ground_truth, shift_m, angle_deg)
-    alone = system.tracker.track(system.state.scene, pixels, start, 10)
-    result = system.tracker.track(system.state.scene, pixels, start, 10, system.history)
+    alone = system.recovery.judge(system.tracker.track(TrackingProblem(system.state.scene, pixels.records, start, 10)))
+    result = system.localize(pixels, start, 10)
     assert alone.lost or alone.fit.mean_robust_weight < system.config.tracking.recovery_min_robust_weight
     assert result.recovered and not result.lost
     assert result.fit.mean_robust_weight > alone.fit.mean_robust_weight
@@ -103,14 +104,16 @@ def test_a_wrong_start_is_rescued(dataset, system, pixels, shift_m, angle_deg):
 class Elsewhere(FrameHistory):
     """Frames that were seen in another place."""
 
-    def _frame(self, row):
+    def keyframe(self, row):
         return Keyframe(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
 
 
 def test_what_cannot_be_rescued_stays_lost(dataset, system, pixels):
     """The view of another place: no start helps."""
     start = moved(dataset.poses()[10], 50.0, 90.0)
-    result = system.tracker.track(system.state.scene, pixels, start, 10, Elsewhere(system.state, dataset.camera))
+    problem = TrackingProblem(system.state.scene, pixels.records, start, 10)
+    estimate = system.tracker.track(problem)
+    result = system.recovery.resolve(problem, estimate, pixels, Elsewhere(system.state), to_be_mapped=False)
     assert result.lost and not result.relocalized
     assert torch.equal(result.pose, start)
 
@@ -119,14 +122,14 @@ def test_rescue_can_be_turned_off(dataset, pixels):
     off = ("tracking.rescue=false", "tracking.relocalization_candidates=0")
     plain = SlamSystem(settings(*off), dataset.camera, dataset.poses()[0])
     plain.process(dataset[0])
-    result = plain.tracker.track(plain.state.scene, pixels, moved(dataset.poses()[10], 50.0, 90.0), 10, plain.history)
+    result = plain.localize(pixels, moved(dataset.poses()[10], 50.0, 90.0), 10)
     assert result.lost and not result.recovered
 
 
 def test_a_clean_run_needs_no_rescue(system):
     assert not any(report.recovered or report.lost for report in system.reports)
     assert (
-        min(report.mean_robust_weight for report in system.reports[1:])
+        min(report.fit.mean_robust_weight for report in system.reports[1:])
         > system.config.tracking.recovery_min_robust_weight
     )
     assert max(report.error_probability for report in system.reports[1:]) < system.config.tracking.verify_threshold

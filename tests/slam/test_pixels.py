@@ -6,7 +6,8 @@ import torch
 
 from spslam import ops
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame, unpack_points
-from spslam.slam.state import FrameTable, pose_tensor
+from spslam.slam.poses import pose_tensor
+from spslam.slam.state import FrameTable
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
 

@@ -1,4 +1,4 @@
-"""The doubt about a pose: what raises it, what it is where nothing is known, and the measures it is made of."""
+"""The probability of a pose error: what raises it, what it is where nothing is known, and the measures behind it."""
 
 import math
 from dataclasses import replace
@@ -7,9 +7,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spslam.slam.recovery.pose_confidence import Fit, min_eigenvalue, prediction_error
+from spslam.config import read_shipped
+from spslam.errors import ConfigError
+from spslam.slam.fit import Fit, min_eigenvalue, prediction_error
+from spslam.slam.recovery import pose_confidence
+from spslam.slam.recovery.pose_confidence import MODEL_FILE, PoseConfidenceModel
 
 GOOD = Fit(0.5, 0.95, 0.8, 0.012, 0.5, 0.3, 0.02)
+MODEL = PoseConfidenceModel.load()
+
+
+def error_probability(fit, **changes):
+    return MODEL.error_probability(replace(fit, **changes))
 
 
 def pose(vector, translation):
@@ -17,9 +26,9 @@ def pose(vector, translation):
     return [w, x, y, z, *translation]
 
 
-def test_a_good_fit_leaves_no_doubt_and_a_bad_one_no_trust():
-    assert GOOD.error_probability < 0.001
-    assert Fit(1.2, 0.15, 0.06, 0.0005, 18.0, 5.0, 0.6).error_probability > 0.999
+def test_a_good_fit_is_trusted_and_a_bad_one_is_not():
+    assert error_probability(GOOD) < 0.001
+    assert error_probability(Fit(1.2, 0.15, 0.06, 0.0005, 18.0, 5.0, 0.6)) > 0.999
 
 
 WORSE = {
@@ -33,56 +42,47 @@ WORSE = {
 
 
 @pytest.mark.parametrize("measure", WORSE)
-def test_each_measure_raises_the_doubt(measure):
-    assert replace(GOOD, **{measure: WORSE[measure]}).error_probability > 2 * GOOD.error_probability
+def test_each_measure_raises_the_error_probability(measure):
+    assert error_probability(GOOD, **{measure: WORSE[measure]}) > 2 * error_probability(GOOD)
 
 
-def test_support_is_held_against_what_the_map_covers():
+def test_the_robust_weight_is_scaled_by_map_coverage():
     sparse = replace(GOOD, mean_robust_weight=0.3)
-    assert replace(sparse, map_coverage=0.35).error_probability < 0.1 * sparse.error_probability
-    assert replace(sparse, map_coverage=0.95).error_probability == sparse.error_probability
-    assert replace(sparse, map_coverage=0.0).error_probability == sparse.error_probability
-    # A wrong pose has no more on a map with holes.
-    assert (
-        replace(
-            GOOD,
-            mean_robust_weight=0.05,
-            min_eigenvalue=0.0005,
-            prediction_error_cm=18.0,
-            free_space_violation=0.3,
-            map_coverage=0.4,
-        ).error_probability
-        > 0.99
-    )
+    assert error_probability(sparse, map_coverage=0.35) < 0.1 * error_probability(sparse)
+    assert error_probability(sparse, map_coverage=0.95) == error_probability(sparse)
+    assert error_probability(sparse, map_coverage=0.0) == error_probability(sparse)
+    # A wrong pose has no larger weight on a map with holes.
+    wrong = replace(GOOD, mean_robust_weight=0.05, min_eigenvalue=0.0005, free_space_violation=0.3)
+    assert error_probability(wrong, prediction_error_cm=18.0, map_coverage=0.4) > 0.99
 
 
-def test_no_likeness_of_right_poses_makes_a_difference():
+def test_the_correlation_of_right_poses_makes_no_difference():
     for brightness_correlation in (0.26, 0.9, math.nan):
-        assert replace(GOOD, brightness_correlation=brightness_correlation).error_probability == GOOD.error_probability
-    # A plain thing before the lens that fits a wall.
+        assert error_probability(GOOD, brightness_correlation=brightness_correlation) == error_probability(GOOD)
+    # A plain surface before the camera that fits a wall.
     wall = Fit(1.0, 0.95, 0.8, 0.002, math.nan, math.nan, 0.002)
-    assert wall.error_probability < 0.02
-    assert replace(wall, brightness_correlation=0.0).error_probability > 0.5
+    assert error_probability(wall) < 0.02
+    assert error_probability(wall, brightness_correlation=0.0) > 0.5
 
 
-def test_what_is_not_known_lies_between_right_and_wrong():
+def test_an_unknown_measure_counts_between_right_and_wrong():
     for name, wrong in (("free_space_violation", 0.3), ("prediction_error_cm", 50.0)):
-        unknown = replace(GOOD, **{name: math.nan}).error_probability
-        assert GOOD.error_probability < unknown < replace(GOOD, **{name: wrong}).error_probability
+        unknown = error_probability(GOOD, **{name: math.nan})
+        assert error_probability(GOOD) < unknown < error_probability(GOOD, **{name: wrong})
 
 
 def test_nothing_measured_is_no_number():
-    assert math.isnan(Fit().error_probability)
-    assert 0 < replace(GOOD, min_eigenvalue=0.0).error_probability < 1
+    assert math.isnan(error_probability(Fit()))
+    assert 0 < error_probability(GOOD, min_eigenvalue=0.0) < 1
 
 
 def test_extremes_stay_probabilities():
-    assert Fit(0, 0, 0, 0, 1e6, 180, 1).error_probability == pytest.approx(1)
-    assert Fit(0, 1, 1, 1e3, 0, 0, 0).error_probability == pytest.approx(0, abs=1e-6)
+    assert error_probability(Fit(0, 0, 0, 0, 1e6, 180, 1)) == pytest.approx(1)
+    assert error_probability(Fit(0, 1, 1, 1e3, 0, 0, 0)) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-4, 5.0, 179.0, 180.0])
-def test_jump_is_distance_and_angle(degrees):
+def test_prediction_error_is_distance_and_angle(degrees):
     axis = np.array([0.36, 0.48, 0.8])
     start = pose([0.3, -0.2, 0.1], [1, 2, 3])
     turned = (Rotation.from_rotvec(np.radians(degrees) * axis) * Rotation.from_rotvec([0.3, -0.2, 0.1])).as_rotvec()
@@ -92,13 +92,27 @@ def test_jump_is_distance_and_angle(degrees):
         assert prediction_error(start, other) == (pytest.approx(5.0), pytest.approx(degrees, abs=1e-6))
 
 
-def test_jump_of_a_pose_of_nan_is_none():
+def test_prediction_error_of_nan_is_nan():
     assert all(math.isnan(number) for number in prediction_error(pose([0, 0, 0], [0, 0, 0]), [math.nan] * 7))
 
 
-def test_information_is_the_weakest_direction_a_pixel():
+def test_min_eigenvalue_is_of_the_weakest_direction_per_pixel():
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
     hessian = turn @ np.diag([5.0, 7, 9, 20, 30, 40]) @ turn.T
     assert min_eigenvalue(hessian.flatten().tolist(), 10) == pytest.approx(0.5)
     assert min_eigenvalue([0.0] * 36, 10) == 0
     assert math.isnan(min_eigenvalue([math.nan] * 36, 10))
+
+
+def test_the_shipped_model_names_its_provenance():
+    provenance = read_shipped(MODEL_FILE)["provenance"]
+    assert set(provenance) == {"data", "command", "commits"}
+
+
+@pytest.mark.parametrize("change", [{"intercept": None}, {"slope": 1.0}])
+def test_a_model_of_other_constants_is_refused(monkeypatch, change):
+    content = read_shipped(MODEL_FILE)
+    constants = {name: value for name, value in {**content["constants"], **change}.items() if value is not None}
+    monkeypatch.setattr(pose_confidence, "read_shipped", lambda name: {**content, "constants": constants})
+    with pytest.raises(ConfigError, match="constants that do not match the program's: (intercept|slope); reinstall"):
+        PoseConfidenceModel.load()

@@ -32,11 +32,11 @@ def test_cells_are_means_of_their_records():
 
 
 def test_a_reference_is_made_once_a_frame_and_follows_its_pose():
-    keeper = ReferenceCache(CAMERA, weight_m=0.3, kernel=0.4)
+    cache = ReferenceCache(CAMERA, weight_m=0.3, kernel=0.4)
     records = torch.tensor([record(10, 10, 1.0, (9, 9, 9))], dtype=torch.int32)
-    first, again = (keeper.of(5, records, torch.full((7,), pose)) for pose in (1.0, 2.0))
+    first, again = (cache.get(5, records, torch.full((7,), pose)) for pose in (1.0, 2.0))
     assert again.cells is first.cells and again.pose[0] == 2.0
-    assert keeper.of(10, records, first.pose).cells is not first.cells
+    assert cache.get(10, records, first.pose).cells is not first.cells
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +53,13 @@ def processed(dataset, count, *overrides):
 
 def test_the_reference_is_the_last_mapped_frame(dataset):
     system = processed(dataset, 8, "mapping.every=3")
-    history = FrameHistory(system.state, dataset.camera)
-    row, frame = history.mapped(every=3)
+    history = FrameHistory(system.state)
+    row, frame = history.last_mapped(every=3)
     assert row == 6 and torch.equal(frame.pose, system.state.frames.poses[6])
     system.state.frames.lost[6] = True
-    assert history.mapped(every=3)[0] == 3
+    assert history.last_mapped(every=3)[0] == 3
     system.state.frames.lost[:] = True
-    assert history.mapped(every=3) is None
+    assert history.last_mapped(every=3) is None
 
 
 def test_colors_take_part_only_where_asked(dataset):

@@ -12,8 +12,8 @@ import pytest
 
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
-from spslam.run.sequence import run_sequence
 from spslam.run import loop as run_loop
+from spslam.run.sequence import run_sequence
 from tests.cli.command import ROOT
 from tests.system.sequences import FAST_SETTINGS, Recorded, results, run_on, settings, write_room
 

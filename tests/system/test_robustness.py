@@ -9,8 +9,8 @@ from spslam.camera import Camera
 from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError, OutputError, SpslamError
-from spslam.scene import Scene
 from spslam.run import sequence as run_module
+from spslam.scene import Scene
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, run_on, settings

@@ -1,1 +1,1 @@
-"""What happens to a frame whose pose is doubtful: how probable an error is, verification, other starts, relocalization."""
+"""What happens to a doubtful pose: how probable an error is, verification, other starts, relocalization."""

@@ -7,8 +7,8 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.scene import Scene
-from spslam.slam.frame_history import rotations
 from spslam.slam.pixels import unpack_points
+from spslam.slam.poses import rotations
 from spslam.slam.reference_image import LUMA_OF_WHITE, luma
 
 POINTS = 2048  # of a frame

@@ -1,14 +1,14 @@
-"""Further starts for tracking: the frame is laid onto earlier ones by projective ICP, which needs no map."""
+"""Further starts for tracking: projective ICP against earlier frames, which needs no map."""
 
-import numpy as np
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix
+from spslam.geometry import compose, inverse
 from spslam.slam.cell_grid import CellGrid
 from spslam.slam.frame_history import Keyframe
 from spslam.slam.pixels import FramePixels, unpack_points
+from spslam.slam.poses import pose_matrix, pose_tensor
 
 POINTS = 4096  # of the earlier frame
 ITERATIONS = 20  # from 10 cm and 10 degrees off; 15 are just too few
@@ -27,12 +27,12 @@ class IcpAlignment:
 
     def pose(self, earlier: Keyframe, start: torch.Tensor) -> torch.Tensor:
         """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
-        origin = _matrix(earlier.pose)
-        between = _pose(compose(inverse(_matrix(start)), origin), start.device)
+        origin = pose_matrix(earlier.pose)
+        between = pose_tensor(compose(inverse(pose_matrix(start)), origin), start.device)
         points = unpack_points(earlier.records[:POINTS], self._camera)
         maps = self.vertices, self.normals
         between, _, _ = ops.projective_icp(points, *maps, between, self.intrinsics, iterations=ITERATIONS)
-        return _pose(compose(origin, inverse(_matrix(between))), start.device)
+        return pose_tensor(compose(origin, inverse(pose_matrix(between))), start.device)
 
 
 def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:
@@ -52,11 +52,3 @@ def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, tor
     points = torch.cat([unpack_points(records, camera), normals.new_zeros(1, 3)])
     normals = torch.cat([normals, normals.new_zeros(1, 3)])
     return points[first].view(shape), normals[first].view(shape), grid.intrinsics
-
-
-def _matrix(pose: torch.Tensor) -> np.ndarray:
-    return pose7_to_matrix(pose.cpu().numpy().astype(np.float64))
-
-
-def _pose(matrix: np.ndarray, device: torch.device) -> torch.Tensor:
-    return torch.from_numpy(matrix_to_pose7(matrix)).to(device, torch.float32)

@@ -1,4 +1,4 @@
-"""What else speaks for a pose or against it, where its fit to the map leaves doubt."""
+"""Verification of a pose where its fit to the map leaves doubt: free space, the map's holes and its colors."""
 
 import math
 from dataclasses import replace
@@ -9,22 +9,25 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
-from spslam.slam.frame_history import FrameHistory, surface_shares
+from spslam.slam.fit import Fit
+from spslam.slam.frame_history import FrameHistory
 from spslam.slam.recovery.appearance import POINTS, brightness_correlation, brightness_sums
+from spslam.slam.recovery.free_space import surface_counts, surface_shares
 from spslam.slam.recovery.icp_alignment import IcpAlignment
-from spslam.slam.recovery.pose_confidence import SCORE_KERNEL_M, Fit
+from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 
 
 class Verifier:
-    """Holds poses against other frames' surface, the map's holes and its colors.
+    """Compares poses with other frames' surface and the map's colors.
 
     Args:
         config: settings.
         camera: of all frames.
+        confidence: names the score kernel, and what counts as known.
     """
 
-    def __init__(self, config: Config, camera: Camera):
-        self._config, self._camera = config, camera
+    def __init__(self, config: Config, camera: Camera, confidence: PoseConfidenceModel):
+        self._config, self._camera, self._confidence = config, camera, confidence
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
 
     def verified(
@@ -36,31 +39,38 @@ class Verifier:
         history: FrameHistory,
         records: torch.Tensor | None = None,
     ) -> Fit:
-        """The fit with `free_space_violation`, `occluded_share` and `map_coverage`; with `brightness_correlation` too where pixel records are given.
+        """The fit with free-space violation, occluded share and map coverage, and with records the correlation too.
 
         Args:
             fit: of the pose to the map.
             pose: float32 [7].
             scene: the map.
-            alignment: with the frame's surface maps.
+            alignment: with the frame's vertex map.
             history: the frames before.
             records: int32 [P, 3] the frame's packed pixels in random order.
         """
-        counts = history.surface_counts(alignment.vertices, alignment.intrinsics, pose)
-        looks = [] if records is None else [brightness_sums(scene, records[:POINTS], pose, self._camera)]
+        rows = history.compared_rows()
+        counts = surface_counts(
+            alignment.vertices,
+            alignment.intrinsics,
+            pose,
+            history.poses[rows],
+            history.depth_thumbnails[rows],
+            self._camera,
+        )
+        colors = [] if records is None else [brightness_sums(scene, records[:POINTS], pose, self._camera)]
         # A doubtful frame's second wait for the device.
-        numbers = torch.cat([counts, self._coverage(scene, history), *looks]).tolist()
-        free_space_violation, occluded_share = surface_shares(*numbers[:3])
-        alike = brightness_correlation(*numbers[4:]) if looks else math.nan
+        numbers = torch.cat([counts, self._map_coverage(scene, history), *colors]).tolist()
+        violation, occluded = surface_shares(*numbers[:3], self._confidence.unknown_free_space_violation)
         return replace(
             fit,
-            free_space_violation=free_space_violation,
-            occluded_share=occluded_share,
+            free_space_violation=violation,
+            occluded_share=occluded,
             map_coverage=numbers[3],
-            brightness_correlation=alike,
+            brightness_correlation=brightness_correlation(*numbers[4:]) if colors else math.nan,
         )
 
-    def _coverage(self, scene: Scene, history: FrameHistory) -> torch.Tensor:
+    def _map_coverage(self, scene: Scene, history: FrameHistory) -> torch.Tensor:
         """Share of the last trusted frame's pixels on mapped surface, float32 [1]; NaN where there is no such frame."""
         last = history.last()
         if last is None:
@@ -71,6 +81,6 @@ class Verifier:
             last.pose[None],
             self._intrinsics,
             truncation=scene.settings.truncation_m,
-            kernel=SCORE_KERNEL_M,
+            kernel=self._confidence.score_kernel_m,
         )
         return inlier_share

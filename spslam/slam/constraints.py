@@ -1,0 +1,60 @@
+"""What a frame is tracked against beside the map: depth images of earlier frames, and the last mapped one's colors."""
+
+from dataclasses import dataclass
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.config import Config
+from spslam.slam.frame_history import FrameHistory
+from spslam.slam.pixels import FramePixels
+from spslam.slam.reference_image import ReferenceCache
+
+LITTLE_DEPTH_SHARE = 0.25  # of the image; with less, depth keyframes take part from the first iteration on
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Terms of Gauss-Newton tracking beside the map's.
+
+    Attributes:
+        reference: the last mapped frame, to compare brightness with; None compares none.
+        depth_keyframes: depth images of earlier frames; None uses the map alone.
+        keyframes_from_start: whether these take part in all iterations. Normally they join in the second half, as the
+            map alone brings a pose from farther away; a strip of depth would slide along the map before that.
+    """
+
+    reference: ops.ReferenceImage | None = None
+    depth_keyframes: ops.DepthKeyframes | None = None
+    keyframes_from_start: bool = False
+
+    def depth_keyframes_of(self, iterations: int) -> ops.DepthKeyframes | None:
+        """The depth keyframes for a call of so many iterations."""
+        if self.depth_keyframes is None or self.keyframes_from_start:
+            return self.depth_keyframes
+        return self.depth_keyframes._replace(first_iteration=iterations // 2)
+
+
+class ConstraintSource:
+    """Gathers the constraints of a frame from the frames before it.
+
+    Args:
+        config: settings.
+        camera: of all frames.
+    """
+
+    def __init__(self, config: Config, camera: Camera):
+        weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
+        self._references = ReferenceCache(camera, weight_m, kernel) if weight_m > 0 else None
+        self._mapping_every = config.mapping.every
+
+    def gather(self, history: FrameHistory, pixels: FramePixels) -> Constraints:
+        """The constraints of the next frame, of the given pixels."""
+        from_start = pixels.valid_depth_share < LITTLE_DEPTH_SHARE
+        return Constraints(self._reference(history), history.depth_keyframes(), from_start)
+
+    def _reference(self, history: FrameHistory) -> ops.ReferenceImage | None:
+        mapped = history.last_mapped(self._mapping_every) if self._references else None
+        if mapped is None or self._references is None:
+            return None
+        row, keyframe = mapped
+        return self._references.get(row, keyframe.records, keyframe.pose)

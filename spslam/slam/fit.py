@@ -1,0 +1,56 @@
+"""How well a pose fits what is known: the measures that tracking and verification take of it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Measures of one pose; NaN where something was not measured.
+
+    Attributes:
+        residual_cm: RMS distance of the frame's pixels to the mapped surface, weighted as in `mean_robust_weight`.
+        inlier_share: share of the pixels that fall on mapped surface.
+        mean_robust_weight: mean robust weight of all pixels by the score kernel, from 0 (none fits the map) to 1.
+        min_eigenvalue: smallest eigenvalue of the normal equations per pixel (m and rad): how firmly the least
+            constrained direction is held.
+        prediction_error_cm, prediction_error_deg: distance and angle to the pose that the motion model predicted.
+        free_space_violation: share of the surface known from other frames that the frame would look through.
+        occluded_share: share of that surface that something nearer occludes; no sign of a wrong pose.
+        map_coverage: share of the last trusted frame's pixels that fall on mapped surface. Where images are small or
+            points are few the map has holes, and no pose has a larger mean robust weight than this.
+        brightness_correlation: correlation of the pixels' brightness with that of the map's colors.
+    """
+
+    residual_cm: float = math.nan
+    inlier_share: float = math.nan
+    mean_robust_weight: float = math.nan
+    min_eigenvalue: float = math.nan
+    prediction_error_cm: float = math.nan
+    prediction_error_deg: float = math.nan
+    free_space_violation: float = math.nan
+    occluded_share: float = math.nan
+    map_coverage: float = math.nan
+    brightness_correlation: float = math.nan
+
+
+def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:
+    """Distance (cm) and angle (degrees) between two poses of seven numbers each; NaN where one of them is."""
+    near, far = (math.dist(predicted[:4], [sign * number for number in pose[:4]]) for sign in (1, -1))
+    chord = min(near, far, 2.0) if near == near else math.nan  # 2 sin(angle / 4), exact for small angles too
+    return 100 * math.dist(predicted[4:], pose[4:]), math.degrees(4 * math.asin(chord / 2))
+
+
+def min_eigenvalue(hessian: list[float], pixels: int) -> float:
+    """Smallest eigenvalue of the normal equations per pixel; NaN where the matrix is not finite.
+
+    Args:
+        hessian: 36 numbers, symmetric.
+        pixels: how many pixels it is a sum over.
+    """
+    matrix = np.array(hessian).reshape(6, 6)
+    if not np.isfinite(matrix).all():
+        return math.nan
+    return max(float(np.linalg.eigvalsh(matrix)[0]), 0.0) / pixels

@@ -1,0 +1,125 @@
+"""Place recognition: earlier frames whose coarse depth looks like that of a frame, as starts for relocalization."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from spslam.camera import Camera
+from spslam.geometry import compose, matrix_to_pose7, pose7_to_matrix
+from spslam.slam.frame_history import FrameHistory, Keyframe
+from spslam.slam.pixels import THUMBNAIL_STEP_PX, FramePixels
+
+# Difference of two coarse depth images: of the logarithms, clamped, and what a cell costs that only one of them knows.
+MAX_LOG_DIFFERENCE, ONE_SIDED_DIFFERENCE = 0.3, 0.15
+MIN_SEPARATION = 5  # frames; of similar frames in a row only the best is a candidate
+TURNED_CANDIDATES = 32  # the best are also compared as if the camera had turned
+TURN_COLUMNS, TURN_ROWS = 0.15, 0.2  # share of the image by which it may have turned, or twice that to the side
+MIN_OVERLAP = 0.4  # share of an image that must remain to be compared
+MIN_DEPTH_M = 0.05
+
+
+@dataclass(frozen=True)
+class RelocalizationCandidate:
+    """An earlier frame that looks like the present one.
+
+    Attributes:
+        keyframe: the earlier frame.
+        start: float32 [7], the pose from which the present frame would look most like it.
+    """
+
+    keyframe: Keyframe
+    start: torch.Tensor
+
+
+def retrieve(history: FrameHistory, pixels: FramePixels, count: int, camera: Camera) -> list[RelocalizationCandidate]:
+    """Earlier frames whose depth thumbnail is most like that of the given pixels, best first.
+
+    Of similar frames in a row only the best is taken, so that a slow camera does not fill the list. The best are also
+    compared as they would look if the camera had turned.
+
+    Args:
+        history: the frames before.
+        pixels: of the present frame.
+        count: most candidates; 0 gives none.
+        camera: of all frames.
+    """
+    rows = history.usable_rows().to(history.depth_thumbnails.device)
+    if len(rows) == 0 or count == 0:
+        return []
+    difference = thumbnail_difference(pixels.depth_thumbnail, history.depth_thumbnails[rows])
+    least = -F.max_pool1d(-difference[None, None], 2 * MIN_SEPARATION + 1, 1, MIN_SEPARATION)[0, 0]
+    separate = torch.where(difference == least, difference, torch.inf)
+    order = separate.argsort(stable=True)[:TURNED_CANDIDATES]
+    rows = rows[order[separate[order].isfinite()]]
+    shifts, differences = turned_differences(pixels.depth_thumbnail, history.depth_thumbnails[rows])
+    smallest, turn = differences.min(0)
+    order = smallest.argsort(stable=True)[:count]
+    keyframes = [history.keyframe(row) for row in rows[order].tolist()]
+    turns = [shifts[i] for i in turn[order].tolist()]
+    return [
+        RelocalizationCandidate(keyframe, turned(keyframe.pose, shift, camera))
+        for keyframe, shift in zip(keyframes, turns, strict=True)
+    ]
+
+
+def thumbnail_difference(depth_thumbnail: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+    """Mean difference of the logarithms of depth between coarse depth images, clamped to `MAX_LOG_DIFFERENCE`.
+
+    Args:
+        depth_thumbnail: float16 [h, w], m, 0 where unknown.
+        others: float16 [F, h, w].
+
+    Returns:
+        float32 [F]; cells that neither image knows do not count.
+    """
+    one, known = depth_thumbnail.float().clamp(min=MIN_DEPTH_M).log(), depth_thumbnail > 0
+    other, others_known = others.float().clamp(min=MIN_DEPTH_M).log(), others > 0
+    difference = (one - other).abs().clamp(max=MAX_LOG_DIFFERENCE)
+    difference = torch.where(known & others_known, difference, ONE_SIDED_DIFFERENCE)
+    either = known | others_known
+    return (difference * either).sum((1, 2)) / either.sum((1, 2)).clamp(min=1)
+
+
+def turned_differences(
+    depth_thumbnail: torch.Tensor, others: torch.Tensor
+) -> tuple[list[tuple[int, int]], torch.Tensor]:
+    """Differences of coarse depth images with the first one shifted over the others by rows and columns.
+
+    Args:
+        depth_thumbnail: float16 [h, w], m.
+        others: float16 [F, h, w].
+
+    Returns:
+        The S shifts (rows, columns), (0, 0) among them; float32 [S, F] differences where the images overlap.
+    """
+    height, width = depth_thumbnail.shape
+    down, right = max(round(TURN_ROWS * height), 1), max(round(TURN_COLUMNS * width), 1)
+    shifts = [(y, x) for y in (0, -down, down) for x in (0, -right, right, -2 * right, 2 * right)]
+    shifts = [(y, x) for y, x in shifts if (height - abs(y)) * (width - abs(x)) >= MIN_OVERLAP * height * width]
+    differences = [thumbnail_difference(_part(depth_thumbnail, -y, -x), _part(others, y, x)) for y, x in shifts]
+    return shifts, torch.stack(differences)
+
+
+def _part(thumbnails: torch.Tensor, down: int, right: int) -> torch.Tensor:
+    """Images [..., h, w] without the first rows and columns, or the last where negative."""
+    height, width = thumbnails.shape[-2:]
+    rows = slice(max(down, 0), height + min(down, 0))
+    return thumbnails[..., rows, max(right, 0) : width + min(right, 0)]
+
+
+def turned(pose: torch.Tensor, shift: tuple[int, int], camera: Camera) -> torch.Tensor:
+    """The pose float32 [7] of a camera that has turned from `pose` so that its image moved by thumbnail cells.
+
+    Args:
+        pose: float32 [7].
+        shift: rows and columns; what is at a cell now was that much further down and to the right.
+        camera: of the image.
+    """
+    down, right = (math.atan(n * THUMBNAIL_STEP_PX / f) / 2 for n, f in zip(shift, (camera.fy, camera.fx), strict=True))
+    yaw = pose7_to_matrix(np.array([math.cos(right), 0, math.sin(right), 0, 0, 0, 0]))
+    pitch = pose7_to_matrix(np.array([math.cos(down), -math.sin(down), 0, 0, 0, 0, 0]))
+    matrix = compose(pose7_to_matrix(pose.cpu().double().numpy()), yaw, pitch)
+    return torch.from_numpy(matrix_to_pose7(matrix)).to(pose)
