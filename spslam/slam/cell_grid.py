@@ -1,4 +1,4 @@
-"""A frame's pixel records as small images: which cell of a coarse grid each falls in."""
+"""A coarse grid over the image, to make small images of a frame's pixel records."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 
-COLUMNS = 80  # at most: about three pixel records a cell
+MAX_COLUMNS = 80  # about three pixel records per cell
 
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Squares of `step` x `step` pixels that cover the image.
+    """Square cells of `step` x `step` pixels that cover the image.
 
     Attributes:
         step: px.
@@ -27,8 +27,8 @@ class CellGrid:
 
     @classmethod
     def of(cls, camera: Camera) -> "CellGrid":
-        """The finest grid of at most `COLUMNS` columns."""
-        step = -(-camera.width // COLUMNS)
+        """The finest grid of at most `MAX_COLUMNS` columns."""
+        step = -(-camera.width // MAX_COLUMNS)
         rows, columns = -(-camera.height // step), -(-camera.width // step)
         center = (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5
         return cls(step, rows, columns, ops.Intrinsics(camera.fx / step, camera.fy / step, *center))

@@ -1,4 +1,4 @@
-"""What a frame is tracked against beside the map: depth images of earlier frames, and the last mapped one's colors."""
+"""Tracking constraints beside the map: depth images of earlier frames, and the last mapped one's brightness."""
 
 from dataclasses import dataclass
 

@@ -1,18 +1,18 @@
-"""Depth images of earlier frames, which tracking holds a frame's surface against beside the map."""
+"""Depth images of earlier frames, with which tracking aligns a frame beside the map."""
 
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
 
-EVERY = 10  # frames; of these the images are kept for a while
-AGES = (1, 4)  # of the kept images that are used, in units of EVERY
-COLUMNS = 640  # of an image, at most
-UNITS = 2**16 - 1  # a depth has 16 bits
+INTERVAL = 10  # frames between the images that are kept
+AGES = (1, 4)  # of the kept images that are used, in intervals
+MAX_COLUMNS = 640  # of an image
+UNITS = 2**16 - 1  # depth is stored in 16 bits
 
 
 class DepthKeyframeStore:
-    """The last frame's depth image, and those of every tenth frame for as long as they are of use.
+    """The last frame's depth image, and those of every tenth frame while they are used.
 
     Attributes:
         images: uint16 [S, h, w] depth in units of `unit` m, 0 where unknown; the first is the last frame's.
@@ -26,7 +26,7 @@ class DepthKeyframeStore:
         Args:
             camera: of all frames.
             max_depth_m: the largest depth that images hold.
-            kernel_m: last width of the robust kernel of distances from what they show.
+            kernel_m: final width of the robust kernel of distances from the surface in the images.
             device: where the images are.
         """
         self.step = depth_image_step(camera)
@@ -40,14 +40,14 @@ class DepthKeyframeStore:
         self.intrinsics = ops.Intrinsics(fx, fy, cx, cy)
 
     def add(self, frame: int, image: torch.Tensor) -> None:
-        """Takes in the depth image uint16 [h, w] of frame number `frame`; the host waits for nothing."""
-        slots = [0] if frame % EVERY else [0, self._slot(frame)]
+        """Stores the depth image uint16 [h, w] of frame number `frame`, asynchronously."""
+        slots = [0] if frame % INTERVAL else [0, self._slot(frame)]
         for slot in slots:
             self.images[slot].copy_(image)
             self.frames[slot] = frame
 
     def select(self, frame: int, lost: torch.Tensor, poses: torch.Tensor) -> ops.DepthKeyframes | None:
-        """What to hold frame number `frame` against: the last frame, one 10 to 19 back and one 40 to 49 back.
+        """Images to align frame number `frame` with: the last frame, one 10 to 19 back and one 40 to 49 back.
 
         Args:
             frame: its number.
@@ -55,11 +55,11 @@ class DepthKeyframeStore:
             poses: float32 [F, 7] of the frames before.
 
         Returns:
-            The views of which the pose is known; None where there is none.
+            The images whose pose is known; None where there is none.
         """
         wanted = [(0, frame - 1)]
         for age in AGES:
-            kept = (frame // EVERY - age) * EVERY
+            kept = (frame // INTERVAL - age) * INTERVAL
             if kept != frame - 1:
                 wanted.append((self._slot(kept), kept))
         rows = tuple((slot, of) for slot, of in wanted if of >= 0 and self.frames[slot] == of and not lost[of])
@@ -78,9 +78,9 @@ class DepthKeyframeStore:
 
     @staticmethod
     def _slot(frame: int) -> int:
-        return 1 + frame // EVERY % (1 + max(AGES))
+        return 1 + frame // INTERVAL % (1 + max(AGES))
 
 
 def depth_image_step(camera: Camera) -> int:
-    """Distance of the pixels that a depth image keeps, px."""
-    return -(-camera.width // COLUMNS)
+    """Every how many pixels of the camera's image a depth image holds one."""
+    return -(-camera.width // MAX_COLUMNS)

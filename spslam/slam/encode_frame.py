@@ -1,4 +1,4 @@
-"""What a frame's surface points do to the sparse volume: allocate voxels around them and fuse their encoding."""
+"""Allocates voxels around a frame's surface points and fuses the encoding of these points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spslam.options import PriorOptions
 from spslam.prior.encoder import Prior
 from spslam.scene import SparseVolume
 
-# Pairs of a point and a vertex lighter than this share of the least weight of a vertex aren't worth encoding: they move
+# Pairs of a point and a vertex lighter than this share of the least weight of a vertex are not encoded: they move
 # 99 % of the field by less than 0.1 mm.
 _LIGHT_PAIR = 1 / 60
 

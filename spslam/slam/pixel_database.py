@@ -25,7 +25,7 @@ class PixelDatabase:
         """An empty database.
 
         Args:
-            pixels_per_frame: records a frame, to start with.
+            pixels_per_frame: records per frame, to start with.
             budget_mb: most megabytes it may take.
             device: where the records are.
             keyframe_every: frames whose number isn't a multiple are forgotten when the next one comes, as systems with

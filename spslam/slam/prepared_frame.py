@@ -1,4 +1,4 @@
-"""What the system needs of a frame, and how it is made of the images."""
+"""A frame sampled from its images, as the system takes it."""
 
 import time
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from spslam.slam.upload import Upload, Uploader
 
 @dataclass
 class PreparedFrame:
-    """What the system needs of a frame; the images are let go.
+    """A sampled frame; its images are freed.
 
     Attributes:
         index: of the frame in the data set; keys its draws.

@@ -1,4 +1,4 @@
-"""What a mapped frame looked like, small and gray, for tracking to compare colors with."""
+"""Small grayscale image of the last mapped frame, to compare brightness with while tracking."""
 
 import torch
 
@@ -33,7 +33,7 @@ def reference_cells(records: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 def luma(records: torch.Tensor) -> torch.Tensor:
-    """Brightness of packed pixels int32 [P, 3], in units of which white has `LUMA_OF_WHITE`: int32 [P]."""
+    """Luma int32 [P] of packed pixels int32 [P, 3], from 0 to `LUMA_OF_WHITE`."""
     channels = ((records[:, 2] >> shift) & 0xFF for shift in (0, 8, 16))
     red, green, blue = (weight * channel for weight, channel in zip(ops.LUMA_WEIGHTS, channels, strict=True))
     return red + green + blue
@@ -44,11 +44,11 @@ def _depth_steps(records: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 class ReferenceCache:
-    """The reference of the last mapped frame, made when first asked for.
+    """The reference of the last mapped frame, made when first needed.
 
     Args:
         camera: of all frames.
-        weight_m: that a difference of 1 in brightness counts as.
+        weight_m: m that a brightness difference of 1 counts as.
         kernel: width of the robust kernel of brightness.
     """
 

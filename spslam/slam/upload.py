@@ -1,4 +1,4 @@
-"""Frames' way to a CUDA device, beside whatever it does."""
+"""Asynchronous upload of frames to a CUDA device."""
 
 import contextlib
 import threading
@@ -16,7 +16,7 @@ class Upload:
 
     Attributes:
         pixels: on the device; not to be read before `received`.
-        source: the same in page-locked memory, to be kept as it is until `end` has passed.
+        source: the same in page-locked memory, not to be changed until `end` is complete.
         begin, end: of the copy.
     """
 
@@ -26,7 +26,7 @@ class Upload:
     end: StreamEvent
 
     def received(self) -> FramePixels:
-        """The pixels, for work that is given to the current stream from now on; the host waits for nothing."""
+        """The pixels, for work submitted to the current stream from now on; does not wait."""
         stream = torch.cuda.current_stream(self.pixels.buffer.device)
         stream.wait_event(self.end.event)
         # Their memory must not be given to another upload while this stream may read it.
@@ -35,7 +35,7 @@ class Upload:
 
 
 class Uploader:
-    """Copies frames to a CUDA device beside whatever it does; each thread that uses it has a stream of its own."""
+    """Copies frames to a CUDA device asynchronously; each thread that uses it has a stream of its own."""
 
     def __init__(self, device: torch.device):
         self.device = device

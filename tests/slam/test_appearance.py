@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from spslam.slam.pixels import sample_frame
-from spslam.slam.recovery.appearance import FEW_POINTS, brightness_correlation, brightness_sums
+from spslam.slam.recovery.appearance import MIN_POINTS, brightness_correlation, brightness_sums
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
 
@@ -37,7 +37,7 @@ def test_one_color_is_like_nothing():
 
 def test_nothing_is_told_by_few_pixels_plain_surface_or_without_light():
     mapped = np.random.default_rng(0).uniform(0.2, 0.8, 500)
-    assert math.isnan(brightness_correlation(*sums_of(mapped[: FEW_POINTS - 1], mapped[: FEW_POINTS - 1])))
+    assert math.isnan(brightness_correlation(*sums_of(mapped[: MIN_POINTS - 1], mapped[: MIN_POINTS - 1])))
     assert math.isnan(brightness_correlation(*sums_of(0.05 * mapped + 0.4, mapped)))
     assert math.isnan(brightness_correlation(*sums_of(mapped, 0.05 * mapped)))
     assert math.isnan(brightness_correlation(*sums_of(mapped, np.full(500, 0.99))))

@@ -1,4 +1,4 @@
-"""Whether a frame's colors are those of the map where it is laid: plain shapes are alike in many places."""
+"""Whether a frame's brightness agrees with the map's colors at a pose: plain shapes fit in many places."""
 
 import math
 
@@ -11,12 +11,12 @@ from spslam.slam.pixels import unpack_points
 from spslam.slam.poses import rotations
 from spslam.slam.reference_image import LUMA_OF_WHITE, luma
 
-POINTS = 2048  # of a frame
-NEAR = 0.5  # of the truncation, from the mapped surface
-FEW_POINTS = 100  # say nothing
-PLAIN = 0.05  # deviation of the map's brightness: with less there is nothing to be like
-LEAST_DEVIATION = 0.02  # of the picture's brightness: less is the camera's noise
-DARK, BLINDED = 0.05, 0.95  # mean brightness of a picture without light, or with too much
+POINTS = 2048  # pixels of a frame that are compared
+MAX_DISTANCE = 0.5  # from the mapped surface, in units of the truncation
+MIN_POINTS = 100  # with fewer the correlation is unknown
+MIN_MAP_DEVIATION = 0.05  # of the map's brightness; on plainer surface the correlation is unknown
+NOISE_DEVIATION = 0.02  # of the image's brightness; less is the camera's noise
+MIN_BRIGHTNESS, MAX_BRIGHTNESS = 0.05, 0.95  # mean of the image; beyond it is under- or overexposed
 
 
 def brightness_sums(scene: Scene, records: torch.Tensor, pose: torch.Tensor, camera: Camera) -> torch.Tensor:
@@ -29,11 +29,11 @@ def brightness_sums(scene: Scene, records: torch.Tensor, pose: torch.Tensor, cam
         camera: of the pixels.
 
     Returns:
-        float64 [6]: pixels, the map's brightness m and the picture's b, and m m, b b, m b. Zeros where P = 0.
+        float64 [6]: sums of 1, m, b, m m, b b and m b, m being the map's brightness and b the image's. Zeros where P = 0.
     """
     points = unpack_points(records, camera) @ rotations(pose[None, :4])[0].T + pose[4:]
     distance, inside = scene.sdf(points)
-    near = inside & (distance.abs() < NEAR)
+    near = inside & (distance.abs() < MAX_DISTANCE)
     mapped, seen = _brightness(scene.color(points).double()), luma(records).double() / LUMA_OF_WHITE
     columns = torch.stack([torch.ones_like(mapped), mapped, seen, mapped * mapped, seen * seen, mapped * seen])
     return torch.where(near, columns, 0).sum(1)
@@ -42,21 +42,21 @@ def brightness_sums(scene: Scene, records: torch.Tensor, pose: torch.Tensor, cam
 def brightness_correlation(
     pixels: float, mapped: float, seen: float, mapped_2: float, seen_2: float, both: float
 ) -> float:
-    """Correlation from -1 to 1 of the map's brightness and the picture's, of `brightness_sums`.
+    """Correlation in [-1, 1] of the map's brightness and the image's, of `brightness_sums`.
 
-    It does not change with exposure. NaN where nothing can be told: few pixels, a plain part of the map, the dark.
+    It is invariant to exposure. NaN where it is unknown: few pixels, a plain part of the map, a dark or overexposed image.
     """
-    if not pixels >= FEW_POINTS:
+    if not pixels >= MIN_POINTS:
         return math.nan
     mean_mapped, mean_seen = mapped / pixels, seen / pixels
     deviation_mapped = math.sqrt(max(mapped_2 / pixels - mean_mapped**2, 0.0))
     deviation_seen = math.sqrt(max(seen_2 / pixels - mean_seen**2, 0.0))
-    if deviation_mapped < PLAIN or not DARK < mean_seen < BLINDED:
+    if deviation_mapped < MIN_MAP_DEVIATION or not MIN_BRIGHTNESS < mean_seen < MAX_BRIGHTNESS:
         return math.nan
-    return (both / pixels - mean_mapped * mean_seen) / (deviation_mapped * max(deviation_seen, LEAST_DEVIATION))
+    return (both / pixels - mean_mapped * mean_seen) / (deviation_mapped * max(deviation_seen, NOISE_DEVIATION))
 
 
 def _brightness(colors: torch.Tensor) -> torch.Tensor:
-    """Of colors [P, 3] in [0, 1]."""
+    """Luma in [0, 1] of colors [P, 3] in [0, 1]."""
     red, green, blue = (weight * channel for weight, channel in zip(ops.LUMA_WEIGHTS, colors.unbind(1), strict=True))
     return (red + green + blue) / sum(ops.LUMA_WEIGHTS)

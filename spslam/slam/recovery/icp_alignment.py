@@ -10,8 +10,8 @@ from spslam.slam.frame_history import Keyframe
 from spslam.slam.pixels import FramePixels, unpack_points
 from spslam.slam.poses import pose_matrix, pose_tensor
 
-POINTS = 4096  # of the earlier frame
-ITERATIONS = 20  # from 10 cm and 10 degrees off; 15 are just too few
+POINTS = 4096  # pixels of the earlier frame that are aligned
+ITERATIONS = 20  # converge from 10 cm and 10 degrees; 15 do not always
 
 
 class IcpAlignment:
@@ -36,9 +36,9 @@ class IcpAlignment:
 
 
 def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:
-    """What a frame's pixel records show of the surface, as maps with the cells of a `CellGrid`.
+    """Vertex and normal map of a frame's pixel records, with the cells of a `CellGrid`.
 
-    A cell holds the first record that falls in it and has a normal, so both devices choose the same.
+    A cell holds the first record in it that has a normal, so that CPU and CUDA choose the same.
 
     Returns:
         vertices float32 [h, w, 3] (m, camera axes; 0 where there is none), normals float32 [h, w, 3], and the
