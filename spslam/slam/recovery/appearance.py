@@ -29,7 +29,7 @@ def brightness_sums(scene: Scene, records: torch.Tensor, pose: torch.Tensor, cam
         camera: of the pixels.
 
     Returns:
-        float64 [6]: sums of 1, m, b, m m, b b and m b, m being the map's brightness and b the image's. Zeros where P = 0.
+        float64 [6]: sums of 1, m, b, m m, b b and m b for the map's brightness m and the image's b. Zeros where P = 0.
     """
     points = unpack_points(records, camera) @ rotations(pose[None, :4])[0].T + pose[4:]
     distance, inside = scene.sdf(points)
@@ -44,7 +44,7 @@ def brightness_correlation(
 ) -> float:
     """Correlation in [-1, 1] of the map's brightness and the image's, of `brightness_sums`.
 
-    It is invariant to exposure. NaN where it is unknown: few pixels, a plain part of the map, a dark or overexposed image.
+    It is invariant to exposure. NaN where it is unknown: few pixels, plain surface, a dark or overexposed image.
     """
     if not pixels >= MIN_POINTS:
         return math.nan
