@@ -16,8 +16,8 @@ from spslam.datasets import open_dataset
 from spslam.prior import load_prior
 
 VOXEL_M, CUBES = 0.04, 2  # edge of a voxel; marching cubes in each, along an axis
-POINTS = 8000  # a frame
-MIN_WEIGHT, FULL_WEIGHT, MAX_WEIGHT = 0.006, 2.5, 20.0  # of what the points give to a vertex; of a vertex in all
+POINTS = 8000  # per frame
+MIN_WEIGHT, FULL_WEIGHT, MAX_WEIGHT = 0.006, 2.5, 20.0  # sums of point weights at a vertex; cap of its fused weight
 
 
 def surface_points(frame, camera, device):

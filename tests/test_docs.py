@@ -11,6 +11,19 @@ from spslam.config import option_paths
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+# Dated experiments are not updated, so the options and scripts that they name may be gone; everything else is current.
+RECORDS = [page for page in PAGES if page.parent.name == "experiments" and page.name != "index.md"]
+CURRENT = [page for page in PAGES if page not in RECORDS]
+
+
+def page_id(page):
+    return str(page.relative_to(ROOT))
+
+
+def links(page):
+    """Target and anchor of every link and picture of a page, those to other sites left out."""
+    found = re.findall(r"\]\(([^)#\s]*)(?:#([^)]*))?\)", page.read_text(encoding="utf-8"))
+    return [(target, anchor) for target, anchor in found if not target.startswith(("http:", "https:", "mailto:"))]
 
 
 def python_blocks(page):
@@ -46,18 +59,42 @@ def headings(page):
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_links_lead_somewhere(page):
-    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)]*))?\)", page.read_text(encoding="utf-8")):
-        if not target.startswith(("http:", "https:", "mailto:")):
-            file = page.parent / target if target else page
-            assert file.exists(), target
-            assert not anchor or anchor in headings(file), f"{target}#{anchor}"
+    for target, anchor in links(page):
+        file = page.parent / target if target else page
+        assert file.exists(), target
+        assert not anchor or anchor in headings(file), f"{target}#{anchor}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("folder", ["docs", "docs/ops", "docs/experiments"])
+def test_every_page_is_in_its_index(folder):
+    index = ROOT / folder / "index.md"
+    linked = {(index.parent / target).resolve() for target, _ in links(index)}
+    assert not [page.name for page in index.parent.glob("*.md") if page != index and page not in linked]
+
+
+@pytest.mark.parametrize("page", CURRENT, ids=page_id)
 def test_commands_and_options_named_exist(page):
     text = page.read_text(encoding="utf-8")
-    assert {name for name in re.findall(r"^\s*(?:\$ )?spslam ([a-z-]+)", text, re.MULTILINE)} <= set(COMMANDS)
+    code = "\n".join(re.findall(r"```\w*\n(.*?)```", text, re.DOTALL) + re.findall(r"`(spslam [^`]*)`", text))
+    assert set(re.findall(r"^\s*(?:\$ )?spslam ([a-z-]+)", code, re.MULTILINE)) <= set(COMMANDS)
     for option in re.findall(r"--set ([\w.]+)=", text):
         assert option in set(option_paths()) | {"section.key"}
+
+
+@pytest.mark.parametrize("page", [page for page in CURRENT if page.name != "CHANGELOG.md"], ids=page_id)
+def test_scripts_and_files_named_exist(page):
+    """Of `python -m experiments.NAME`, and of paths in backticks such as `slam/state.py` or `configs/tum.yaml`."""
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"python -m experiments\.([a-z]\w*)", text):
+        assert (ROOT / "experiments" / f"{name}.py").is_file(), name
+    for path in re.findall(r"`([\w/]+/\w+\.(?:py|yaml|h|cuh|cpp|cu))`", text):
+        assert (ROOT / path).is_file() or (ROOT / "spslam" / path).is_file(), path
+
+
+@pytest.mark.parametrize("page", RECORDS, ids=page_id)
+def test_experiments_are_dated_and_say_where_they_come_from(page):
+    assert re.fullmatch(r"20\d\d-[01]\d-[a-z-]+", page.stem)
+    text = page.read_text(encoding="utf-8")
+    assert all(re.search(rf"^\| {row} \| .+ \|$", text, re.MULTILINE) for row in ("status", "commit", "machine"))
