@@ -25,7 +25,8 @@ from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.reader_launch import launch_standby
-from spslam.run.sequence import run_sequence
+from spslam.run.sequence import RunRequest, run_sequence
+from spslam.run_folder import RunFolder
 
 # Columns of the table that are medians of metrics.json.
 FIGURES = (
@@ -94,14 +95,15 @@ def run_preset(args: argparse.Namespace, preset: str) -> list[dict]:
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder) / "run"
             launch_standby(config)  # as the command line does
-            metrics = run_sequence(config, args.data, output, frames, mesh=False)
+            metrics = run_sequence(RunRequest(config, args.data, output, frames, mesh=False))
             runs.append({**metrics, "digest": digest(output)})
     return runs
 
 
 def digest(output: Path) -> str:
     """What tells two results apart."""
-    content = b"".join((output / name).read_bytes() for name in ("trajectory.txt", "map.safetensors"))
+    folder = RunFolder(output)
+    content = folder.trajectory.read_bytes() + folder.map.read_bytes()
     return hashlib.sha256(content).hexdigest()[:16]
 
 

@@ -11,13 +11,14 @@ import torch
 
 import spslam
 from spslam import ops
+from spslam.run.provenance import device_name
 
 
 def describe_environment(device: torch.device) -> dict[str, Any]:
     """Device, versions, kernels, threads and commit, for the record of a run."""
     return {
         "device": device.type,
-        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else processor_name(),
+        "device_name": device_name(device),
         "cpu_kernels": ops.CPU_ISA,
         "kernel_threads": ops.get_num_threads(),
         "spslam": spslam.__version__,
@@ -37,13 +38,3 @@ def commit() -> str | None:
         return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.strip() or None
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def processor_name() -> str:
-    """The processor's model name where the system tells, else its architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()

@@ -26,7 +26,7 @@ from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import ate, rpe
 from spslam.run.device import resolve_device
-from spslam.run.sequence import run_sequence
+from spslam.run.sequence import RunRequest, run_sequence
 
 _READING_THREADS, _READ_AHEAD = 2, 8
 
@@ -76,7 +76,8 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
     data = None if job.data is None else Path(job.data)
     dataset = open_dataset(config.dataset, data)
     ground_truth = _true_surface(dataset, job.mesh)
-    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=ground_truth is not None or job.thorough)
+    with_mesh = ground_truth is not None or job.thorough
+    figures = run_sequence(RunRequest(config, data, folder, parse_slice(job.frames), mesh=with_mesh))
     if "peak_gpu_mb" in figures:
         figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
     run = RunOutput.read(folder)

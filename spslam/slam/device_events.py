@@ -57,7 +57,7 @@ class StreamEvent(DeviceEvent):
         return earlier.event.elapsed_time(self.event)
 
 
-def marker(device: torch.device) -> Callable[[], DeviceEvent]:
+def event_recorder(device: torch.device) -> Callable[[], DeviceEvent]:
     """Makes marks of when the device has done all it was given so far: on CUDA by this thread's current stream."""
     if device.type != "cuda":
         return HostEvent

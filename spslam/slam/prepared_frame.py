@@ -20,7 +20,7 @@ class PreparedFrame:
         pixels: on the CPU, or on their way to the device.
         decode_ms: reading, decoding and sampling, on the thread that did it.
         wait_ms: how long the host waited for the frame.
-        asked: when it was asked for; None where nobody kept the time.
+        requested: when it was requested; None where nobody kept the time.
     """
 
     index: int
@@ -28,7 +28,7 @@ class PreparedFrame:
     pixels: FramePixels | Upload
     decode_ms: float = 0.0
     wait_ms: float = 0.0
-    asked: DeviceEvent | None = None
+    requested: DeviceEvent | None = None
 
 
 class FramePreparation:

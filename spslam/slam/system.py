@@ -10,7 +10,7 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
 from spslam.prior import load_prior
-from spslam.slam.device_events import marker
+from spslam.slam.device_events import event_recorder
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.frame_report import FrameEvents, FrameReport, PendingReport
 from spslam.slam.mapper import Mapper
@@ -80,9 +80,9 @@ class SlamSystem:
 
     def submit(self, frame: PreparedFrame) -> PendingReport:
         """Takes the next frame in as `process` does, but waits only for its pose: mapping goes on behind."""
-        self._mark = marker(self.device)
+        self._mark = event_recorder(self.device)
         began = self._mark()
-        marks = FrameEvents(asked=frame.asked or began, began=began, done=began)
+        marks = FrameEvents(asked=frame.requested or began, began=began, done=began)
         pixels = self._receive(frame, marks)
         number = len(self.state.frames)
         tracked = self._track(pixels, number, marks)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from spslam.errors import OutputError
-from spslam.run.checkpoint_writer import CheckpointWriter
 from spslam.run import checkpoint_writer
+from spslam.run.checkpoint_writer import CheckpointWriter
 from spslam.slam.checkpoint import load_checkpoint
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings

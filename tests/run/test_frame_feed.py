@@ -5,8 +5,8 @@ import torch
 
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
-from spslam.run.frame_feed import FrameFeed, automatic_workers
 from spslam.run import frame_feed
+from spslam.run.frame_feed import FrameFeed, automatic_workers
 from spslam.slam.pixels import sample_frame
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload, Uploader

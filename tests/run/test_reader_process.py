@@ -1,5 +1,6 @@
 """Frames read by another process: what happens where that can't be, or where either side goes."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -12,10 +13,11 @@ import pytest
 import torch
 
 from spslam.errors import SpslamError
+from spslam.run import reader_launch
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.reader_launch import end_standby, has_standby, launch_standby
 from spslam.run.reader_process import ReaderProcess
-from spslam.run import reader_launch
+from spslam.run.reader_service import serve
 from spslam.slam.device_events import HostEvent
 from spslam.slam.pixels import sample_frame
 from spslam.slam.upload import Upload
@@ -41,6 +43,17 @@ def has_ended(pid: int) -> bool:
     except FileNotFoundError:
         return True
     return state == "Z"
+
+
+def test_the_function_that_the_process_runs_exists():
+    """It is named by a string, so that starting the process does not import torch here."""
+    module = importlib.import_module(reader_launch.SERVICE_MODULE)
+    assert getattr(module, reader_launch.SERVICE_FUNCTION) is serve
+
+
+def test_starting_the_process_does_not_import_torch():
+    code = "import sys, spslam.run.reader_launch, spslam.run.request; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=PATIENCE_S)
 
 
 def test_a_data_set_that_cannot_be_pickled_is_read_by_threads():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from spslam.slam.device_events import marker
+from spslam.slam.device_events import event_recorder
 from spslam.slam.frame_report import FrameEvents, PendingReport
 
 
@@ -70,7 +70,7 @@ def test_a_report_is_done_with_the_frames_last_mark():
 
 
 def test_marks_of_a_device_are_in_order(device):
-    mark = marker(device)
+    mark = event_recorder(device)
     first = mark()
     torch.ones(1000, device=device).sum()
     second = mark()

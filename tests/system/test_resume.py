@@ -12,8 +12,8 @@ import pytest
 
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
-from spslam.run.sequence import run_sequence
 from spslam.run import loop as run_loop
+from spslam.run.sequence import RunRequest, run_sequence
 from tests.cli.command import ROOT
 from tests.system.sequences import FAST_SETTINGS, Recorded, results, run_on, settings, write_room
 
@@ -49,7 +49,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def uninterrupted(data, tmp_path_factory):
     output = tmp_path_factory.mktemp("runs") / "whole"
-    run_sequence(settings(*OVERRIDES), data, output, mesh=False)
+    run_sequence(RunRequest(settings(*OVERRIDES), data, output, mesh=False))
     return results(output)
 
 
@@ -102,7 +102,7 @@ def test_killed_while_it_writes_a_checkpoint_the_one_before_is_whole(data, unint
     assert process.returncode == -signal.SIGKILL
     assert list(output.glob(".checkpoint.*.tmp.safetensors"))
     assert frames_logged(output) == list(range(6))
-    run_sequence(settings(*OVERRIDES), data, output, resume=True, mesh=False)
+    run_sequence(RunRequest(settings(*OVERRIDES), data, output, resume=True, mesh=False))
     assert results(output) == uninterrupted
     assert frames_logged(output) == list(range(FRAMES))
     assert not list(output.glob(".*"))
@@ -220,7 +220,7 @@ def test_other_frames_of_the_same_number_are_refused(monkeypatch, interrupted):
 def test_another_folder_is_refused(monkeypatch, interrupted, tmp_path):
     monkeypatch.setattr(registry, "open_dataset", lambda *_: Recorded(8))
     with pytest.raises(OutputError, match="belongs to a run over other data"):
-        run_sequence(settings(), tmp_path, interrupted, resume=True, mesh=False)
+        run_sequence(RunRequest(settings(), tmp_path, interrupted, resume=True, mesh=False))
 
 
 @pytest.mark.parametrize("size", [0, 7, 1000])

@@ -9,8 +9,8 @@ from spslam.camera import Camera
 from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError, OutputError, SpslamError
+from spslam.run.sequence import RunRequest, run_sequence
 from spslam.scene import Scene
-from spslam.run import sequence as run_module
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, run_on, settings
@@ -214,7 +214,7 @@ def test_tiny_images_work(monkeypatch, tmp_path):
 
 def test_every_nth_frame(monkeypatch, tmp_path):
     monkeypatch.setattr(registry, "open_dataset", lambda *_: Recorded(9))
-    metrics = run_module.run_sequence(settings(), None, tmp_path / "out", slice(1, None, 3), mesh=False)
+    metrics = run_sequence(RunRequest(settings(), None, tmp_path / "out", slice(1, None, 3), mesh=False))
     found = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt")
     assert metrics["frames"] == 3
     np.testing.assert_allclose(found.timestamps, Recorded(9).timestamps()[1::3], atol=1e-6)
