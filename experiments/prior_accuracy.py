@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from spslam.benchmark.environment import describe_environment
-from spslam.benchmark.report import fill_regions
+from spslam.benchmark.suite_report import fill_regions
 from spslam.benchmark.tables import Table, to_markdown, to_text
 from spslam.config import Config, load_config
 from spslam.datasets.base import RgbdFrame

@@ -1,4 +1,4 @@
-"""What a result depends on beside its settings: machine, versions, commit."""
+"""What a result depends on besides its options: machine, versions, commit."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def describe_environment(device: torch.device) -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """The commit that runs, with a plus where files differ from it; None outside a repository."""
+    """The commit of the running code, with a plus if files have changed since; None outside a repository."""
     root = Path(spslam.__file__).parent.parent
-    if not (root / ".git").exists():  # installed: a repository further up is another project's
+    if not (root / ".git").exists():  # an installed package; a repository further up is another project's
         return None
     command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     try:

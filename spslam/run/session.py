@@ -11,8 +11,8 @@ from spslam.errors import OutputError
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
 from spslam.run.output_folder import OutputFolder
-from spslam.run.request import RunRequest
 from spslam.run.provenance import provenance
+from spslam.run.request import RunRequest
 from spslam.slam.checkpoint import load_checkpoint
 from spslam.slam.system import SlamSystem
 

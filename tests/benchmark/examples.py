@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from spslam.benchmark.jobs import Job, Plan
 from spslam.benchmark.pool import Outcome
-from spslam.benchmark.suites import GICP, SPSLAM, Sequence, Study, Suite, Variant
+from spslam.benchmark.suites import SPSLAM, Sequence, Study, Suite, Variant
 from spslam.benchmark.summary import Summary, summarize
 
 ENVIRONMENT = {
@@ -48,7 +48,7 @@ def study(**changes) -> Study:
         "name": "prior",
         "title": "With & without",
         "note": "A note.",
-        "sequences": tuple(Sequence(name, name, "demo") for name in ("room", "hall")),
+        "sequences": tuple(Sequence(name, "demo") for name in ("room", "hall")),
         "variants": variants,
         "columns": ("ate_rmse_cm", "f1_1cm"),
         "x_label": "iterations",
@@ -76,6 +76,3 @@ def made_up_summary(suite: Suite, figures, seeds: int = 1) -> Summary:
 def ablation(**changes) -> Suite:
     """A suite of one study."""
     return Suite("ablation", "Parts & pieces", 1, (study(**changes),))
-
-
-__all__ = ["ENVIRONMENT", "GICP", "SPSLAM", "ablation", "made_up_summary", "study", "tiny_job"]

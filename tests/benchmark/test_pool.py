@@ -128,6 +128,8 @@ def test_the_command_prints_tables_and_writes_them(tmp_path):
         (("quick", "--data", "nowhere"), "--data must be a folder that holds the data sets, got nowhere"),
         (("quick", "--frames", "9"), "--frames must be START:STOP"),
         (("quick", "--sequences", "x"), "sequence must be one of room"),
+        (("quick", "--folders", "x.yaml"), "--folders needs --data"),
+        (("quick", "--data", ".", "--folders", "x.yaml"), "x.yaml: can't be read: No such file"),
     ],
 )
 def test_wrong_arguments_give_one_line(tmp_path, arguments, message):

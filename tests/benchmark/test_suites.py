@@ -5,12 +5,14 @@ import sys
 import pytest
 
 from spslam.benchmark.figures import FIGURES
+from spslam.benchmark.folders import read_folders, with_folders
 from spslam.benchmark.jobs import Job, make_plan
 from spslam.benchmark.published import AVERAGE, published
 from spslam.benchmark.suites import GICP, load_suite, suite_names
 from spslam.config import load_config
 from spslam.errors import ConfigError
 from tests.benchmark.examples import tiny_job
+from tests.cli.command import ROOT
 
 DATASETS = {"replica": 8, "synthetic_rgbd": 6, "scannet": 6, "tum": 3, "7scenes": 7}
 
@@ -94,6 +96,50 @@ def test_a_plan_takes_the_data_that_is_there_and_says_what_is_not(tmp_path):
     assert plan.cells["all", "room1", "spslam paper"] == tuple(
         key for key, job in plan.jobs.items() if job.preset == "paper"
     )
+
+
+def test_folders_come_from_a_file(tmp_path):
+    (tmp_path / "mine" / "kitchen").mkdir(parents=True)
+    file = tmp_path / "folders.yaml"
+    file.write_text(f"quick: {{kitchen: mine/kitchen, rpy: {tmp_path / 'absent'}}}\n7scenes: {{fire: elsewhere}}\n")
+    suite = with_folders(load_suite("quick", ["fast"], ["kitchen", "rpy", "gray"], baseline=False), read_folders(file))
+    plan = make_plan(suite, tmp_path, "cpu")
+    assert [job.data for job in plan.jobs.values()] == [str(tmp_path / "mine" / "kitchen")]
+    assert plan.skipped["rpy"].startswith(f"none of {tmp_path / 'absent'} in {tmp_path}; --folders FILE names other")
+    assert plan.skipped["gray"].startswith("none of neural_rgbd_data/grey_white_room, ")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "can't be read: No such file"),
+        ("a: [", "must be YAML"),
+        ("- quick", "must hold SUITE: {SEQUENCE: FOLDER}, got"),
+        ("quik: {kitchen: x}", "suite must be one of .*quick.*, got quik"),
+        ("quick: kitchen", "quick must hold SEQUENCE: FOLDER, got kitchen"),
+        ("quick: {kitschen: x}", "a sequence of quick must be one of kitchen, .*, got kitschen"),
+        ("quick: {room: x}", "a sequence of quick must be one of kitchen, .*, got room"),
+        ("quick: {kitchen: 3}", "the folder of quick, kitchen must be text, got 3"),
+    ],
+)
+def test_a_wrong_file_of_folders_is_one_line(tmp_path, content, message):
+    file = tmp_path / "folders.yaml"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(ConfigError, match=f"folders.yaml: {message}") as error:
+        read_folders(file)
+    assert "\n" not in str(error.value)
+
+
+def test_the_repositorys_file_of_folders_is_valid():
+    assert set(read_folders(ROOT / "experiments" / "bench_folders.yaml")) <= set(suite_names())
+
+
+def test_suites_name_public_folders_only():
+    """A suite lists parent folders of the data set's own folder name; other names belong in a `--folders` file."""
+    for name in suite_names():
+        for sequence in load_suite(name).studies[0].sequences:
+            assert len({folder.rpartition("/")[2] for folder in sequence.folders}) <= 1, sequence.name
 
 
 def test_without_data_only_what_needs_none_is_planned():

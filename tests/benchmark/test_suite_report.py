@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from spslam.benchmark.figures import Statistic
-from spslam.benchmark.report import describe_gaps, fill_regions, update_page, write_results
+from spslam.benchmark.suite_report import describe_gaps, fill_regions, update_page, write_results
 from spslam.benchmark.suites import load_suite
 from spslam.benchmark.tables import make_tables, to_markdown, to_text
 from spslam.errors import OutputError
