@@ -1,4 +1,4 @@
-"""Warm-up before the first frame: a GPU loads each kernel at its first use, which takes longer than the kernel itself."""
+"""Warm-up before the first frame: loading a CUDA kernel at its first use takes longer than running it."""
 
 import numpy as np
 import torch

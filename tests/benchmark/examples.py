@@ -1,4 +1,4 @@
-"""Small suites and made-up outcomes for the tests of the benchmark."""
+"""Small suites and synthetic outcomes for the tests of the benchmark."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def tiny_job(method: str = SPSLAM, seed: int = 0, **changes) -> Job:
 
 
 def study(**changes) -> Study:
-    """Two iterations of two series over two sequences, with a plot."""
+    """Two series with two numbers of iterations over two sequences, with a plot."""
     variants = tuple(
         Variant(f"{series} {x}", options=(("mapping.iterations", x),), series=series, x=float(x))
         for series in ("with", "without")
@@ -59,7 +59,7 @@ def study(**changes) -> Study:
 
 
 def made_up_summary(suite: Suite, figures, seeds: int = 1) -> Summary:
-    """Results as ``figures(sequence, variant name, seed)`` gives them, None for a failed run."""
+    """Results by `figures(sequence, variant name, seed)`, which returns None for a failed run."""
     cells, outcomes = {}, {}
     for part in suite.studies:
         for sequence in part.sequences:

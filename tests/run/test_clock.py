@@ -1,4 +1,4 @@
-"""The clock of a run adds up over interruptions."""
+"""The clock of a run adds up the time of all its sessions."""
 
 import json
 
@@ -16,7 +16,7 @@ def now(monkeypatch):
     return times
 
 
-def test_a_resumed_run_continues_the_saved_clock(now):
+def test_resumed_run_continues_the_saved_clock(now):
     clock = RunClock()
     now["s"] = 105.0
     clock.start_s = 5.0

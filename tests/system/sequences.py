@@ -28,7 +28,7 @@ def _rendered(count: int) -> tuple[GeneratedDataset, list[RgbdFrame]]:
 
 
 class Recorded(RgbdDataset):
-    """The generated room's first frames, rendered once; `change(frame)` may spoil a copy, or raise."""
+    """The generated room's first frames, rendered once; `change(frame)` may modify a copy, or raise."""
 
     name = "recorded"
 
@@ -80,5 +80,5 @@ def write_room(scene: Path, count: int) -> Path:
 
 
 def results(output: Path) -> tuple[bytes, bytes]:
-    """What must be the same to the byte: trajectory and map."""
+    """The bytes of trajectory and map."""
     return (output / "trajectory.txt").read_bytes(), (output / "map.safetensors").read_bytes()
