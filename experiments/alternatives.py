@@ -1,8 +1,8 @@
-"""Each op against whatever else one would write for it, the best alternative first: how many times slower it is.
+"""Speed of each op compared with its alternatives: how many times slower the fastest alternative is.
 
 python -m experiments.alternatives --device cpu --threads 2
-python -m experiments.alternatives --cpu-time     on a machine that others use: the CPU time of one thread
-python -m experiments.alternatives --device cuda  by the wall clock, launches included, and by the GPU's clock
+python -m experiments.alternatives --cpu-time     on a machine with other load: the CPU time of one thread
+python -m experiments.alternatives --device cuda  wall-clock time, launches included, and GPU time
 python -m experiments.alternatives --op mlp       one of them
 """
 
@@ -12,8 +12,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from experiments import map_ops, room, timing
-from experiments import ops as composable
+from experiments import composable_ops, map_ops, room, timing
 from experiments.compose import TORCH
 from spslam import ops
 
@@ -23,7 +22,7 @@ Contenders = dict[str, Callable]
 
 
 def dense_volume(generator: torch.Generator, device: torch.device) -> tuple[list, Contenders]:
-    """A volume that is dense, where grid_sample can be used; the op finds its cells by hash and is charged for it."""
+    """A dense volume, for which grid_sample can be used; the time of the op includes its hash lookups."""
     cells = ops.VoxelHash(SIDE**3, device)
     cells.insert(torch.cartesian_prod(*[torch.arange(SIDE, dtype=torch.int32)] * 3).to(device))
     x, y, z = cells.voxel_coords.long().unbind(1)
@@ -54,7 +53,7 @@ def _grid_sample(grid: torch.Tensor, points: torch.Tensor, last: int) -> torch.T
 
 
 def gather_bilinear(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
-    """`bilinear_interpolate` by index and gather."""
+    """`bilinear_interpolate` by indexing and gathering."""
     height, width, channels = texels.shape
     u, v = uv[:, 0].clamp(0, width - 1), uv[:, 1].clamp(0, height - 1)
     iu, iv = u.detach().floor().clamp(max=width - 2), v.detach().floor().clamp(max=height - 2)
@@ -90,7 +89,7 @@ def suites(generator: torch.Generator, device: torch.device) -> list[Suite]:
             (0, 1),
         )
     ]
-    for name, ours, theirs, inputs, differentiable in composable.cases(generator, device):
+    for name, ours, theirs, inputs, differentiable in composable_ops.cases(generator, device):
         contenders = {"spslam": (ours, inputs), "torch": (theirs, inputs)}
         if name == "bilinear_interpolate":
             torch.testing.assert_close(ours(*inputs), gather_bilinear(*inputs), rtol=1e-4, atol=1e-4)
@@ -109,7 +108,7 @@ Clocks = dict[str, Callable[[dict[str, Callable]], dict[str, float]]]
 
 
 def rows_of(name: str, direction: str, contenders: dict[str, Callable], clocks: Clocks) -> list[dict[str, object]]:
-    """A row by each clock, for each way of ours."""
+    """A row per clock and spslam contender."""
     measured = {clock: compare(contenders) for clock, compare in clocks.items()}
     return [
         row(name + own.removeprefix("spslam"), f"{direction}{clock}", times, own)
@@ -120,7 +119,7 @@ def rows_of(name: str, direction: str, contenders: dict[str, Callable], clocks: 
 
 
 def row(name: str, direction: str, times: dict[str, float], own: str) -> dict[str, object]:
-    """Our time, the best alternative and its time as a multiple of ours."""
+    """The time of spslam, and the fastest alternative with its time and their ratio."""
     others = {key: value for key, value in times.items() if not key.startswith("spslam")}
     best = min(others, key=others.__getitem__)
     return {
@@ -134,7 +133,7 @@ def row(name: str, direction: str, times: dict[str, float], own: str) -> dict[st
 
 
 def clocks_of(device: torch.device, rounds: int, clock: Callable[[], float]) -> Clocks:
-    """The clocks to measure by: on a GPU its own too."""
+    """The clocks to measure with: wall clock or CPU time, and on CUDA also GPU time."""
     clocks: Clocks = {"": functools.partial(timing.compare, rounds=rounds, device=device, clock=clock)}
     if device.type == "cuda":
         clocks[", GPU clock"] = functools.partial(timing.compare_on_gpu, rounds=rounds, device=device)
@@ -147,10 +146,10 @@ def measured(generator: torch.Generator, device: torch.device, clocks: Clocks, o
     for name, contenders, differentiable in suites(generator, device):
         if op not in name:
             continue
-        forward = {key: composable.forward(*pair) for key, pair in contenders.items()}
+        forward = {key: composable_ops.forward(*pair) for key, pair in contenders.items()}
         rows += rows_of(name, "forward", forward, clocks)
         if differentiable:
-            both = {key: composable.forward_and_backward(*pair, differentiable) for key, pair in contenders.items()}
+            both = {key: composable_ops.forward_and_backward(*pair, differentiable) for key, pair in contenders.items()}
             rows += rows_of(name, "forward + backward", both, clocks)
     for name, functions in without_gradient(generator, device).items():
         if op in name:
@@ -181,7 +180,7 @@ def main() -> None:
     rows = measured(torch.Generator().manual_seed(0), device, clocks, args.op)
     if not rows:
         parser.error(f"argument --op: no op's name contains {args.op}")
-    timing.report(f"{room.FRAMES} frames, {composable.RAYS} rays", rows, device, args.json)
+    timing.report(f"{room.FRAMES} frames, {composable_ops.RAYS} rays", rows, device, args.json)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""How far off a start may be: the share of wrong starts from which tracking comes back, without and with rescue.
+"""Convergence basin: the share of perturbed start poses from which tracking converges, without and with recovery.
 
     python -m experiments.basin 7scenes path/to/redkitchen --frames 200 --every 10 --trials 10
 
-Each `--every`-th frame of a run is tracked again, before it enters the map, from starts that are off by fixed distances
-and angles in random directions. A start has come back if its pose lies within 1 cm and 0.5 degrees of the one that the
-run's own start leads to.
+Each `--every`-th frame of a run is tracked again, before it is mapped, from starts that are off by fixed distances and
+angles in random directions. A start has converged if its pose is within 1 cm and 0.5 degrees of the pose that the run's
+own start leads to.
 """
 
 import argparse
@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument("config")
     parser.add_argument("data", nargs="?")
     parser.add_argument("--frames", type=int, default=200, help="frames of the run")
-    parser.add_argument("--stride", type=int, default=1, help="take every so manieth frame")
-    parser.add_argument("--every", type=int, default=10, help="try each so manieth of them")
+    parser.add_argument("--stride", type=int, default=1, help="use every n-th frame")
+    parser.add_argument("--every", type=int, default=10, help="try every n-th of them")
     parser.add_argument("--trials", type=int, default=10, help="starts of each offset at each frame")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change an option")
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> dict[tuple[int, int], dict[str, list[bool]]]:
-    """Whether each start came back, by offset and by whether ICP might help."""
+    """Whether each start converged, by offset and by whether recovery by ICP was allowed."""
     config, device = load_config(args.config, None, args.set), torch.device(args.device)
     dataset = open_dataset(config.dataset, args.data)
     dataset = Subset(dataset, 0, min(args.frames * args.stride, len(dataset)), args.stride)
@@ -74,7 +74,7 @@ def measure(args: argparse.Namespace) -> dict[tuple[int, int], dict[str, list[bo
 
 
 def try_start(system: SlamSystem, pixels, number: int, offset: tuple[int, int], random, back: dict) -> None:
-    """Adds whether one random start of that offset comes back to `back`."""
+    """Appends to `back` whether one random start with that offset converges."""
     tracker, frames, scene = system.tracker, system.state.frames, system.state.scene
     wanted = matrix(tracker.track(TrackingProblem(scene, pixels.records, tracker.predict(frames), number)).pose)
     start = pose_tensor(moved(wanted, offset, random), frames.poses.device)
@@ -87,7 +87,7 @@ def try_start(system: SlamSystem, pixels, number: int, offset: tuple[int, int], 
 
 
 def moved(pose: np.ndarray, offset: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """The pose shifted and turned by that much in random directions."""
+    """The pose translated (cm) and rotated (degrees) by an offset in random directions."""
     shift, axis = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
     half = np.radians(offset[1]) / 2
     turn = pose7_to_matrix(np.concatenate([[np.cos(half)], np.sin(half) * axis, np.zeros(3)]))

@@ -1,7 +1,7 @@
-"""The step that `spslam.ops.render_step` fuses, composed of separate ops with autograd: what it is compared with.
+"""`spslam.ops.render_step` composed of separate ops with autograd, for comparison with the fused step.
 
-Two libraries of parts: OPS, the public ops of spslam, and TORCH, plain torch. Rays, samples and hash probes are the
-public ops in both, as torch has neither Philox nor a hash table.
+The separate ops come from one of two libraries: OPS, the public ops of spslam, or TORCH, plain torch. Ray sampling and
+hash lookup are the public ops in both, as torch has neither Philox nor a hash table.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ HIDDEN = 32
 
 
 class OpsParts:
-    """The parts as spslam's public ops."""
+    """The parts as public ops of spslam."""
 
     trilinear_interpolate = staticmethod(ops.trilinear_interpolate)
     tri_plane_interpolate = staticmethod(ops.tri_plane_interpolate)
@@ -95,7 +95,7 @@ OPS, TORCH = OpsParts, TorchParts
 
 @dataclass(frozen=True)
 class Measurements:
-    """What R pixel records say, in the dtype of the step."""
+    """Content of R pixel records, in the dtype of the step."""
 
     directions: torch.Tensor  # [R, 3] in camera axes, z = 1
     depth: torch.Tensor  # [R] m
@@ -133,12 +133,12 @@ def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:
 def world_points(
     rays: ops.RayBatch, directions: torch.Tensor, t: torch.Tensor, increments: torch.Tensor | None
 ) -> torch.Tensor:
-    """Sample positions [R, S, 3], differentiable by the left increments [F, 6] of the poses, which are zero."""
+    """Sample positions [R, S, 3], differentiable in the left increments [F, 6] of the poses, which are zero."""
     frames, poses = rays.ray_frames.long(), rays.poses.to(directions.dtype)
     turned = torch.bmm(rotation_matrices(poses[:, :4]).index_select(0, frames), directions[..., None])[..., 0]
     centers = poses[:, 4:].index_select(0, frames)
     if increments is not None:
-        # exp(omega) to first order: all that a gradient at zero sees.
+        # exp(omega) to first order, which has the same gradient at zero.
         moved = increments.index_select(0, frames)
         centers = centers + moved[:, :3]
         turned = turned + torch.linalg.cross(moved[:, 3:], turned)
@@ -154,13 +154,13 @@ def compose_render_step(
     compact: bool = True,
     dtype: torch.dtype = torch.float32,
 ) -> ops.RenderStep:
-    """`spslam.ops.render_step` with the same arguments and results, as a composition.
+    """The composition, with the arguments and results of `spslam.ops.render_step`.
 
     Args:
-        scene, rays, options, gradients: as for `render_step`. Rows of `gradients` that receive a gradient other than 0
-            are stamped, which are those that rays reach but for exact zeros.
+        scene, rays, options, gradients: as for `render_step`. Rows of `gradients` with a gradient other than 0 are
+            stamped; unlike there, rows that rays reach with a gradient of exactly 0 are not.
         parts: OPS or TORCH.
-        compact: decode only the samples inside the volume, which costs a host synchronization; else all of them.
+        compact: decode only the samples inside the volume, which needs a host synchronization; otherwise all samples.
         dtype: float32, or float64 for comparisons.
 
     Returns:

@@ -1,11 +1,12 @@
-"""How well the doubt tells wrong poses from right ones, and what a fit to these data would make its coefficients.
+"""How well the error probability separates wrong poses from right ones, and the coefficients that fit these data.
 
     python -m experiments.confidence_calibration --config 7scenes --data path/to/redkitchen --step 2 --save kitchen2.npz
     python -m experiments.confidence_calibration --saved kitchen2.npz room3.npz
 
-A run gives right poses: what tracking finds from the motion model, without a second try. Wrong ones are what it makes
-of starts that are 10-60 cm and 5-40 degrees off, or the poses of other frames, where it ends over 6 cm or 4 degrees
-from the run's own pose. The first form measures one sequence, the second judges what was saved.
+Right poses are those that tracking finds in a run from the motion model's prediction, without recovery. Wrong poses are
+found from starts that are 10-60 cm and 5-40 degrees off, or that are the poses of other frames, if the result is more
+than 6 cm or 4 degrees from the run's own pose. The first command measures one sequence, the second evaluates saved
+measurements.
 """
 
 import argparse
@@ -45,7 +46,7 @@ RIDGE = 3e-3
 
 
 def main() -> None:
-    """Parses the arguments; measures a sequence, or judges saved measures."""
+    """Parses the arguments; measures a sequence, or evaluates saved measurements."""
     args = _parser().parse_args()
     tables = [measure(args)] if args.saved is None else [dict(np.load(path)) for path in args.saved]
     if args.save:
@@ -54,7 +55,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> dict[str, np.ndarray]:
-    """Fits of right and wrong poses of one sequence, a row each with `COLUMNS`."""
+    """Fits of right and wrong poses of one sequence, one row per pose with `COLUMNS`."""
     config = load_config(args.config, args.preset, ["device=cpu", *args.set])
     dataset = open_sequence(config.dataset, args.data, slice(None, None, args.step))
     ground_truth, random = dataset.poses(), np.random.default_rng(0)
@@ -92,13 +93,13 @@ def row(fit: Fit) -> list[float]:
 
 
 def is_apart(pose: np.ndarray, other: np.ndarray) -> bool:
-    """Whether a pose is another than the run's."""
+    """Whether a pose is different from the run's."""
     angle = np.degrees(rotation_angle(pose[:3, :3].T @ other[:3, :3]))
     return bool(100 * np.linalg.norm(pose[:3, 3] - other[:3, 3]) > WRONG_CM or angle > WRONG_DEG)
 
 
 def judge(right: np.ndarray, wrong: np.ndarray) -> None:
-    """Prints the doubt of both at the first look, at the second, and after a loss; and fitted coefficients."""
+    """Prints error probabilities at first look, at second look and when lost, and the fitted coefficients."""
     model = PoseConfidenceModel.load()
     print(f"{len(right)} right poses, {len(wrong)} wrong ones")
     unseen = {"free_space_violation": math.nan, "brightness_correlation": math.nan}
@@ -123,7 +124,7 @@ def as_fit(line: np.ndarray) -> Fit:
 
 
 def coefficients(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
-    """Logistic regression by Newton's method, both kinds of pose weighing the same, the slopes held back a little."""
+    """Logistic regression by Newton's method; both classes have the same weight, slopes have a small ridge penalty."""
     table = np.concatenate([right, wrong])
     mean_robust_weight, min_eigenvalue, prediction_error_cm, prediction_error_deg, free_space_violation = table.T[:5]
     model = PoseConfidenceModel.load()
@@ -155,8 +156,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--step", type=int, default=1, help="use every n-th frame")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
-    parser.add_argument("--save", type=Path, help="file for the measures")
-    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to judge together")
+    parser.add_argument("--save", type=Path, help="file for the measurements")
+    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to evaluate together")
     return parser
 
 

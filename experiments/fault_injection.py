@@ -1,7 +1,7 @@
-"""Faults injected into a sequence: what a camera shows when it is covered, carried or cut off, and what becomes of it.
+"""Fault injection: frames of a covered, moved or interrupted camera, and what the system does with them.
 
-A trial is a run up to a place, a fault, and then frames near a place that was seen before. Every second frame of the
-data set is mapped and the camera comes back with the others, so that no frame is seen twice.
+A trial is a run up to some frame, then a fault, then frames near a place that was mapped before. Every second frame of
+the data set is mapped, and the camera returns with frames in between, so that no frame is processed twice.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from spslam.geometry import inverse, rotation_angle
 from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapshot
 from spslam.slam.system import SlamSystem
 
-STEP = 2  # of the mapped frames; those between are for the way back
+STEP = 2  # between mapped frames; the frames in between are for the way back
 BLACK_FRAMES, JUMP_FRAMES, COVERED_FRAMES, BACK_FRAMES = 30, 60, 20, 15
 FOUND_CM, FOUND_DEG = 3.0, 3.0
-WRONG_CM, WRONG_DEG = 8.0, 6.0  # truth and map disagree by a few centimeters by themselves
+WRONG_CM, WRONG_DEG = 8.0, 6.0  # ground truth and map differ by a few centimeters anyway
 FLAG_WITHIN, RECOVER_WITHIN = 3, 10
 
 Change = Callable[[RgbdFrame, np.random.Generator], None]
 
 
 def black_out(frame: RgbdFrame, random: np.random.Generator) -> None:
-    """Neither light nor depth."""
+    """A black frame without depth."""
     frame.color[:], frame.depth[:] = 0, 0
 
 
 def cover_near(frame: RgbdFrame, random: np.random.Generator) -> None:
-    """Something flat and dark some 40 cm before the lens, with noise and holes."""
+    """A flat dark surface 40 cm in front of the lens, with noise and holes."""
     slope = np.linspace(-0.02, 0.02, frame.depth.shape[1], dtype=np.float32)
     frame.depth[:] = 0.4 + slope + random.normal(0, 0.004, frame.depth.shape)
     frame.depth[random.random(frame.depth.shape) < 0.2] = 0
@@ -44,14 +44,14 @@ def cover_near(frame: RgbdFrame, random: np.random.Generator) -> None:
 
 
 def cover_garbage(frame: RgbdFrame, random: np.random.Generator) -> None:
-    """A sensor without a signal: depth anywhere from 0.3 to 4 m, half of it missing."""
+    """A sensor without signal: random depth from 0.3 to 4 m, half of it missing."""
     frame.depth[:] = random.uniform(0.3, 4, frame.depth.shape)
     frame.depth[random.random(frame.depth.shape) < 0.5] = 0
     frame.color[:] = random.integers(0, 255, frame.color.shape)
 
 
 def cover_wall(frame: RgbdFrame, random: np.random.Generator) -> None:
-    """Depth of a plane at 1.5 m, which fits many a wall."""
+    """Depth of a plane at 1.5 m, which can be mistaken for a wall."""
     frame.depth[:] = 1.5 + random.normal(0, 0.005, frame.depth.shape)
     frame.color[:] = 90
 
@@ -61,7 +61,7 @@ COVERS = (cover_near, cover_garbage, cover_wall)
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame of a trial: which of the data set's, and how it is spoilt."""
+    """A frame of a trial: its index in the data set, and the change that the fault makes to it."""
 
     index: int
     change: Change | None = None
@@ -69,14 +69,14 @@ class Shown:
 
 @dataclass(frozen=True)
 class Trial:
-    """A fault after `place` frames of the run and the way back.
+    """A fault after `place` frames of the run, and the way back.
 
     Attributes:
-        fault: its name.
-        place: rows of the run before it.
-        during: frames shown while it lasts; none where the camera is only carried elsewhere.
-        back: frames near a place that was seen.
-        seed: of what is drawn.
+        fault: name of the fault.
+        place: number of mapped frames before it.
+        during: frames shown during the fault; empty where the camera only moves elsewhere.
+        back: frames near a place that was mapped.
+        seed: of the fault's random draws.
     """
 
     fault: str
@@ -88,15 +88,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a trial.
+    """Result of a trial.
 
     Attributes:
-        trial: which.
-        flagged_after: frames of the fault until the first lost one, 1 for at once; 0 where no frame was wrong.
-        wrong_unflagged: frames whose pose was wrong and not called lost, in all.
-        recovered_after: frames of the way back until the first known pose within 3 cm; None where there was none.
-        error_cm: distance from where the camera is at the end; infinite where it is lost.
-        voxels_added: by mapping frames of the fault whose pose was wrong.
+        trial: the trial.
+        flagged_after: number of frames from the first wrong pose to the first one flagged as lost, 1 if it is the same
+            frame; 0 where no pose was wrong.
+        wrong_unflagged: number of wrong poses that were not flagged as lost.
+        recovered_after: number of frames of the way back up to the first pose within 3 cm; None where there is none.
+        error_cm: position error at the end; infinite if lost.
+        voxels_added: voxels allocated by frames of the fault whose pose was wrong.
     """
 
     trial: Trial
@@ -108,7 +109,7 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Flagged within 3 frames, and back within 10."""
+        """Whether the fault was flagged within 3 frames and the camera recovered within 10."""
         return (
             self.flagged_after <= FLAG_WITHIN
             and self.recovered_after is not None
@@ -117,7 +118,7 @@ class Outcome:
 
 
 def plan(dataset: RgbdDataset, count: int, seed: int) -> list[Trial]:
-    """`count` trials of each fault, at places spread over the run, each coming back somewhere else."""
+    """`count` trials of each fault, at places spread over the run, each with another place to return to."""
     random = np.random.default_rng(seed)
     rows = len(dataset) // STEP
     places = np.linspace(0.25 * rows, rows - JUMP_FRAMES // STEP - BLACK_FRAMES // STEP - 2, count).astype(int)
@@ -141,12 +142,20 @@ def plan(dataset: RgbdDataset, count: int, seed: int) -> list[Trial]:
 
 
 def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device: torch.device) -> Iterator[Outcome]:
-    """Runs over every second frame, and from each trial's place on a copy of the system through the trial.
+    """Maps every second frame, and runs each trial on a copy of the system at the trial's place.
 
-    Raises
-    ------
-    DatasetError
-        When a frame before a fault is called lost, for then there is nothing to compare with, or no truth is known.
+    Args:
+        config: of the system.
+        dataset: with ground-truth poses.
+        trials: as `plan` gives them.
+        device: of the system.
+
+    Yields:
+        The outcome of each trial, in the order of their places.
+
+    Raises:
+        DatasetError: a frame before a fault is lost, so that there is nothing to compare with, or the data set has no
+            ground truth.
     """
     ground_truth = true_poses(dataset)
     system = SlamSystem(config, dataset.camera, ground_truth[0], device)
@@ -154,26 +163,24 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
         for trial in sorted(trials, key=lambda trial: trial.place):
             while len(system.state.frames) < trial.place:
                 if system.process(dataset[STEP * len(system.state.frames)]).lost:
-                    raise DatasetError(
-                        f"{dataset.name}: frame {len(system.state.frames) - 1} of a clean run is called lost"
-                    )
+                    raise DatasetError(f"{dataset.name}: frame {len(system.state.frames) - 1} of a clean run is lost")
             yield try_fault(copy_of(system, ground_truth[0], Path(folder) / "state"), dataset, trial)
 
 
 def try_fault(system: SlamSystem, dataset: RgbdDataset, trial: Trial) -> Outcome:
-    """One trial on a system that has seen `trial.place` frames; it is used up."""
+    """Runs one trial on a system that has mapped `trial.place` frames; the system is not usable afterwards."""
     random, ground_truth = np.random.default_rng(trial.seed), true_poses(dataset)
     lost, wrong, added = [], [], 0
     for shown in trial.during:
         voxels = system.state.scene.volume.num_voxels
-        report = system.process(_spoilt(dataset, shown, random))
+        report = system.process(_shown_frame(dataset, shown, random))
         apart_cm, apart_deg = _error(system, ground_truth, trial.place, shown.index)
         lost.append(report.lost)
         wrong.append(shown.change is not None or apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
         added += system.state.scene.volume.num_voxels - voxels if wrong[-1] else 0
     errors = []
     for shown in trial.back:
-        report = system.process(_spoilt(dataset, shown, random))
+        report = system.process(_shown_frame(dataset, shown, random))
         apart_cm, apart_deg = _error(system, ground_truth, trial.place, shown.index)
         lost.append(report.lost)
         wrong.append(apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
@@ -186,14 +193,14 @@ def try_fault(system: SlamSystem, dataset: RgbdDataset, trial: Trial) -> Outcome
 
 
 def _flagged_after(unflagged: list[bool], wrong: list[bool]) -> int:
-    """Frames from the first wrong pose up to the first that is called so; 0 if none is wrong."""
+    """Frames from the first wrong pose to the first one flagged as lost; 0 if none is wrong."""
     if not any(wrong):
         return 0
     first = wrong.index(True)
     return unflagged.index(False, first) - first + 1 if False in unflagged[first:] else len(wrong)
 
 
-def _spoilt(dataset: RgbdDataset, shown: Shown, random: np.random.Generator) -> RgbdFrame:
+def _shown_frame(dataset: RgbdDataset, shown: Shown, random: np.random.Generator) -> RgbdFrame:
     frame = dataset[shown.index]
     if shown.change is not None:
         shown.change(frame, random)
@@ -201,19 +208,19 @@ def _spoilt(dataset: RgbdDataset, shown: Shown, random: np.random.Generator) -> 
 
 
 def _error(system: SlamSystem, ground_truth: np.ndarray, place: int, index: int) -> tuple[float, float]:
-    """Distance (cm) and angle (degrees) of the last frame's pose from where the map has the camera of a frame."""
+    """Distance (cm) and angle (degrees) of the last pose from the expected pose of a data set's frame."""
     return apart(system.state.frames.matrices(-1)[0], expected_pose(system, ground_truth, place, index))
 
 
 def expected_pose(system: SlamSystem, ground_truth: np.ndarray, place: int, index: int) -> np.ndarray:
-    """Where the map has the camera of a frame: carried by the true motion from the mapped frame that is nearest to it.
+    """Expected pose of a frame in the map: the nearest mapped frame's estimated pose, moved by the true motion from it.
 
-    So neither drift of the map nor error of the truth over longer ways takes part.
+    So neither drift of the map nor errors of the ground truth over long distances count.
 
     Args:
-        system: that has seen `place` frames of the run.
+        system: has mapped `place` frames.
         ground_truth: float64 [F, 4, 4] of the data set.
-        place: rows of the run.
+        place: number of mapped frames.
         index: of the frame in the data set.
 
     Returns:
@@ -232,15 +239,15 @@ def apart(pose: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 
 def true_poses(dataset: RgbdDataset) -> np.ndarray:
-    """float64 [F, 4, 4]; a `DatasetError` where they are not known."""
+    """Ground-truth poses float64 [F, 4, 4]; raises DatasetError where there are none."""
     poses = dataset.poses()
     if poses is None:
-        raise DatasetError(f"{dataset.name}: must have true poses to try faults on, got none")
+        raise DatasetError(f"{dataset.name}: must have ground-truth poses to inject faults, got none")
     return poses
 
 
 def copy_of(system: SlamSystem, first_pose: np.ndarray, path: Path) -> SlamSystem:
-    """A system with the same state, which goes by way of a file at `path`."""
+    """A copy of the system, made through a checkpoint at `path`."""
     write_snapshot(path, take_snapshot(system.state, system.config, {}, copy=False))
     copy = SlamSystem(system.config, system.camera, first_pose, system.device)
     load_checkpoint(path, copy.state, copy.config)

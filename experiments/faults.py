@@ -1,10 +1,10 @@
-"""Faults injected into a sequence: is loss flagged, and is the camera found again when it sees a place it knows?
+"""Fault injection over a sequence: are tracking failures flagged, and is the camera relocalized at mapped places?
 
     python -m experiments.faults --config 7scenes --data path/to/redkitchen --preset fast --trials 10 --json faults.json
 
-Faults are 30 black frames, a jump over 60, 20 frames of a covered lens, and a return to the start without anything in
-between; each trial comes back to another place (spslam/benchmark/faults.py). Exits with 1 where a bar is missed: loss
-flagged within 3 frames in every trial, and a pose within 3 cm within 10 frames of coming back in 9 of 10.
+Faults are 30 black frames, a jump over 60 frames, 20 frames of a covered lens, and an immediate return to the start;
+each trial returns to another place (`experiments/fault_injection.py`). Exits with 1 unless the failure is flagged
+within 3 frames in every trial, and 9 of 10 trials have a pose within 3 cm within 10 frames after the return.
 """
 
 import argparse
@@ -26,7 +26,7 @@ RECOVERED_SHARE = 0.9
 
 
 def main() -> None:
-    """Parses the arguments, runs the trials, prints a line for each that failed and a table of all."""
+    """Parses the arguments, runs the trials, prints a line per failed trial and a table of all."""
     args = _parser().parse_args()
     device = resolve_device(args.device)
     config = load_config(args.config, args.preset, [f"device={args.device}", *args.set])
@@ -38,10 +38,10 @@ def main() -> None:
             print(describe(outcome), flush=True)
     rows = [summarize(fault, outcomes) for fault in sorted({outcome.trial.fault for outcome in outcomes})]
     timing.report(
-        f"{dataset.name}, {args.preset or config.preset}, {args.trials} trials a fault", rows, device, args.json
+        f"{dataset.name}, {args.preset or config.preset}, {args.trials} trials per fault", rows, device, args.json
     )
     if not all(row["flagged"] == row["trials"] and row["recovered"] >= RECOVERED_SHARE * row["trials"] for row in rows):
-        sys.exit("a bar is missed")
+        sys.exit("a required rate is missed")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -52,17 +52,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--trials", type=int, default=10, help="of each fault")
-    parser.add_argument("--seed", type=int, default=0, help="of where the camera comes back and of noise")
+    parser.add_argument("--seed", type=int, default=0, help="of the places to return to and of noise")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
-    parser.add_argument("--verbose", action="store_true", help="a line for each trial")
+    parser.add_argument("--verbose", action="store_true", help="print a line per trial")
     parser.add_argument("--json", type=Path, help="file to write the results to")
     return parser
 
 
 def describe(outcome: Outcome) -> str:
-    """A trial in a line."""
+    """A trial in one line."""
     trial, back = outcome.trial, outcome.recovered_after
-    found = "not found again" if back is None else f"found again after {back}"
+    found = "not relocalized" if back is None else f"relocalized after {back}"
     return (
         f"{trial.fault} at {trial.place}, back at frame {trial.back[0].index}: flagged after {outcome.flagged_after}, "
         f"{outcome.wrong_unflagged} wrong poses not flagged, {found}, {outcome.error_cm:.2f} cm at the end, "

@@ -1,9 +1,9 @@
-"""GPU time of what grows a map and takes its mesh: a frame encoded and fused, voxels entered, marching cubes.
+"""GPU time of the map's ops: encoding and fusing a frame, inserting voxels, marching cubes.
 
 python -m experiments.gpu_map --json gpu_map.json
 
-A call's time is taken by CUDA events and holds the launches and the one read-back; the kernels' own time is what the
-profiler says of them. Frames are encoded into a map that earlier ones began, as in a run.
+The time of a call is measured by CUDA events and includes launches and the read-back; the time of its kernels is
+measured by the profiler. Frames are encoded into a map that already has earlier frames, as in a run.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def row(op: str, call_us: float, kernels_us: float | None = None, peak_mb: float
 
 
 def event_ms(call: Callable[[], object]) -> float:
-    """Milliseconds from before a call to after it, on the device's clock."""
+    """GPU time in milliseconds from the start of a call to its end."""
     start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     start.record()
     call()
@@ -44,7 +44,7 @@ def event_ms(call: Callable[[], object]) -> float:
 
 
 def kernel_us(call: Callable[[], object]) -> float:
-    """Microseconds that the device works for a call: kernels and copies, without the gaps between them."""
+    """GPU time of a call's kernels and copies in microseconds, without the gaps between them."""
     torch.cuda.synchronize()
     with profile(activities=[ProfilerActivity.CUDA]) as record:
         call()
@@ -53,7 +53,7 @@ def kernel_us(call: Callable[[], object]) -> float:
 
 
 def frame_points(generator: torch.Generator, device: torch.device) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Each frame's surface points, some millimeters off the room's walls, and the walls' normals."""
+    """Surface points of each frame, with some millimeters of noise, and their normals."""
     rays = room.make_rays(generator, PIXELS_PER_FRAME * FRAMES, FRAMES, torch.device("cpu"))
     inward = torch.cat([torch.eye(3), -torch.eye(3)])
     frames = []

@@ -23,7 +23,7 @@ TRACKING = dict(
 
 
 def median_us(call: Callable[[], object], rounds: int) -> float:
-    """Microseconds of device time of one call, without the host's share."""
+    """GPU time of one call in microseconds, without launches."""
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
@@ -44,7 +44,7 @@ def median_us(call: Callable[[], object], rounds: int) -> float:
 
 
 def tracking_rows(scene: ops.SceneView, rays: ops.RayBatch, rounds: int) -> list[dict[str, object]]:
-    """A tracking call of 8 iterations, and what one more costs: the difference of 16 and 8."""
+    """A tracking call of 8 iterations, and the time per further iteration: from the difference of 16 and 8."""
     rows: list[dict[str, object]] = []
     for pixels in (1024, 4096):
         for tf32 in (True, False):

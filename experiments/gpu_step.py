@@ -1,9 +1,9 @@
-"""Whole tracking and mapping calls on a GPU, each one CUDA graph: device time of an iteration, host time of a call.
+"""Tracking and mapping calls on a GPU, one CUDA graph each: GPU time per iteration, host time per call.
 
     python -m experiments.gpu_step --json gpu_step.json
 
-Device times are of CUDA events around a call that the host has queued behind a sleeping kernel, so that launches hide;
-host times are of the Python call alone.
+GPU times are measured by CUDA events around a call that is queued behind a sleeping kernel, which hides launches; host
+times are those of the Python call alone.
 """
 
 import statistics
@@ -21,7 +21,7 @@ TRACKING_RAYS, TRACKING_ITERATIONS = 1024, 6
 MAPPING_RAYS, MAPPING_ITERATIONS = 2048, 20
 RECORDS = 2000  # of each frame
 SLEEP_CYCLES = 2_000_000  # about a millisecond
-RATE = 1e-4  # small: the scene must look the same in all rounds
+RATE = 1e-4  # small, so that the scene is the same in all rounds
 
 
 class TrackingCall:

@@ -1,4 +1,4 @@
-"""The ops that keep a map: sparse optimizer, normal equations, voxel hash, marching cubes, and a room's whole mesh.
+"""Speed of the ops on the map: sparse optimizer, normal equations, voxel hash, marching cubes, mesh of a room.
 
 python -m experiments.map_ops --device cpu --threads 2
 """
@@ -22,7 +22,7 @@ Contenders = dict[str, Callable[[], object]]
 
 
 def adam_on_rows(param, grad, exp_avg, exp_avg_sq, stamps, lr, step) -> None:
-    """`sparse_adam_` in plain torch: the touched rows gathered, stepped and put back."""
+    """`sparse_adam_` in plain torch: gather the touched rows, update them, scatter them."""
     rows = (stamps == 1).nonzero()[:, 0]
     g, m, v = (x.index_select(0, rows) for x in (grad, exp_avg, exp_avg_sq))
     m.lerp_(g, 0.1)
@@ -35,7 +35,7 @@ def adam_on_rows(param, grad, exp_avg, exp_avg_sq, stamps, lr, step) -> None:
 
 
 def adam(generator: torch.Generator, device: torch.device) -> Contenders:
-    """One step on the touched rows of a table; torch.optim.Adam steps all rows, having no choice."""
+    """One step on the touched rows of a table; torch.optim.Adam can only update all rows."""
     tensors = [torch.rand(ROWS, CHANNELS, generator=generator).to(device) for _ in range(4)]
     stamps = torch.zeros(ROWS, dtype=torch.int32)
     stamps[torch.randperm(ROWS, generator=generator)[:TOUCHED]] = 1
@@ -70,13 +70,13 @@ def gauss_newton_step(generator: torch.Generator, device: torch.device) -> Conte
 
 
 def packed(coords: torch.Tensor) -> torch.Tensor:
-    """One sortable integer a voxel."""
+    """One sortable integer per voxel."""
     x, y, z = (coords.long() + 2**20).unbind(1)
     return x << 42 | y << 21 | z
 
 
 def hash_contenders(generator: torch.Generator, device: torch.device) -> dict[str, Contenders]:
-    """The distinct ones of many voxels, looking many up, and both, against sorting and bisection."""
+    """Finding the distinct voxels, looking voxels up, and both; torch does it by sorting and bisection."""
     distinct = torch.randint(-200, 200, (DISTINCT, 3), generator=generator, dtype=torch.int32)
     coords = distinct[torch.randint(0, DISTINCT, (POINTS,), generator=generator)].to(device)
     capacity = 1 << (4 * DISTINCT).bit_length()
@@ -108,7 +108,7 @@ def hash_contenders(generator: torch.Generator, device: torch.device) -> dict[st
 
 
 def sphere_cells(device: torch.device) -> tuple[np.ndarray, torch.Tensor, torch.Tensor]:
-    """A sphere's distance on a dense grid, and cut into cells."""
+    """Signed distance of a sphere on a dense grid, and the same divided into cells."""
     axis = torch.linspace(-1, 1, SPHERE_SAMPLES)
     x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
     field = (x * x + y * y + z * z).sqrt() - 0.7
@@ -120,7 +120,7 @@ def sphere_cells(device: torch.device) -> tuple[np.ndarray, torch.Tensor, torch.
 
 
 def marching_cubes(device: torch.device) -> Contenders:
-    """A sphere in 256^3 cubes; a map has only the cells near its surface."""
+    """A sphere in 256^3 cubes; a map only has the cells near its surface."""
     field, coords, values = sphere_cells(device)
     inside = (values < 0).flatten(1)
     crossed = inside.any(1) & ~inside.all(1)
@@ -133,7 +133,7 @@ def marching_cubes(device: torch.device) -> Contenders:
 
 
 def room_mesh(generator: torch.Generator, device: torch.device) -> Contenders:
-    """The surface of a map of 325,000 vertices, from its decoder."""
+    """The surface of a map with 325,000 vertices, from its decoder."""
     scene = room.make_scene(generator, device)
     vertices = scene.hash_keys[scene.hash_keys >= 0]
     mask = 2**21 - 1

@@ -1,10 +1,10 @@
-"""How exact the surface is after encoding alone, before any iteration of mapping.
+"""Accuracy of the surface after encoding alone, before any mapping iteration.
 
     python -m experiments.prior_accuracy [--weights FILE] [--output FILE.json] [--report PAGE.md]
 
-Three frames of a generated room, which the prior never saw, get Gaussian noise on their depth, or a Kinect's errors,
-and are encoded and fused. Then rays through pixels of the three views look for the first zero crossing of the decoded
-field, and the crossing's true distance to the room's surface is the error.
+Three frames of a generated room that is not in the prior's training data get Gaussian noise or a Kinect's noise on
+their depth, and are encoded and fused. The first zero crossing of the decoded field is then searched along rays
+through pixels of the three frames; its true distance to the room's surface is the error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from spslam.benchmark.environment import describe_environment
-from spslam.benchmark.report import fill_regions
+from spslam.benchmark.suite_report import fill_regions
 from spslam.benchmark.tables import Table, to_markdown, to_text
 from spslam.config import Config, load_config
 from spslam.datasets.base import RgbdFrame
@@ -35,7 +35,7 @@ from spslam.slam.pixels import sample_frame, unpack_points
 
 NOISE_MM = (0.0, 2.0, 5.0, 10.0)
 KINECT = "kinect"
-# Three views within a third of a second, as mapping integrates them, from four sides of the room.
+# Three frames within a third of a second, as mapping fuses them, from four sides of the room.
 TRIPLES = ((0, 5, 10), (75, 80, 85), (150, 155, 160), (225, 230, 235))
 RAYS = 4000
 SEARCH_M, SEARCH_STEP_M = 0.12, 0.005
@@ -43,21 +43,20 @@ ROOM_SEED = 11
 
 
 def measure(prior: Prior, noise: float | str, triples=TRIPLES, seed: int = 0, config: Config | None = None) -> dict:
-    """Errors of zero crossings over all triples of views.
+    """Measures the errors of zero crossings over all triples of frames.
 
-    Parameters
-    ----------
-    prior : the networks.
-    noise : standard deviation of the depth in mm, or "kinect".
-    triples : frames of the generated room that are fused.
-    seed : of the noise and of the rays.
-    config : defaults of the demo if not given; its section ``prior`` counts.
+    Args:
+        prior: the networks.
+        noise: standard deviation of the depth in mm, or "kinect".
+        triples: indices of the frames of the generated room that are fused.
+        seed: of the noise and the rays.
+        config: None for the demo's; only its section `prior` matters.
 
-    Returns
-    -------
-    ``mean_mm, median_mm, p95_mm`` of the crossings' distance to the true surface, ``bias_mm`` (negative: too deep),
-    ``found`` the share of rays that met a crossing; in the seen space within one voxel of the surface ``band_mm``, the
-    mean error of the field, and ``covered``, the share with all eight corners; ``voxels``, and ``encode_ms`` a frame.
+    Returns:
+        `mean_mm`, `median_mm` and `p95_mm` of the distance from zero crossings to the true surface; `bias_mm`
+        (negative: too deep); `found`, the share of rays with a crossing. In free space within one voxel of the surface:
+        `band_mm`, the mean error of the field, and `covered`, the share with all eight corners. `voxels`, and
+        `encode_ms` per frame.
     """
     config = config or load_config("demo", overrides=[("prior.neighborhood", prior.neighborhood)])
     dataset = GeneratedDataset(frames=max(map(max, triples)) + 1, width=640, height=480, seed=ROOM_SEED)
@@ -107,7 +106,7 @@ def _with_noise(depth: np.ndarray, noise: float | str, focal_px: float, generato
 
 
 def _integrate(scene: Scene, prior: Prior, frame: RgbdFrame, dataset: GeneratedDataset, config: Config) -> float:
-    """Milliseconds of encoding and fusion, without the choice of pixels and their normals."""
+    """Encodes and fuses a frame; returns the milliseconds, without sampling of pixels and normals."""
     pixels = sample_frame(frame, dataset.camera, config)
     pose = torch.from_numpy(frame.pose).float()
     points = unpack_points(pixels.records, dataset.camera) @ pose[:3, :3].T + pose[:3, 3]
@@ -135,7 +134,7 @@ def _crossings(
     places = (origin[:, None] + along[..., None] * direction[:, None]).reshape(-1, 3)
     sdf, valid = scene.sdf(places)
     true = torch.from_numpy(dataset.room.signed_distance(places.numpy())).float()
-    # The room's distance is exact in free space only.
+    # The room's signed distance is exact in free space only.
     seen = (offset <= 0).expand(along.shape).reshape(-1)
     near = seen & (true >= 0) & (true < scene.settings.voxel_size_m)
     error = (sdf * scene.settings.truncation_m - true).abs()
@@ -170,7 +169,7 @@ def main() -> None:
 
 
 def accuracy_table(rows: dict[str, dict]) -> Table:
-    """One line a noise, from what `measure` gives."""
+    """One row per noise level, from the results of `measure`."""
     header = ("noise mm", "mean mm", "median mm", "95 % mm", "bias mm", "field mm", "found", "covered", "voxels")
     lengths = ("mean_mm", "median_mm", "p95_mm", "bias_mm", "band_mm")
     lines = [
@@ -187,7 +186,7 @@ def accuracy_table(rows: dict[str, dict]) -> Table:
 
 
 def validation_table(prior: Prior) -> Table:
-    """The figures in the weights' provenance: solids of kinds that they weren't trained on, 2 mm of noise."""
+    """Validation figures stored with the weights: kinds of solids not trained on, 2 mm of noise."""
     header = ("held out", "0-4 cm mm", "4-8 cm mm", "sign", "crossing mm")
     lines = [
         (

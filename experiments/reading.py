@@ -1,4 +1,4 @@
-"""Frames a second of reading alone: decoding, sampling and, for a GPU, the upload, by number of threads.
+"""Speed of reading alone, by number of threads: decoding, sampling and, for a GPU, the upload.
 
 python -m experiments.reading --config 7scenes --data path/to/redkitchen --frames 0:300 --workers 1 2 4 8 16
 """
@@ -21,12 +21,12 @@ from spslam.run.frame_feed import FrameFeed
 
 
 def main() -> None:
-    """Parses the arguments and prints a row for each number of threads."""
+    """Parses the arguments and prints a row per number of threads."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", default="demo", help="configuration file or name")
     parser.add_argument("--data", type=Path, help="the sequence's folder")
     parser.add_argument("--frames", default="0:300", help="START:STOP")
-    parser.add_argument("--device", default="cpu", help="cuda counts the upload in")
+    parser.add_argument("--device", default="cpu", help="cuda includes the upload")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path, help="file to write the results to")
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def read_all(dataset: RgbdDataset, config: Config, device: torch.device) -> dict[str, float]:
-    """Frames a second, and milliseconds a frame of a thread and of the processors."""
+    """Frames/s, and ms/frame: of the reading threads, and of the processors in user and system mode."""
     started, before = time.perf_counter(), os.times()
     with FrameFeed(dataset, config, device) as feed:
         for _ in feed:

@@ -1,13 +1,13 @@
-"""Is a lost camera found where it is, and never where it is not?
+"""Relocalization: how many poses of a lost camera are accepted, among right ones, wrong ones and those of a wall.
 
     python -m experiments.relocalization --config 7scenes --data path/to/redkitchen --save kitchen.npz
     python -m experiments.relocalization --saved kitchen.npz room.npz
 
-Every second frame of a sequence is mapped. At four places the camera is cut off, and frames from all over the sequence
-are shown to it one by one, each as the first after the loss: some show what was seen before, others what never was.
-Every third of them is shown again as a plain wall, of one color and somewhere between 0.8 and 2.7 m away, which is
-nowhere. Printed is how many poses are believed, at once or if four frames agree, with what colors say and without. The
-first form measures one sequence, the second judges what was saved.
+Every second frame of a sequence is mapped. At four places the camera is interrupted, and frames from the whole sequence
+are shown to it one by one, each as the first after the failure: some show mapped surface, others do not. Every third of
+them is shown again as a wall of one color, 0.8 to 2.7 m away, that is nowhere in the map. The script prints how many
+poses are accepted, at once or if four frames agree, with and without the check of colors. The first command measures
+one sequence, the second evaluates saved measurements.
 """
 
 import argparse
@@ -47,12 +47,12 @@ PLACES, FIRST_PLACE = 4, 0.25  # of the sequence
 LOST_FRAMES = 6
 WALL_EVERY, NEARER_M, FARTHER_M = 3, 0.7, 1.2
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 1.0)
-# A pose that is given up would be the start's.
+# Otherwise the pose of a lost frame would be the start.
 KEEPING = ["tracking.lost_threshold=1", "tracking.min_inlier_share=0", "tracking.relocalization_threshold=1"]
 
 
 def main() -> None:
-    """Parses the arguments; measures a sequence, or judges saved measures."""
+    """Parses the arguments; measures a sequence, or evaluates saved measurements."""
     args = _parser().parse_args()
     config = load_config(args.config, args.preset, ["device=cpu", *args.set, *KEEPING])
     if args.saved is None:
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:
-    """For each frame shown: whether it is a wall, distance (cm) and angle (degrees) to where it is, and its fit."""
+    """For each frame shown: whether it is a wall, distance (cm) and angle (degrees) to the true pose, and its fit."""
     ground_truth, random = true_poses(dataset), np.random.default_rng(0)
     system = SlamSystem(config, dataset.camera, ground_truth[0])
     rows = len(dataset) // STEP
@@ -82,7 +82,7 @@ def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[f
 
 
 def cut_off(system: SlamSystem, dataset: RgbdDataset, ground_truth: np.ndarray) -> SlamSystem:
-    """A copy of the system that has seen nothing but black for some frames."""
+    """A copy of the system after some black frames."""
     with tempfile.TemporaryDirectory() as folder:
         lost = copy_of(system, ground_truth[0], Path(folder) / "state")
     for _ in range(LOST_FRAMES):
@@ -95,7 +95,7 @@ def cut_off(system: SlamSystem, dataset: RgbdDataset, ground_truth: np.ndarray) 
 def shown(
     lost: SlamSystem, dataset: RgbdDataset, index: int, is_wall: bool, random: np.random.Generator
 ) -> tuple[Fit, np.ndarray]:
-    """What the lost system makes of a frame, or of a wall in its stead: fit and pose [4, 4]; it stays as it is."""
+    """Fit and pose [4, 4] that the lost system finds for a frame, or for a wall instead; the system is not changed."""
     frame = dataset[index]
     if is_wall:
         cover_wall(frame, random)
@@ -108,7 +108,7 @@ def shown(
 
 
 def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
-    """Prints how many poses are believed at once, and if neighbors agree, for what is right, wrong and nowhere."""
+    """Prints how many right poses, wrong poses and poses of walls are accepted, at once and if neighbors agree."""
     wall, is_wrong = table[:, 0] > 0, (table[:, 1] > WRONG_CM) | (table[:, 2] > WRONG_DEG)
     groups = {"right": ~wall & ~is_wrong, "wrong": ~wall & is_wrong, "of a wall": wall}
     fits = [Fit(*line) for line in table[:, 3:].tolist()]
@@ -121,7 +121,7 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
     for name, group in groups.items():
         known = brightness_correlation[group & np.isfinite(brightness_correlation)]
         span = " to ".join(f"{number:.2f}" for number in (known.min(), known.max())) if len(known) else "unknown"
-        print(f"{group.sum()} poses {name}, likeness {span}")
+        print(f"{group.sum()} poses {name}, brightness correlation {span}")
         for how, error_probability in error_probabilities.items():
             if not group.any():
                 continue
@@ -138,8 +138,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--every", type=int, default=3, help="show every n-th of the frames that are not mapped")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
-    parser.add_argument("--save", type=Path, help="file for the measures")
-    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to judge together")
+    parser.add_argument("--save", type=Path, help="file for the measurements")
+    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to evaluate together")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""A room of 7 x 3.5 x 2.6 m as a scene of some 300,000 voxel vertices, and rays of cameras inside it."""
+"""A room of 7 x 3.5 x 2.6 m as a scene with about 300,000 voxel vertices, and rays of cameras inside it."""
 
 import math
 
@@ -17,13 +17,13 @@ FRAMES = 200
 
 
 def wall_distance(points: torch.Tensor) -> torch.Tensor:
-    """Signed distance (m) to the walls, positive in the room; of points near them."""
+    """Signed distance (m) of points near the walls, positive inside the room."""
     low, high = points.new_tensor(LOW), points.new_tensor(HIGH)
     return torch.minimum(points - low, high - points).amin(-1)
 
 
 def make_scene(generator: torch.Generator, device: torch.device) -> ops.SceneView:
-    """The room with its own signed distance in the first channel, and random color."""
+    """The room, with its signed distance in the first embedding channel and random color."""
     counts = [int(high / VOXEL_M) + 6 for high in HIGH]
     grid = torch.stack(torch.meshgrid(*[torch.arange(n) for n in counts], indexing="ij"), -1).view(-1, 3)
     volume = SparseVolume(VOXEL_M, capacity=1 << 19)
@@ -56,7 +56,7 @@ def _plane_layout(counts: list[int]) -> tuple[list[int], int]:
 
 
 def _distance_decoder(generator: torch.Generator) -> torch.Tensor:
-    """tanh of the first channel: two hidden units carry it and its negative, the others are random and unused."""
+    """A decoder that returns tanh of the first channel, by two hidden units; the other units are unused."""
     w1, w2, w3 = (0.1 * torch.randn(shape, generator=generator) for shape in ((32, 11), (32, 32), (1, 32)))
     w1[:2] = w2[:2] = 0.0
     w1[0, 3], w1[1, 3] = 1.0, -1.0
@@ -67,7 +67,7 @@ def _distance_decoder(generator: torch.Generator) -> torch.Tensor:
 
 
 def make_rays(generator: torch.Generator, count: int, frames: int, device: torch.device) -> ops.RayBatch:
-    """`count` rays shared evenly by cameras on an ellipse in the middle of the room, looking outward."""
+    """`count` rays, divided evenly among cameras on an ellipse in the middle of the room that look outward."""
     poses = _poses(FRAMES)[torch.linspace(0, FRAMES - 1, frames).long()]
     ray_frames = torch.arange(count) * frames // count
     u = torch.randint(0, WIDTH, (count,), generator=generator)
@@ -89,7 +89,7 @@ def make_rays(generator: torch.Generator, count: int, frames: int, device: torch
 def _poses(count: int) -> torch.Tensor:
     """[F, 7] quaternion and translation: upright cameras (y down is the room's -z) on an ellipse."""
     angle = torch.arange(count) * (2 * math.pi / count)
-    # Camera z to the room's x, then turned about the room's z: (w, x, y, z) of the product.
+    # Camera z to the room's x, then a rotation about the room's z: (w, x, y, z) of the product.
     upright = torch.tensor([0.5, -0.5, 0.5, -0.5])
     w, z = torch.cos(angle / 2), torch.sin(angle / 2)
     a, b, c, d = upright

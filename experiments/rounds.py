@@ -2,8 +2,8 @@
 
     python -m experiments.rounds --rounds 10 --device cuda --preset balanced --json rounds.json
 
-One round is 300 frames. The path is aligned as a whole; a round's error is that of its frames. Memory is what is held
-at the round's end: the map, the pixels of all frames (bounded by pixels.budget_mb), the process, the GPU's allocator.
+One round is 300 frames. The whole trajectory is aligned at once; the error of a round is that of its frames. Memory is
+measured at the end of a round: the map, the stored pixels (limited by pixels.budget_mb), the process, the GPU.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from spslam.slam.system import SlamSystem
 
 
 def main() -> None:
-    """Parses the arguments, goes the rounds, prints a line for each."""
+    """Parses the arguments, runs the rounds, prints a line per round."""
     args = _parser().parse_args()
     frames = FRAMES_PER_ROUND * args.rounds
     overrides = [f"device={args.device}", f"dataset.frames={frames}", f"dataset.noise={args.noise}", *args.set]
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def memory(system: SlamSystem) -> dict[str, float]:
-    """What is held now."""
+    """Memory in use."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     figures = {
         "voxels": system.state.scene.volume.num_voxels,
@@ -79,7 +79,7 @@ def memory(system: SlamSystem) -> dict[str, float]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--noise", type=float, default=1.0, help="of the camera, 1 is a Kinect's")
+    parser.add_argument("--noise", type=float, default=1.0, help="of the depth camera; 1 is a Kinect's")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")

@@ -1,10 +1,10 @@
-"""Whole runs over a sequence: frames a second, accuracy, where the time goes, memory, and whether runs are the same.
+"""Whole runs over a sequence: frames/s, accuracy, time per stage, memory, and whether repeated runs are identical.
 
     python -m experiments.sequence --config 7scenes --data path/to/redkitchen --frames 0:300 --device cuda \
         --preset balanced --preset paper --repeats 5 --json sequence.json
 
-Each preset has a process of its own, in which its runs follow one another; the table holds medians over them. Decoding
-is part of a run, extracting the mesh is not. Exits with 1 if runs of one preset differ in a byte of trajectory or map:
+The runs of a preset follow one another in one process; the table has their medians. Decoding is part of a run,
+extracting the mesh is not. Exits with 1 if runs of one preset differ in a byte of trajectory or map:
 `--repeats 10 --preset balanced` is the test of determinism.
 """
 
@@ -25,7 +25,8 @@ from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.reader_launch import launch_standby
-from spslam.run.sequence import run_sequence
+from spslam.run.sequence import RunRequest, run_sequence
+from spslam.run_folder import RunFolder
 
 # Columns of the table that are medians of metrics.json.
 FIGURES = (
@@ -48,7 +49,7 @@ FIGURES = (
 
 
 def main() -> None:
-    """Parses the arguments; runs each preset in a process, or the single one of `--job`."""
+    """Parses the arguments; runs each preset in its own process, or in this one with `--job`."""
     args = _parser().parse_args()
     if args.job:
         print(json.dumps(run_preset(args, args.job)))
@@ -58,7 +59,7 @@ def main() -> None:
         runs = _in_own_process(preset)
         rows.append(summarize(preset, runs))
         print(f"{preset}: " + ", ".join(f"{run['fps']:.1f}" for run in runs) + " frames/s", flush=True)
-    title = f"{args.config}, frames {args.frames or 'all'}, {args.repeats} runs a preset, medians"
+    title = f"{args.config}, frames {args.frames or 'all'}, {args.repeats} runs per preset, medians"
     timing.report(title, rows, resolve_device(args.device), args.json)
     if any(row["results"] != 1 for row in rows):
         sys.exit("runs with the same seed differ")
@@ -93,20 +94,21 @@ def run_preset(args: argparse.Namespace, preset: str) -> list[dict]:
     for _ in range(args.repeats):
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder) / "run"
-            launch_standby(config)  # as the command line does
-            metrics = run_sequence(config, args.data, output, frames, mesh=False)
+            launch_standby(config)  # as `spslam run` does
+            metrics = run_sequence(RunRequest(config, args.data, output, frames, mesh=False))
             runs.append({**metrics, "digest": digest(output)})
     return runs
 
 
 def digest(output: Path) -> str:
-    """What tells two results apart."""
-    content = b"".join((output / name).read_bytes() for name in ("trajectory.txt", "map.safetensors"))
+    """Hash of trajectory and map."""
+    folder = RunFolder(output)
+    content = folder.trajectory.read_bytes() + folder.map.read_bytes()
     return hashlib.sha256(content).hexdigest()[:16]
 
 
 def summarize(preset: str, runs: list[dict]) -> dict[str, object]:
-    """A row of the table: medians, the slowest run, and how many different results there were."""
+    """A row of the table: medians, the slowest run, and the number of different results."""
     row: dict[str, object] = {"preset": preset, "results": len({run["digest"] for run in runs})}
     row["fps_least"] = min(run["fps"] for run in runs)
     for name in FIGURES:

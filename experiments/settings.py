@@ -1,11 +1,12 @@
-"""Accuracy of settings: runs each over each sequence with several seeds, many at a time, and prints one table.
+"""Accuracy of settings: runs each one over each sequence with several seeds, in parallel, and prints one table.
 
     python -m experiments.settings --sequence kitchen=7scenes:path/to/redkitchen:0:300 --sequence room=demo::0:150 \
         --setting balanced --setting balanced,mapping.pose_rate=1e-3 --seeds 3 --workers 4 --jsonl settings.jsonl
 
-A sequence is NAME=CONFIG:FOLDER:START:STOP[:STEP], then any ,KEY=VALUE of its own; a setting is PRESET,KEY=VALUE,...
-Workers are processes with `--threads` kernel threads each; with `--device cuda` they are spread over all GPUs. A row is
-written when its run is done, and rows that a file has already are not run again, so what is cut short can go on.
+A sequence is NAME=CONFIG:FOLDER:START:STOP[:STEP] and optional ,KEY=VALUE of its own; a setting is PRESET,KEY=VALUE,...
+Workers are processes with `--threads` kernel threads each; with `--device cuda` they are distributed over all GPUs. A
+row is written when its run has finished. Rows that the file already has are not run again, so an interrupted call can
+be continued.
 """
 
 import argparse
@@ -41,7 +42,7 @@ FIGURES = ("ate_rmse_cm", "rpe_cm", "rpe_deg", "lost", "fps")
 
 @dataclass(frozen=True)
 class Job:
-    """One sequence with one setting and seed; `overrides` are the sequence's own."""
+    """One sequence with one setting and seed; `overrides` are options of the sequence."""
 
     name: str
     config: str
@@ -55,18 +56,18 @@ class Job:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """What a row of results is known by."""
+        """Identifies a row of results."""
         return self.setting, self.name, self.seed
 
 
 def main() -> None:
-    """Parses the arguments; runs the jobs in worker processes, or those that a parent sends to this one."""
+    """Parses the arguments; runs the jobs in worker processes, or is such a worker."""
     args = _parser().parse_args()
     if args.worker:
         serve(args.device, args.threads)
         return
     settings = args.setting + [line for path in args.settings for line in read_settings(path)]
-    # Seeds outermost: what is cut short has fewer seeds of all rather than all seeds of some.
+    # Seeds outermost: an interrupted call has some seeds of all settings rather than all seeds of some.
     jobs = [parse_job(q, setting, seed) for seed in range(args.seeds) for setting in settings for q in args.sequence]
     rows = read_rows(args.jsonl) if args.jsonl else []
     done = {(row["setting"], row["name"], row["seed"]) for row in rows if "error" not in row}
@@ -78,12 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequence", action="append", default=[])
     parser.add_argument("--setting", action="append", default=[])
-    parser.add_argument("--settings", action="append", default=[], type=Path, help="file with a setting a line")
+    parser.add_argument("--settings", action="append", default=[], type=Path, help="file with one setting per line")
     parser.add_argument("--seeds", type=int, default=1, help="runs of each, with seeds from 0 on")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--workers", type=int, default=1, help="runs at the same time, on all devices together")
+    parser.add_argument("--workers", type=int, default=1, help="simultaneous runs, on all devices together")
     parser.add_argument("--threads", type=int, default=2, help="kernel and reading threads of a run")
-    parser.add_argument("--jsonl", type=Path, help="file to append a line to for each run")
+    parser.add_argument("--jsonl", type=Path, help="file to append one line per run to")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     return parser
 
@@ -98,18 +99,18 @@ def parse_job(sequence: str, setting: str, seed: int) -> Job:
 
 
 def read_settings(path: Path) -> list[str]:
-    """The lines of a file that are neither empty nor a remark."""
+    """The lines of a file that are neither empty nor comments."""
     lines = (line.strip() for line in path.read_text(encoding="utf-8").splitlines())
     return [line for line in lines if line and not line.startswith("#")]
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """What earlier runs wrote; nothing where there is no file."""
+    """Rows of earlier runs; empty where there is no file."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
 def run_jobs(jobs: list[Job], args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of the jobs in the order in which they end, each written as it comes."""
+    """Rows of the jobs in the order in which they finish; each is written at once."""
     waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
     results: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     for job in jobs:
@@ -126,7 +127,7 @@ def run_jobs(jobs: list[Job], args: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def drive_worker(number: int, args: argparse.Namespace, waiting: queue.SimpleQueue, results: queue.SimpleQueue) -> None:
-    """Hands jobs to a process of its own one by one; a job at which it dies is a row with its last words."""
+    """Sends jobs to a worker process one by one; a job that crashes the worker is a row with an error."""
     process = None
     while True:
         try:
@@ -147,7 +148,7 @@ def drive_worker(number: int, args: argparse.Namespace, waiting: queue.SimpleQue
 
 
 def start_worker(number: int, args: argparse.Namespace) -> subprocess.Popen:
-    """A process that answers jobs on its standard input; on CUDA it sees one GPU only."""
+    """Starts a worker process, which reads jobs from its standard input; on CUDA it uses one GPU."""
     environment = dict(os.environ)
     if args.device == "cuda":
         gpus = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(torch.cuda.device_count())))
@@ -158,7 +159,7 @@ def start_worker(number: int, args: argparse.Namespace) -> subprocess.Popen:
 
 
 def serve(device_name: str, threads: int) -> None:
-    """Answers each job on standard input with its row on standard output."""
+    """Main loop of a worker: reads jobs from standard input, writes rows to standard output."""
     torch.set_num_threads(1)
     ops.set_num_threads(threads)
     device = resolve_device(device_name)
@@ -173,7 +174,7 @@ def serve(device_name: str, threads: int) -> None:
 
 
 def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
-    """Tracks and maps the sequence; returns ATE, RPE, what was lost, and the rate."""
+    """Tracks and maps the sequence; returns ATE, RPE, lost and recovered frames, and frames/s."""
     preset, *overrides = job.setting.split(",")
     own = [f"seed={job.seed}", f"run.prefetch_workers={threads}", *job.overrides]
     config = load_config(job.config, preset, [*own, *overrides])
@@ -199,7 +200,7 @@ def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
 
 
 def print_table(rows: Iterable[dict[str, Any]]) -> None:
-    """Means over the seeds, and how far the ATE spreads; one line a setting and sequence."""
+    """Prints means over the seeds and the range of the ATE; one line per setting and sequence."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["setting"], row["name"]), []).append(row)

@@ -1,4 +1,4 @@
-"""One tracking and one mapping iteration: the fused `render_step` against the same composed of ops with autograd.
+"""Speed of one tracking and one mapping iteration: the fused `render_step` against a composition of ops with autograd.
 
 python -m experiments.step --device cpu --threads 2
 """
@@ -33,7 +33,7 @@ WORKLOADS = (("tracking", 1024, 1, False), ("mapping", 2048, room.FRAMES, True))
 
 
 def zero_gradients(scene: ops.SceneView) -> ops.SceneGradients:
-    """Buffers for a scene's gradients; both sides add to them, so their content does not matter to the time."""
+    """Buffers for a scene's gradients; all contenders add to them, so their content does not affect the time."""
     new = scene.embeddings.new_zeros
     rows, texels = len(scene.embeddings), len(scene.texels)
     return ops.SceneGradients(
@@ -44,7 +44,7 @@ def zero_gradients(scene: ops.SceneView) -> ops.SceneGradients:
 def contenders(
     scene: ops.SceneView, rays: ops.RayBatch, options: ops.RenderOptions, mapping: bool
 ) -> dict[str, Callable[[], ops.RenderStep]]:
-    """The fused step and its compositions, all with the same arguments."""
+    """The fused step and its compositions, with the same arguments."""
     gradients = zero_gradients(scene) if mapping else None
     compositions = {
         "composed of torch, all samples": (TORCH, False),

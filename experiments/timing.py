@@ -1,4 +1,4 @@
-"""Timing of alternatives in one process, and the record of what it was measured on."""
+"""Timing of alternatives in one process, and the description of the machine."""
 
 import argparse
 import json
@@ -12,7 +12,7 @@ import torch
 from spslam import ops
 from spslam.benchmark.environment import describe_environment
 
-TURN_MS, MAX_CALLS = 5.0, 20  # of a turn on a GPU
+TURN_MS, MAX_CALLS = 5.0, 20  # length of a turn on a GPU
 IDLE_CYCLES = 30_000_000  # 15 to 20 ms, in which Python launches a turn
 
 
@@ -22,18 +22,18 @@ def compare(
     device: torch.device,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Median milliseconds of a call of each contender, its launches from Python included.
+    """Median milliseconds per call of each contender, launches from Python included.
 
-    They take turns, so that a machine that others use slows all of them alike; warm-up is not counted. On a GPU a turn
-    is as many calls one after the other as fill some milliseconds, and one wait at its end.
+    The contenders take turns, so that other load on the machine slows all of them equally; warm-up is not counted. On a
+    GPU a turn is several calls that together take some milliseconds, and one synchronization at the end.
     """
     return _in_turns(contenders, rounds, device, lambda function, calls: _wall_ms(function, calls, device, clock))
 
 
 def compare_on_gpu(contenders: dict[str, Callable[[], object]], rounds: int, device: torch.device) -> dict[str, float]:
-    """The same by the GPU's clock: launches wait behind an idle kernel, so what Python takes for them doesn't count.
+    """The same with GPU time: launches queue behind an idle kernel, so the time that Python needs does not count.
 
-    A contender that waits for the GPU itself, or works on the CPU, is charged for it here too.
+    Time that a contender spends on the CPU or synchronizing with the GPU does count.
     """
     return _in_turns(contenders, rounds, device, _gpu_ms)
 
@@ -54,7 +54,7 @@ def _in_turns(
 
 
 def _calls_a_turn(function: Callable[[], object], device: torch.device) -> int:
-    """One on the CPU; warms up on both."""
+    """One on the CPU; also warms up, on both devices."""
     for _ in range(2):
         once = _wall_ms(function, 1, device, time.perf_counter)
     return max(1, min(MAX_CALLS, int(TURN_MS / max(once, 1e-3)))) if device.type == "cuda" else 1
@@ -87,11 +87,11 @@ def _synchronize(device: torch.device) -> None:
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
-    """The options every benchmark has."""
+    """A parser with the options that every script has."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="CPU threads, of torch as well")
-    parser.add_argument("--rounds", type=int, default=15, help="turns each contender gets")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="CPU threads of kernels and torch")
+    parser.add_argument("--rounds", type=int, default=15, help="turns per contender")
     parser.add_argument("--json", type=Path, help="file to write the results to")
     return parser
 

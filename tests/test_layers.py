@@ -23,7 +23,7 @@ INCLUDES = {
 ELEMENT_SYSTEM_HEADERS = {"cmath", "cstdint", "limits"}
 
 # Which parts of spslam a part may import. Parts that aren't named here are of the ground floor.
-GROUND = {"camera", "config", "errors", "geometry", "io", "options", "trajectory"}
+GROUND = {"camera", "config", "errors", "geometry", "io", "options", "run_folder", "trajectory"}
 IMPORTS = {
     **{name: GROUND for name in GROUND},
     "ops": set(),
@@ -128,6 +128,12 @@ def test_tracker_and_mapper_do_not_know_each_other():
     for path in MODULES:
         if part_of(path) == "slam" and path.stem in names:
             assert not [name for name in imported(path) if names[path.stem] in name.split(".")]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_package_needs_nothing_of_the_repository(path):
+    """`tests` and `experiments` are not in the wheel."""
+    assert not {name.split(".")[0] for name in imported(path)} & {"experiments", "tests", "tools"}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)

@@ -1,4 +1,4 @@
-"""What a result depends on beside its settings: machine, versions, commit."""
+"""What a result depends on besides its options: machine, versions, commit."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import torch
 
 import spslam
 from spslam import ops
+from spslam.run.provenance import device_name
 
 
 def describe_environment(device: torch.device) -> dict[str, Any]:
     """Device, versions, kernels, threads and commit, for the record of a run."""
     return {
         "device": device.type,
-        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else processor_name(),
+        "device_name": device_name(device),
         "cpu_kernels": ops.CPU_ISA,
         "kernel_threads": ops.get_num_threads(),
         "spslam": spslam.__version__,
@@ -28,22 +29,12 @@ def describe_environment(device: torch.device) -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """The commit that runs, with a plus where files differ from it; None outside a repository."""
+    """The commit of the running code, with a plus if files have changed since; None outside a repository."""
     root = Path(spslam.__file__).parent.parent
-    if not (root / ".git").exists():  # installed: a repository further up is another project's
+    if not (root / ".git").exists():  # an installed package; a repository further up is another project's
         return None
     command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     try:
         return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.strip() or None
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def processor_name() -> str:
-    """The processor's model name where the system tells, else its architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()

@@ -1,4 +1,4 @@
-"""The figures of a run by name: how they are called and printed in tables."""
+"""The figures of a run by name: title, unit and digits in tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """Title in a table, unit, and digits after the point."""
+    """How a figure is printed: title in a table, unit, digits after the decimal point."""
 
     title: str
     unit: str
@@ -57,13 +57,13 @@ FIGURES = {
 
 
 def figure(name: str) -> Figure:
-    """How a figure is printed; one without an entry by its own name."""
+    """How a figure is printed; one without an entry has its name as title."""
     return FIGURES.get(name, Figure(name, "", 2))
 
 
 @dataclass(frozen=True)
 class Statistic:
-    """A figure over the runs of one cell: mean, sample standard deviation (0 of a single run), extremes, runs."""
+    """A figure over the runs of one cell: mean, sample standard deviation (0 for one run), minimum, maximum, runs."""
 
     mean: float
     deviation: float
@@ -73,12 +73,12 @@ class Statistic:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Statistic:
-        """Of at least one value."""
+        """The statistic of at least one value."""
         mean = math.fsum(values) / len(values)
         squares = math.fsum((value - mean) ** 2 for value in values)
         return cls(mean, math.sqrt(squares / max(len(values) - 1, 1)), min(values), max(values), len(values))
 
     def text(self, digits: int) -> str:
-        """Mean, and spread where runs differ: ``2.30 ± 0.02``."""
+        """Mean, and standard deviation where runs differ: `2.30 ± 0.02`."""
         spread = f" ± {self.deviation:.{digits}f}" if self.runs > 1 and self.high > self.low else ""
         return f"{self.mean:.{digits}f}{spread}"

@@ -1,6 +1,6 @@
-"""The classical rival: voxelized GICP odometry against a growing map of Gaussians (`small_gicp`).
+"""The classical baseline: voxelized GICP odometry against a growing voxel map of Gaussians (`small_gicp`).
 
-No loop closure, no dense map, no color, no learning; what a neural map must beat to be worth its work.
+No loop closure, dense map, color or learning: a neural map is worth its cost only where it is better than this.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from spslam.camera import Camera
 from spslam.errors import SpslamError
 from spslam.geometry import constant_speed, orthonormalize
 
-# Four times the voxel: matches farther apart belong to other surfaces.
+# Maximum correspondence distance in voxels: pairs farther apart belong to different surfaces.
 _REACH_VOXELS = 4
-# Every second pixel both ways: a voxel of 2 cm still gets several.
+# Every second pixel in both directions: a voxel of 2 cm still gets several.
 _PIXEL_STEP = 2
 _NEIGHBORS = 10
-# A registration that matches less than this share of the frame's points holds on to nothing.
+# With a smaller share of matched points, the registration counts as failed.
 _MIN_MATCHED = 0.2
 _MAX_ITERATIONS = 30
-# A voxel that a room's camera saw once stays in the map.
+# Voxels never expire from the map.
 _NEVER = 1 << 30
 
 
 def gicp_off_reason() -> str:
-    """Why the baseline can't run, empty if it can."""
+    """Why the baseline can't run; empty if it can."""
     try:
         import small_gicp  # noqa: F401
     except ImportError:
@@ -33,14 +33,16 @@ def gicp_off_reason() -> str:
 
 
 class GicpOdometry:
-    """Registers each depth image against the voxel map of all before it, from a constant-speed prediction.
+    """Registers each depth image against the voxel map of all earlier ones, starting at a constant-speed prediction.
 
-    Parameters
-    ----------
-    camera : of the depth images.
-    first_pose : float64 [4,4] ``T_world_camera`` of the first frame.
-    voxel_m : edge of the map's voxels, and of the grid that a frame's points are averaged over.
-    threads : of the registration. More than one makes the averaging, and so the result, vary slightly.
+    Args:
+        camera: intrinsics of the depth images.
+        first_pose: float64 [4, 4] T_world_camera of the first frame.
+        voxel_m: edge of the map's voxels and of the grid that downsamples a frame's points, in meters.
+        threads: of the registration. With more than one, the downsampling and so the result vary slightly.
+
+    Raises:
+        SpslamError: small_gicp is not installed.
     """
 
     def __init__(self, camera: Camera, first_pose: np.ndarray, voxel_m: float = 0.04, threads: int = 1) -> None:
@@ -57,10 +59,16 @@ class GicpOdometry:
         self.lost: list[bool] = []
 
     def process(self, depth: np.ndarray) -> np.ndarray:
-        """The pose of the next frame, float64 [4,4], from its depth float32 [H,W] in meters, 0 where unknown.
+        """Tracks the next frame.
 
-        A frame without depth, or whose registration finds too little to hold on to, keeps the predicted pose, counts
-        as lost and doesn't touch the map.
+        A frame without depth, or whose registration fails, gets the predicted pose, counts as lost and is not added to
+        the map.
+
+        Args:
+            depth: float32 [H, W] in meters, 0 where unknown.
+
+        Returns:
+            float64 [4, 4] T_world_camera.
         """
         import small_gicp
 
@@ -97,5 +105,5 @@ class GicpOdometry:
 
 
 def _orthonormal(pose: np.ndarray) -> np.ndarray:
-    """The pose with its rotation projected back, so that rounding does not add up."""
+    """The pose with an exactly orthonormal rotation, so that rounding errors don't accumulate."""
     return np.block([[orthonormalize(pose[:3, :3]), pose[:3, 3:]], [np.array([[0.0, 0.0, 0.0, 1.0]])]])

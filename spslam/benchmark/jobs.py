@@ -1,4 +1,4 @@
-"""From a suite and a folder of data to single runs."""
+"""The single runs of a suite, over the data that is there."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from spslam.config import Config, config_names, load_config
 from spslam.prior.encoder import shipped_weights
 from spslam.slam.checkpoint import fingerprint
 
-GENERATED = "generated"
-
 
 @dataclass(frozen=True)
 class Job:
     """One run of one variant over one sequence, as plain values.
 
-    Attributes
-    ----------
-    sequence : short name.
-    config, preset, options : of the run; ``options`` are pairs of ``section.key`` and value.
-    method, method_options : ``spslam``, or ``gicp`` with its own options.
-    seed : of the run.
-    frames : ``START:STOP[:STEP]`` or None for all.
-    device : ``cpu`` or ``cuda``.
-    data, mesh : folder of the data and file of the true surface, None where there is none.
-    thorough : evaluate as in the paper, with depth from novel views and pictures of the map, which takes longer than a
-        short run does; else a fifth of the points are compared, and no views.
+    Attributes:
+        sequence: name of the sequence.
+        config: name of the configuration.
+        preset: name of the preset; None for the default one.
+        options: changes to the configuration, pairs of `section.key` and value.
+        method: `spslam` or `gicp`.
+        method_options: options of the baseline, pairs of name and value.
+        seed: of the run.
+        frames: `START:STOP[:STEP]`; None for all.
+        device: `cpu` or `cuda`.
+        data: folder of the data; None for generated data.
+        mesh: file of the ground-truth surface; None where there is none.
+        thorough: evaluate as in the paper, with depth from novel views and rendered views of the map, which takes
+            longer than a short run. Otherwise a fifth of the surface points is compared, and no views.
     """
 
     sequence: str
@@ -56,10 +57,10 @@ class Job:
         return load_config(self.config, self.preset, changes)
 
     def key(self) -> str:
-        """Name of the run's record: what decides on its figures, readable first, then a hash of all of it.
+        """Name of the run's record: readable words, then a hash of all that its figures depend on.
 
-        Settings count as resolved and weights by content, so that a changed preset or retrained prior is another run;
-        where the data lies doesn't count.
+        The hash is over resolved options and the content of the prior's weights, so a changed preset or a retrained
+        prior gives another key. Where the data is stored does not count.
         """
         content = {
             "settings": fingerprint(self.load_config()),
@@ -77,12 +78,12 @@ class Job:
         return f"{'-'.join(words)}-seed{self.seed}-{digest}".replace("/", "_").replace(" ", "_")
 
     def to_json(self) -> str:
-        """As `from_json` reads it."""
+        """The job as text."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> Job:
-        """What `to_json` wrote."""
+        """The job of a text by `to_json`."""
         values = json.loads(text)
         pairs = {name: tuple((key, value) for key, value in values[name]) for name in ("options", "method_options")}
         return cls(**{**values, **pairs})
@@ -90,13 +91,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a suite asks for on a machine.
+    """The runs of a suite on this machine.
 
-    Attributes
-    ----------
-    jobs : every run by its key; runs that several studies ask for are there once.
-    cells : keys of the runs behind (study, sequence, variant).
-    skipped : sequences and variants that aren't run, and why.
+    Attributes:
+        jobs: all runs by key; a run that several studies need is listed once.
+        cells: keys of the runs of each (study, sequence, variant).
+        skipped: sequences and variants that can't be run, and why.
     """
 
     jobs: dict[str, Job]
@@ -105,18 +105,15 @@ class Plan:
 
 
 def make_plan(suite: Suite, data: Path | None, device: str) -> Plan:
-    """The runs of a suite over the data that is there.
+    """Plans the runs of a suite over the data that is there.
 
-    Parameters
-    ----------
-    suite : what to run.
-    data : folder that holds the data sets; None if only generated data is wanted.
-    device : ``cpu`` or ``cuda``.
+    Args:
+        suite: what to run.
+        data: folder that holds the data sets; None to run over generated data only.
+        device: `cpu` or `cuda`.
 
-    Raises
-    ------
-    ConfigError
-        An option of a variant isn't one.
+    Raises:
+        ConfigError: an option of a variant does not exist.
     """
     jobs: dict[str, Job] = {}
     cells: dict[tuple[str, str, str], tuple[str, ...]] = {}
@@ -139,17 +136,17 @@ def make_plan(suite: Suite, data: Path | None, device: str) -> Plan:
 
 
 def _job(sequence: Sequence, variant: Variant, folder: Path | None, data: Path | None, device: str) -> Job:
-    mesh, ours = _find_mesh(sequence, folder, data), variant.method == SPSLAM
+    mesh, is_spslam = _find_mesh(sequence, folder, data), variant.method == SPSLAM
     return Job(
         sequence=sequence.name,
         config=sequence.config,
         preset=variant.preset,
-        options=(*sequence.options, *variant.options) if ours else sequence.options,
+        options=(*sequence.options, *variant.options) if is_spslam else sequence.options,
         method=variant.method,
-        method_options=() if ours else variant.options,
+        method_options=() if is_spslam else variant.options,
         seed=0,
         frames=sequence.frames,
-        device=device if ours else "cpu",
+        device=device if is_spslam else "cpu",
         data=None if folder is None else str(folder),
         mesh=None if mesh is None else str(mesh),
         thorough=False,
@@ -157,13 +154,13 @@ def _job(sequence: Sequence, variant: Variant, folder: Path | None, data: Path |
 
 
 def _seeded(job: Job, seeds: int) -> Iterator[Job]:
-    """The job with each seed; a baseline draws nothing, and is run once."""
+    """The job with each seed; the baseline has no random draws and is run once."""
     for seed in range(seeds if job.method == SPSLAM else 1):
         yield replace(job, seed=seed)
 
 
 def _locate(sequence: Sequence, data: Path | None) -> tuple[Path | None, str]:
-    """The sequence's folder, or why it can't be run."""
+    """The sequence's folder (None for generated data), or why it can't be run."""
     if sequence.config not in config_names():
         return None, f"there is no configuration {sequence.config}"
     if not sequence.folders:
@@ -173,7 +170,7 @@ def _locate(sequence: Sequence, data: Path | None) -> tuple[Path | None, str]:
     for candidate in sequence.folders:
         if (data / candidate).is_dir():
             return (data / candidate).resolve(), ""
-    return None, f"none of {', '.join(sequence.folders)} in {data}"
+    return None, f"none of {', '.join(sequence.folders)} in {data}; --folders FILE names other folders"
 
 
 def _find_mesh(sequence: Sequence, folder: Path | None, data: Path | None) -> Path | None:

@@ -1,4 +1,4 @@
-"""One run, in this process: the system or the baseline over a sequence, and its figures against the truth."""
+"""One run in this process: spslam or the baseline over a sequence, evaluated against ground truth."""
 
 from __future__ import annotations
 
@@ -26,28 +26,25 @@ from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory import ate, rpe
 from spslam.run.device import resolve_device
-from spslam.run.sequence import run_sequence
+from spslam.run.sequence import RunRequest, run_sequence
 
 _READING_THREADS, _READ_AHEAD = 2, 8
 
 
 def measure(job: Job, folder: Path, threads: int | None) -> dict[str, Any]:
-    """Run a job; returns its record.
+    """Runs a job.
 
-    Parameters
-    ----------
-    job : what to run.
-    folder : for the run's own output; must not hold anything.
-    threads : of the kernels; as many as processors if None.
+    Args:
+        job: what to run.
+        folder: for the run's output; must be empty.
+        threads: number of kernel threads; None for one per processor.
 
-    Returns
-    -------
-    ``job``, ``environment``, ``figures`` by the names of metrics.json, and ``seconds`` in all, evaluation included.
+    Returns:
+        The run's record: `job`, `environment`, `figures` by their names in metrics.json, and `seconds` in total,
+        evaluation included.
 
-    Raises
-    ------
-    SpslamError
-        What is wrong with data or settings.
+    Raises:
+        SpslamError: something is wrong with the data or the options.
     """
     if threads is not None:
         ops.set_num_threads(threads)
@@ -62,7 +59,7 @@ def measure(job: Job, folder: Path, threads: int | None) -> dict[str, Any]:
 
 
 def parse_slice(frames: str | None) -> slice | None:
-    """``START:STOP[:STEP]`` as a slice; raises ValueError."""
+    """`START:STOP[:STEP]` as a slice; raises ValueError."""
     if frames is None:
         return None
     parts = [int(part) if part else None for part in frames.split(":")]
@@ -76,12 +73,13 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
     data = None if job.data is None else Path(job.data)
     dataset = open_dataset(config.dataset, data)
     ground_truth = _true_surface(dataset, job.mesh)
-    figures = run_sequence(config, data, folder, parse_slice(job.frames), mesh=ground_truth is not None or job.thorough)
+    with_mesh = ground_truth is not None or job.thorough
+    figures = run_sequence(RunRequest(config, data, folder, parse_slice(job.frames), mesh=with_mesh))
     if "peak_gpu_mb" in figures:
         figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
     run = RunOutput.read(folder)
     if run.mesh() is None:
-        # A run that was lost throughout has an empty mesh, which is no reason to lose its other figures.
+        # A run whose camera was always lost has an empty mesh; its other figures still count.
         return figures
     if ground_truth is not None:
         extent = (SAMPLES, NOVEL_VIEWS) if job.thorough else (SAMPLES // 5, 0)

@@ -1,4 +1,4 @@
-"""Runs in processes of their own, one a GPU where there are several, each leaving its record at once or not at all."""
+"""Runs in parallel processes, one per GPU where there are several; each writes its record atomically when finished."""
 
 from __future__ import annotations
 
@@ -29,7 +29,15 @@ RECORDS, WORK, RUNS, LOCK = "records", "work", "runs", ".lock"
 
 @dataclass(frozen=True)
 class Outcome:
-    """A finished run: its record, or one line about why there is none. ``earlier`` if it had finished before."""
+    """What became of a job.
+
+    Attributes:
+        key: of the job.
+        job: what was run.
+        record: as `measure` returns it; None where the run failed.
+        error: why it failed, in one line.
+        earlier: whether an earlier call had run it.
+    """
 
     key: str
     job: Job
@@ -45,12 +53,11 @@ Report = Callable[[int, int, Outcome], None]
 class PoolOptions:
     """How the runs share the machine.
 
-    Attributes
-    ----------
-    workers : runs at a time; None is one a GPU, and one on a machine without. Timings are only comparable when runs
-        don't share what they run on, so each record says how many there were.
-    threads : kernel threads of each run; None is as many as there are processors for it.
-    keep : leave each run's output folder in ``runs/``.
+    Attributes:
+        workers: number of simultaneous runs; None for one per GPU, or one on a machine without GPU. Timings are only
+            comparable if runs don't share a device, so each record says how many there were.
+        threads: kernel threads of each run; None for an equal share of the processors.
+        keep: keep each run's output folder, in `runs/`.
     """
 
     workers: int | None = None
@@ -61,19 +68,19 @@ class PoolOptions:
 def run_jobs(
     jobs: dict[str, Job], output: Path, options: PoolOptions, report: Report | None = None
 ) -> dict[str, Outcome]:
-    """Run what isn't there yet; returns the outcome of every job by its key.
+    """Runs the jobs that have no record yet.
 
-    Parameters
-    ----------
-    jobs : by key.
-    output : folder of the benchmark; ``records/KEY.json`` are the finished runs.
-    options : how many at a time.
-    report : called with (runs done, runs in all, outcome), from the calling thread.
+    Args:
+        jobs: by key.
+        output: folder of the benchmark; `records/KEY.json` are the records of finished runs.
+        options: how the runs share the machine.
+        report: called from this thread with (runs done, total runs, outcome).
 
-    Raises
-    ------
-    OutputError
-        The folder can't be used, or another benchmark is running in it. A failing run doesn't raise.
+    Returns:
+        The outcome of every job by key.
+
+    Raises:
+        OutputError: the folder can't be used, or another benchmark is running in it. A failed run doesn't raise.
     """
     with _locked(output):
         _remove_leftovers(output)
@@ -95,14 +102,15 @@ def record_path(output: Path, key: str) -> Path:
 
 
 def run_here(job: Job, key: str, output: Path, workers: int, threads: int, keep: bool) -> None:
-    """Run a job in this process and write its record; what a run's own process does.
+    """Runs a job in this process and writes its record; called in the processes that `run_jobs` starts.
 
-    Parameters
-    ----------
-    job, key, output : as given to :func:`run_jobs`.
-    workers : runs at a time, for the record.
-    threads : of the kernels.
-    keep : move the run's output folder to ``runs/KEY``; else it is removed.
+    Args:
+        job: what to run.
+        key: of the job.
+        output: folder of the benchmark.
+        workers: number of simultaneous runs, for the record.
+        threads: number of kernel threads.
+        keep: move the run's output folder to `runs/KEY` instead of removing it.
     """
     from spslam.benchmark.measure import measure
 
@@ -122,7 +130,7 @@ def run_here(job: Job, key: str, output: Path, workers: int, threads: int, keep:
 
 @contextlib.contextmanager
 def _locked(output: Path) -> Iterator[None]:
-    """Holds the folder for this process; the system lets go when the process ends, however it does."""
+    """Locks the folder for this process; the system releases the lock when the process ends, for whatever reason."""
     try:
         (output / RECORDS).mkdir(parents=True, exist_ok=True)
         lock = (output / LOCK).open("w")
@@ -137,7 +145,7 @@ def _locked(output: Path) -> Iterator[None]:
 
 
 def _remove_leftovers(output: Path) -> None:
-    """What a killed benchmark was in the middle of."""
+    """Removes the files of runs that were in progress in a killed benchmark."""
     shutil.rmtree(output / WORK, ignore_errors=True)
     for temporary in (output / RECORDS).glob(".*.tmp.json"):
         temporary.unlink(missing_ok=True)
@@ -151,7 +159,7 @@ def _finished(output: Path, key: str, job: Job) -> Outcome | None:
 
 
 def _run_missing(jobs: dict[str, Job], output: Path, options: PoolOptions) -> Iterator[Outcome]:
-    """Outcomes as they come; on leaving early, Ctrl-C included, the runs under way are ended."""
+    """Yields outcomes as runs finish; when left early, also by Ctrl-C, the runs in progress are killed."""
     if not jobs:
         return
     slots = _slots(options, any(job.device == "cuda" for job in jobs.values()))
@@ -187,12 +195,12 @@ def _command(key: str, job: Job, output: Path, options: PoolOptions, workers: in
 
 
 def _slots(options: PoolOptions, cuda: bool) -> list[dict[str, str]]:
-    """What each run at a time has in its environment: its GPU, and where spslam is."""
+    """Environment variables of each simultaneous run: its GPU, and where spslam is imported from."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     gpus = visible.split(",") if visible else [str(index) for index in range(torch.cuda.device_count())]
     workers = options.workers or (max(len(gpus), 1) if cuda else 1)
     paths = [str(Path(spslam.__file__).parent.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
-    # Spinning threads of small_gicp's OpenMP would take the cores from the reading threads.
+    # Spinning OpenMP threads of small_gicp would take cores from the reading threads.
     common = {"OMP_WAIT_POLICY": "passive", "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
     return [
         {**common, "CUDA_VISIBLE_DEVICES": gpus[worker % len(gpus)]} if cuda and gpus else common
@@ -201,7 +209,7 @@ def _slots(options: PoolOptions, cuda: bool) -> list[dict[str, str]]:
 
 
 class _Running:
-    """The processes under way, to be ended together."""
+    """The processes of runs in progress, which can be killed together."""
 
     def __init__(self) -> None:
         self._processes: set[subprocess.Popen] = set()
@@ -209,11 +217,11 @@ class _Running:
         self._stopped = False
 
     def call(self, command: list[str], environment: dict[str, str]) -> str:
-        """Runs a command; returns what went wrong, in one line, or nothing."""
+        """Runs a command; returns one line about what went wrong, empty if nothing did."""
         with self._lock:
             if self._stopped:
                 return "interrupted before it began"
-            # Its input stays open for as long as this process lives; that is how a run knows that it is still wanted.
+            # The process ends when its standard input is closed, which happens at the latest when this process ends.
             process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
             )
@@ -233,7 +241,7 @@ class _Running:
         return lines[-1].removeprefix("spslam: ") if code > 0 and lines else f"ended by signal {-code}"
 
     def stop(self) -> None:
-        """Ends all, and lets no further one begin."""
+        """Kills all processes and prevents new ones."""
         with self._lock:
             self._stopped = True
             for process in self._processes:

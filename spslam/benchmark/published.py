@@ -1,4 +1,4 @@
-"""Figures that the paper prints, from `data/published.yaml`."""
+"""Figures published in the paper, from `data/published.yaml`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Number = float | int | str | None
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A table of the paper: its number, its columns, and the values of each method; None where the paper has none."""
+    """A table of the paper: its number, its columns, and the values of each method (None where the paper has none)."""
 
     table: str
     columns: tuple[str, ...]
@@ -30,7 +30,7 @@ class PublishedTable:
 
 
 def published(suite: str | None) -> dict[str, PublishedTable]:
-    """The paper's tables about a suite by kind: ``ate`` and ``averages``, or the ablation's studies; may be empty."""
+    """The paper's tables for a suite, by kind (`ate`, `averages`, or a study of the ablation); may be empty."""
     tables = _read().get(suite, {}) if suite else {}
     return {
         kind: PublishedTable(

@@ -1,7 +1,7 @@
 """What is run: suites of sequences and variants, read from `data/suites/*.yaml`.
 
-A suite's studies each run every variant over every sequence. The dataset suites have one study, whose variants are
-presets and the classical baseline; the ablation has one for each question.
+Each study of a suite runs every variant over every sequence. The suite of a data set has one study, whose variants are
+presets and the classical baseline; the ablation has one study per question.
 """
 
 from __future__ import annotations
@@ -31,18 +31,16 @@ DATASET_COLUMNS = (
 class Sequence:
     """Frames to run over.
 
-    Attributes
-    ----------
-    name, title : short and long name.
-    config : of the shipped configurations.
-    folders : where the data may lie below the data root, in order of preference; none for generated data.
-    meshes : where the true surface may lie, relative to the root; ``{folder}`` stands for the folder found.
-    options : changes to the configuration.
-    frames : ``START:STOP[:STEP]``; None is all.
+    Attributes:
+        name: of the sequence.
+        config: name of a shipped configuration.
+        folders: where the data may be below the data root, in order of preference; empty for generated data.
+        meshes: where the ground-truth surface may be, relative to the root; `{folder}` stands for the folder found.
+        options: changes to the configuration, pairs of `section.key` and value.
+        frames: `START:STOP[:STEP]`; None for all.
     """
 
     name: str
-    title: str
     config: str
     folders: tuple[str, ...] = ()
     meshes: tuple[str, ...] = ()
@@ -52,9 +50,15 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to run: a preset with changed options, or a baseline.
+    """A way to run a sequence: a preset with changed options, or a baseline.
 
-    ``series`` and ``x`` place it in a plot: the line it belongs to and its place on the axis, None outside of one.
+    Attributes:
+        name: of the variant.
+        method: `SPSLAM` or `GICP`.
+        preset: name of a preset; None for the default one.
+        options: changes to the configuration, or the baseline's options.
+        series: line of the plot that the variant belongs to.
+        x: its place on the plot's axis; None in a study without plots.
     """
 
     name: str
@@ -67,7 +71,19 @@ class Variant:
 
 @dataclass(frozen=True)
 class Study:
-    """One question: its sequences, variants, columns of the table, and figures to plot over ``x_label``."""
+    """One question to the data: every variant is run over every sequence.
+
+    Attributes:
+        name: of the study.
+        title: of its table.
+        note: printed above the table.
+        sequences: what is run over.
+        variants: how it is run.
+        columns: figures in the table.
+        x_label: label of the plots' axis.
+        x_log: whether that axis is logarithmic.
+        plots: figures to plot over it.
+    """
 
     name: str
     title: str
@@ -82,7 +98,15 @@ class Study:
 
 @dataclass(frozen=True)
 class Suite:
-    """A named set of studies; ``published`` is the key of the paper's figures, None where there are none to compare."""
+    """A named set of studies.
+
+    Attributes:
+        name: of the suite.
+        title: of its report.
+        seeds: number of runs of each variant, with seeds 0, 1, ...
+        studies: the studies.
+        published: key of the paper's figures; None where the paper has none.
+    """
 
     name: str
     title: str
@@ -105,21 +129,19 @@ def load_suite(
     seeds: int | None = None,
     baseline: bool = True,
 ) -> Suite:
-    """A suite, narrowed to what is asked for.
+    """Loads a suite, or a part of it.
 
-    Parameters
-    ----------
-    name : one of :func:`suite_names`.
-    presets : instead of the suite's own; the ablation's variants name theirs.
-    sequences, studies : only these, by name.
-    frames : ``START:STOP[:STEP]`` instead of the sequences' own.
-    seeds : runs of each variant, with seeds 0, 1, ...; the suite's own number if not given (5, as in the paper).
-    baseline : whether to run the classical baseline.
+    Args:
+        name: one of `suite_names`.
+        presets: instead of the suite's own. No effect on the ablation, whose variants name theirs.
+        sequences: names of the sequences to run; None for all.
+        studies: names of the studies to run; None for all.
+        frames: `START:STOP[:STEP]` instead of the sequences' own.
+        seeds: number of runs of each variant; None for the suite's own number (5 by default, as in the paper).
+        baseline: whether to run the classical baseline.
 
-    Raises
-    ------
-    ConfigError
-        An unknown name, with the known ones.
+    Raises:
+        ConfigError: a name is unknown; the message lists the known ones.
     """
     if name not in suite_names():
         raise ConfigError(f"suite must be one of {', '.join(suite_names())}, got {name}")
@@ -148,7 +170,6 @@ def _sequence(name: str, item: dict[str, Any], content: dict[str, Any]) -> Seque
     named = {key: tuple(text.replace("{name}", name) for text in item.get(key, ())) for key in ("folders", "meshes")}
     return Sequence(
         name,
-        item.get("title", name),
         item["config"] if "config" in item else content["config"],
         named["folders"],
         named["meshes"],

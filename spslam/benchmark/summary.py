@@ -1,4 +1,4 @@
-"""What came out of a suite: statistics of every cell, what was skipped, what failed."""
+"""Results of a suite: statistics of all cells, what was skipped, what failed."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ Cell = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Summary:
-    """A suite's results.
+    """Results of a suite.
 
-    Attributes
-    ----------
-    suite : what was asked for.
-    cells : statistics by figure, of each (study, sequence, variant) that has a finished run.
-    skipped : sequences without data, and why.
-    failed : one line for each run that failed.
-    environments : what the runs were measured on, each once.
+    Attributes:
+        suite: what was run.
+        cells: statistics by figure, of each (study, sequence, variant) that has a finished run.
+        skipped: sequences without data, and why.
+        failed: one line per failed run.
+        environments: what the runs were measured on, each once.
     """
 
     suite: Suite
@@ -34,7 +33,7 @@ class Summary:
     environments: tuple[dict[str, Any], ...]
 
     def value(self, study: Study, sequence: str, variant: str, figure: str) -> Statistic | None:
-        """One statistic, None where it wasn't measured."""
+        """One statistic; None where it was not measured."""
         return self.cells.get((study.name, sequence, variant), {}).get(figure)
 
     def sequences(self, study: Study) -> list[str]:
@@ -48,7 +47,7 @@ class Summary:
         return sum(means) / len(means) if means else None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON: ``rows`` with a statistic of every figure, and the rest."""
+        """The content of summary.json."""
         return {
             "suite": self.suite.name,
             "title": self.suite.title,

@@ -1,4 +1,4 @@
-"""Tables of a suite's results: ours, the baseline's, and the paper's beside them."""
+"""Tables of a suite's results: spslam's, the baseline's and the paper's published figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NOTHING = ""
 
 @dataclass(frozen=True)
 class Table:
-    """A titled grid of text; ``name`` is what a page refers to it by."""
+    """A table of text; a Markdown page refers to it by `name`."""
 
     name: str
     title: str
@@ -25,7 +25,7 @@ class Table:
 
 
 def make_tables(summary: Summary) -> list[Table]:
-    """All tables of a suite that have something in them, in order."""
+    """All tables of a suite that are not empty, in order."""
     tables: list[Table] = []
     for study in summary.suite.studies:
         if summary.suite.name == "ablation":
@@ -39,7 +39,7 @@ def make_tables(summary: Summary) -> list[Table]:
 
 
 def _ate_table(summary: Summary, study: Study, paper: PublishedTable | None) -> Table:
-    """Methods down, sequences across."""
+    """A row per method, a column per sequence."""
     names = summary.sequences(study)
     rows = [
         (variant.name, *(_cell(summary, study, name, variant.name, "ate_rmse_cm") for name in names))
@@ -56,7 +56,7 @@ def _ate_table(summary: Summary, study: Study, paper: PublishedTable | None) -> 
 
 
 def _averages_table(summary: Summary, study: Study, paper: PublishedTable | None) -> Table:
-    """Methods down, the columns of the paper's table across; nothing without one."""
+    """A row per method, columns as in the paper's table; empty without one."""
     if paper is None or not summary.sequences(study):
         return Table("averages", "", "", (), ())
     lines = [(method, *(_printed(value) for value in values)) for method, values in paper.rows.items()]
@@ -71,7 +71,7 @@ def _averages_table(summary: Summary, study: Study, paper: PublishedTable | None
 
 
 def _runs_table(summary: Summary, study: Study) -> Table:
-    """Sequences and methods down, figures across."""
+    """A row per sequence and method, a column per figure."""
     columns = _known_columns(summary, study)
     rows = [
         (name, variant.name, *(_cell(summary, study, name, variant.name, column) for column in columns))
@@ -84,7 +84,7 @@ def _runs_table(summary: Summary, study: Study) -> Table:
 
 
 def _study_table(summary: Summary, study: Study) -> Table:
-    """Variants down; for each sequence the study's figures across."""
+    """A row per variant, a column per sequence and figure of the study."""
     pairs = [
         (name, column)
         for name in summary.sequences(study)
@@ -103,7 +103,7 @@ def _study_table(summary: Summary, study: Study) -> Table:
 
 
 def _paper_note(study: Study) -> str:
-    """The paper's own figures for a study, on its data."""
+    """The paper's figures for a study, measured on other data."""
     table = published("ablation").get(study.name)
     if table is None:
         return ""
@@ -142,7 +142,7 @@ def _printed(value: Number) -> str:
 
 
 def to_text(table: Table) -> str:
-    """For a terminal."""
+    """The table for a terminal."""
     lines = [table.header, *table.rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(table.header))]
     # The first columns are names, the others numbers.
@@ -158,7 +158,7 @@ def to_text(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """The grid as Markdown, without title."""
+    """The table as Markdown, without its title."""
 
     def escape(cells: Iterable[str]) -> Iterator[str]:
         return (cell.replace("|", "\\|") for cell in cells)

@@ -86,12 +86,13 @@ def overrides(args: argparse.Namespace) -> list[str | tuple[str, Any]]:
     return changes
 
 
-def require_run_file(output: Path, name: str) -> Path:
-    """A file of a run's output folder; raises OutputError where there is none."""
+def require_run_file(path: Path) -> Path:
+    """The same path, of a file in a run's output folder (`RunFolder`); raises OutputError where there is none."""
+    output = path.parent
     if not output.exists():
         raise OutputError(f"{output}: no such folder")
     if not output.is_dir():
         raise OutputError(f"{output}: must be the output folder of a run, got a file")
-    if not (output / name).is_file():
-        raise OutputError(f"{output}: must be the output folder of a finished run, but has no {name}")
-    return output / name
+    if not path.is_file():
+        raise OutputError(f"{output}: must be the output folder of a finished run, but has no {path.name}")
+    return path

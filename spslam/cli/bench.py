@@ -18,6 +18,9 @@ from spslam.options import PRESETS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a data set's; --list names all")
     parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the data sets")
+    parser.add_argument(
+        "--folders", metavar="FILE", type=Path, help="YAML file with the folders of sequences: see docs/datasets.md"
+    )
     parser.add_argument("--output", metavar="DIR", type=Path, help="folder of results; runs/bench-SUITE if not given")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto takes the GPUs, if any")
     parser.add_argument("--presets", metavar="NAME", nargs="+", choices=PRESETS, help="presets to run")
@@ -56,13 +59,23 @@ def execute(args: argparse.Namespace) -> None:
     suite = load_suite(
         args.suite, args.presets, args.sequences, args.studies, args.frames, args.seeds, not args.no_baseline
     )
+    if args.folders is not None:
+        suite = _in_folders(suite, args)
     _run_suite(suite, args)
+
+
+def _in_folders(suite: Any, args: argparse.Namespace) -> Any:
+    from spslam.benchmark.folders import read_folders, with_folders
+
+    if args.data is None:
+        raise UsageError("--folders needs --data, the folder that its folders are in")
+    return with_folders(suite, read_folders(args.folders))
 
 
 def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     from spslam.benchmark.jobs import make_plan
     from spslam.benchmark.pool import PoolOptions, run_jobs
-    from spslam.benchmark.report import describe_gaps, update_page, write_results
+    from spslam.benchmark.suite_report import describe_gaps, update_page, write_results
     from spslam.benchmark.summary import summarize
     from spslam.benchmark.tables import to_text
     from spslam.run.device import resolve_device

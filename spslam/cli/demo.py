@@ -1,4 +1,4 @@
-"""``spslam demo``: the whole system on a generated room whose truth is known; nothing to download."""
+"""``spslam demo``: the whole system on a generated room with known ground truth; nothing to download."""
 
 from __future__ import annotations
 
@@ -8,25 +8,12 @@ from pathlib import Path
 
 from spslam.cli.arguments import add_device, add_quiet, at_least_one, overrides
 from spslam.cli.progress import print_summary
-from spslam.cli.run import run
+from spslam.cli.run import make_request, run
 from spslam.config import load_config
 from spslam.errors import ConfigError, OutputError
+from spslam.run_folder import RunFolder
 
 DEFAULT_OUTPUT = Path("runs/demo")
-# What a run leaves; an earlier demo's are removed, anything else is left alone.
-RUN_FILES = (
-    "checkpoint.safetensors",
-    "config.yaml",
-    "log.jsonl",
-    "map.safetensors",
-    "mesh.glb",
-    "mesh.obj",
-    "mesh.ply",
-    "metrics.json",
-    "report.html",
-    "skipped.jsonl",
-    "trajectory.txt",
-)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,45 +35,46 @@ def execute(args: argparse.Namespace) -> None:
     from spslam.run.device import resolve_device
 
     resolve_device(config.device)
-    _remove_earlier_demo(args.output)
+    _remove_earlier_demo(RunFolder(args.output))
     frames = None if args.frames is None else slice(0, args.frames, 1)
     command = "spslam run demo" if frames is None else f"spslam run demo --frames 0:{args.frames}"
-    run(config, args.output, frames, resume=False, mesh=True, quiet=args.quiet, command=command)
-    metrics = _evaluate(args.output)
+    run(make_request(config, args.output, frames), args.quiet, command)
+    metrics = _evaluate(RunFolder(args.output))
     if not args.quiet:
         print_summary(metrics, args.output)
 
 
-def _remove_earlier_demo(output: Path) -> None:
-    if not (output / "config.yaml").is_file():
+def _remove_earlier_demo(folder: RunFolder) -> None:
+    """Removes the files of an earlier demo, nothing else."""
+    if not folder.config.is_file():
         return
     try:
-        earlier = load_config(output / "config.yaml")
+        earlier = load_config(folder.config)
     except ConfigError as error:
-        raise OutputError(f"{output}: holds something that isn't a demo; use another --output") from error
+        raise OutputError(f"{folder.path}: holds something that isn't a demo; use another --output") from error
     if earlier.dataset.type != "generated":
-        raise OutputError(f"{output}: holds a run over other data; use another --output")
-    for name in RUN_FILES:
-        (output / name).unlink(missing_ok=True)
-    # A killed run leaves the file that it was writing.
-    for path in output.glob(".*.tmp.*"):
+        raise OutputError(f"{folder.path}: holds a run over other data; use another --output")
+    for path in folder.files():
+        path.unlink(missing_ok=True)
+    # Temporary files of a killed run.
+    for path in folder.path.glob(".*.tmp.*"):
         path.unlink()
-    shutil.rmtree(output / "previews", ignore_errors=True)
+    shutil.rmtree(folder.previews, ignore_errors=True)
 
 
-def _evaluate(output: Path) -> dict:
-    """Adds the mesh's figures, by the room's exact surface, to metrics and report."""
+def _evaluate(folder: RunFolder) -> dict:
+    """Adds figures of the map, compared with the room's exact surface, to metrics and report."""
     from spslam.datasets.generated import GeneratedDataset
     from spslam.datasets.registry import open_dataset
     from spslam.evaluation.finished_run import add_metrics, surface_figures, view_figures
     from spslam.evaluation.report import write_report
     from spslam.evaluation.run_output import RunOutput
 
-    dataset = open_dataset(load_config(output / "config.yaml").dataset)
-    finished = RunOutput.read(output)
+    dataset = open_dataset(load_config(folder.config).dataset)
+    finished = RunOutput.read(folder.path)
     if not isinstance(dataset, GeneratedDataset) or finished.mesh() is None:
         return finished.metrics
     figures = surface_figures(finished, dataset, dataset.room) | view_figures(finished, dataset)
     metrics = add_metrics(finished, figures)
-    write_report(output)
+    write_report(folder.path)
     return metrics

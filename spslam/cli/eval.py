@@ -10,6 +10,7 @@ from spslam.cli.arguments import add_run_folder, require_run_file
 from spslam.cli.progress import print_summary
 from spslam.config import load_config
 from spslam.errors import OutputError
+from spslam.run_folder import RunFolder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> None:
-    require_run_file(args.output, "trajectory.txt")
+    require_run_file(RunFolder(args.output).trajectory)
 
     from spslam.evaluation.finished_run import add_metrics, trajectory_figures
     from spslam.evaluation.report import write_report
@@ -46,6 +47,6 @@ def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> dict[str, float
     from spslam.evaluation.surface import TriangleSurface
 
     ground_truth = None if gt_mesh is None else TriangleSurface.load(gt_mesh)
-    dataset = open_dataset(load_config(require_run_file(run.folder, "config.yaml")).dataset)
+    dataset = open_dataset(load_config(require_run_file(run.folder.config)).dataset)
     figures = {} if ground_truth is None else surface_figures(run, dataset, ground_truth)
     return {**figures, **view_figures(run, dataset)} if views else figures

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from spslam.run_folder import RunFolder
+
 SECONDS_BETWEEN_LINES = 5.0
 
 
@@ -116,9 +118,10 @@ def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]
     ):
         if metrics.get(key) is not None:
             rows.append((name, form.format(metrics[key])))
-    for name in ("trajectory.txt", "mesh.ply", "report.html"):
-        if (output / name).is_file():
-            rows.append((name.partition(".")[0], str(output / name)))
+    folder = RunFolder(output)
+    for path in (folder.trajectory, folder.mesh, folder.report):
+        if path.is_file():
+            rows.append((path.stem, str(path)))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""``spslam run``: a sequence in, trajectory, map, mesh, metrics and report out."""
+"""``spslam run``: SLAM over a sequence; writes trajectory, map, mesh, metrics and report."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from spslam.cli.progress import make_progress, print_summary
 from spslam.config import Config, load_config, resolve_config_path
 from spslam.errors import DeviceError
 from spslam.run.reader_launch import end_standby, launch_standby
+from spslam.run.request import RunRequest
+from spslam.run_folder import RunFolder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,40 +36,53 @@ def execute(args: argparse.Namespace) -> None:
     if config.dataset.type == "generated" and args.data is not None:
         raise UsageError("--data has no meaning here: the configuration is of the generated room, which needs no data")
     output = args.output or default_output(args.config)
-    metrics = run(config, output, args.frames, args.resume, not args.no_mesh, args.quiet)
+    metrics = run(make_request(config, output, args.frames, args.resume, not args.no_mesh), args.quiet)
     if not args.quiet:
         print_summary(metrics, output)
 
 
-def run(
-    config: Config,
-    output: Path,
-    frames: slice | None,
-    resume: bool,
-    mesh: bool,
-    quiet: bool,
-    command: str = "the same command with",
-) -> dict[str, Any]:
-    """Run the sequence of a configuration; an interruption says how to go on: by ``command`` and ``--resume``."""
+def make_request(
+    config: Config, output: Path, frames: slice | None, resume: bool = False, mesh: bool = True
+) -> RunRequest:
+    """The request for a run over the data that the configuration names."""
+    data = None if config.dataset.path is None else Path(config.dataset.path)
+    return RunRequest(config, data, output, frames, resume, mesh)
+
+
+def run(request: RunRequest, quiet: bool, command: str = "the same command with") -> dict[str, Any]:
+    """Runs a request with a progress display.
+
+    Args:
+        request: what to run.
+        quiet: show no progress.
+        command: how to run it again; with `--resume` after it, it continues an interrupted run.
+
+    Returns:
+        What is written to metrics.json.
+
+    Raises:
+        SpslamError: as of `run_sequence`.
+        KeyboardInterrupt: after Ctrl-C; its message says how to resume.
+    """
     from spslam.datasets import open_sequence
 
-    data = None if config.dataset.path is None else Path(config.dataset.path)
-    # Wrong data is told before torch is loaded.
-    open_sequence(config.dataset, data, frames)
+    # Report unusable data before torch is loaded, which takes seconds.
+    open_sequence(request.config.dataset, request.data_dir, request.frames)
 
-    launch_standby(config)
+    launch_standby(request.config)
     from spslam.run.sequence import run_sequence
 
     progress = make_progress(quiet)
+    resume = f"{command} --output {request.output_dir} --resume goes on"
     try:
-        return run_sequence(config, data, output, frames, resume, mesh, progress)
+        return run_sequence(request, progress)
     except KeyboardInterrupt:
-        if _can_go_on(output):
-            raise KeyboardInterrupt(f"{command} --output {output} --resume goes on") from None
+        if _can_resume(request.output_dir):
+            raise KeyboardInterrupt(resume) from None
         raise
     except DeviceError as error:
-        if _can_go_on(output):
-            raise DeviceError(f"{error}; {command} --output {output} --resume goes on from its checkpoint") from error
+        if _can_resume(request.output_dir):
+            raise DeviceError(f"{error}; {resume} from its checkpoint") from error
         raise
     finally:
         end_standby()
@@ -75,8 +90,8 @@ def run(
             progress.close()
 
 
-def _can_go_on(output: Path) -> bool:
-    return (output / "checkpoint.safetensors").is_file()
+def _can_resume(output: Path) -> bool:
+    return RunFolder(output).checkpoint.is_file()
 
 
 def default_output(config: str) -> Path:

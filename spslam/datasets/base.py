@@ -124,16 +124,6 @@ class Subset(RgbdDataset):
         self.depth_range = dataset.depth_range
         self.border_px = dataset.border_px
 
-    @property
-    def source(self) -> RgbdDataset:
-        """The dataset this is a part of."""
-        return self._dataset
-
-    @property
-    def source_indices(self) -> range:
-        """The numbers that this subset's frames have in ``source``."""
-        return self._indices
-
     def __len__(self) -> int:
         return len(self._indices)
 

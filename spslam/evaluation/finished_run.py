@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,9 +103,9 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
     OutputError
         When the run has no mesh or no map, or none of its frames is in the dataset.
     """
-    mesh, map_file = _require_mesh(run), run.folder / "map.safetensors"
+    mesh, map_file = _require_mesh(run), run.folder.map
     if not map_file.is_file():
-        raise OutputError(f"{run.folder}: has no map.safetensors to draw")
+        raise OutputError(f"{run.folder.path}: has no {map_file.name} to draw")
     scene = Scene.load(map_file)
     likeness, coverage = [], []
     for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS, known_only=True), strict=True):
@@ -130,14 +129,14 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
 def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
     """Write metrics.json with further figures; returns all of them."""
     metrics = {**run.metrics, **figures}
-    atomic_write(Path(run.folder) / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+    atomic_write(run.folder.metrics, json.dumps(metrics, indent=1) + "\n")
     return metrics
 
 
 def _require_mesh(run: RunOutput) -> Mesh:
     mesh = run.mesh()
     if mesh is None:
-        raise OutputError(f"{run.folder}: has no mesh to evaluate; spslam mesh {run.folder} makes one")
+        raise OutputError(f"{run.folder.path}: has no mesh to evaluate; spslam mesh {run.folder.path} makes one")
     return mesh
 
 
@@ -154,7 +153,7 @@ def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int, known_only: boo
     indices = match_times(dataset.timestamps(), run.trajectory.timestamps)
     rows = np.flatnonzero((indices >= 0) & ~(run.trajectory.lost & known_only))
     if not len(rows):
-        raise OutputError(f"{run.folder}: must be a run over {dataset.name}, but has none of its frames")
+        raise OutputError(f"{run.folder.path}: must be a run over {dataset.name}, but has none of its frames")
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
     return rows, indices[rows]
 

@@ -52,7 +52,7 @@ def write_report(output_dir: str | os.PathLike) -> Path:
     sections += [_trajectory(run), _errors(run), _time(run), _tracking(run)]
     sections += [_paper_table(run.metrics), _figures(run.metrics), _settings(run)]
     page = _PAGE.format(title=html.escape(_title(run)), style=STYLE, body="\n".join(sections))
-    path = run.folder / "report.html"
+    path = run.folder.report
     atomic_write(path, page)
     return path
 
@@ -75,7 +75,7 @@ _PAGE = """<!doctype html>
 
 
 def _title(run: RunOutput) -> str:
-    return f"spslam: {run.folder.resolve().name}"
+    return f"spslam: {run.folder.path.resolve().name}"
 
 
 def _header(run: RunOutput) -> str:
@@ -83,7 +83,7 @@ def _header(run: RunOutput) -> str:
     facts = [known.get("device_name"), f"spslam {known['version']}" if "version" in known else None]
     facts.append(f"seed {known['seed']}" if "seed" in known else None)
     text = " · ".join(html.escape(str(fact)) for fact in facts if fact)
-    return f"<header><h1>{html.escape(run.folder.resolve().name)}</h1><p>{text}</p></header>"
+    return f"<header><h1>{html.escape(run.folder.path.resolve().name)}</h1><p>{text}</p></header>"
 
 
 def _tiles(metrics: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ import trimesh
 
 from spslam.camera import Camera
 from spslam.errors import OutputError
+from spslam.run_folder import RunFolder
 from spslam.trajectory import Trajectory
 
 # Files keep a microsecond.
@@ -43,7 +44,7 @@ class RunOutput:
 
     Attributes
     ----------
-    folder : where they are.
+    folder : their paths.
     trajectory : estimated, F frames.
     truth : float64 [F,4,4] true poses of the same frames, NaN where unknown; None if none is known.
     metrics : what metrics.json holds.
@@ -52,7 +53,7 @@ class RunOutput:
     camera : None where the run kept no previews.
     """
 
-    folder: Path
+    folder: RunFolder
     trajectory: Trajectory
     ground_truth: np.ndarray | None
     metrics: dict[str, Any]
@@ -61,7 +62,7 @@ class RunOutput:
     camera: Camera | None
 
     @classmethod
-    def read(cls, folder: Path) -> RunOutput:
+    def read(cls, path: Path) -> RunOutput:
         """Read a run's small files; trajectory.txt and metrics.json must be there.
 
         Raises
@@ -69,18 +70,19 @@ class RunOutput:
         OutputError
             When the folder is no finished run's, or a file in it is damaged.
         """
-        for name in ("trajectory.txt", "metrics.json"):
-            if not (folder / name).is_file():
-                raise OutputError(f"{folder}: must be the output folder of a finished run, but has no {name}")
-        trajectory = Trajectory.load_tum(folder / "trajectory.txt")
+        folder = RunFolder(path)
+        for required in (folder.trajectory, folder.metrics):
+            if not required.is_file():
+                raise OutputError(f"{path}: must be the output folder of a finished run, but has no {required.name}")
+        trajectory = Trajectory.load_tum(folder.trajectory)
         return cls(
             folder,
             trajectory,
-            _read_ground_truth(folder / "previews" / "ground_truth.txt", trajectory.timestamps),
-            _parse(folder / "metrics.json", _read_text(folder / "metrics.json")),
-            [_parse(folder / "log.jsonl", line) for line in _read_text(folder / "log.jsonl").splitlines()],
-            _read_text(folder / "config.yaml"),
-            _read_camera(folder / "previews" / "camera.json"),
+            _read_ground_truth(folder.preview_ground_truth, trajectory.timestamps),
+            _parse(folder.metrics, _read_text(folder.metrics)),
+            [_parse(folder.log, line) for line in _read_text(folder.log).splitlines()],
+            _read_text(folder.config),
+            _read_camera(folder.preview_camera),
         )
 
     @property
@@ -90,15 +92,15 @@ class RunOutput:
 
     def previews(self) -> list[Preview]:
         """The kept input frames, by row; ones that can't be read, or whose pose isn't known, are left out."""
-        found = (_read_preview(path) for path in sorted((self.folder / "previews").glob("frame-*.png")))
-        return [preview for preview in found if preview is not None and self._is_known(preview.row)]
+        found = (_read_preview(self.folder, row) for row in self.folder.preview_rows() if self._is_known(row))
+        return [preview for preview in found if preview is not None]
 
     def _is_known(self, row: int) -> bool:
         return row < len(self.trajectory) and not self.trajectory.lost[row]
 
     def mesh(self) -> Mesh | None:
         """mesh.ply; None where there is none or it is empty. Raises OutputError if it can't be read."""
-        path = self.folder / "mesh.ply"
+        path = self.folder.mesh
         if not path.is_file():
             return None
         try:
@@ -160,12 +162,11 @@ def _read_ground_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:
     return poses if np.isfinite(poses).any() else None
 
 
-def _read_preview(path: Path) -> Preview | None:
-    number = path.stem.removeprefix("frame-")
-    color = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if color is None or not number.isdecimal():
+def _read_preview(folder: RunFolder, row: int) -> Preview | None:
+    color = cv2.imread(str(folder.color_preview(row)), cv2.IMREAD_COLOR)
+    if color is None:
         return None
-    depth_path = path.with_name(f"depth-{number}.png")
+    depth_path = folder.depth_preview(row)
     depth = cv2.imread(str(depth_path), cv2.IMREAD_UNCHANGED) if depth_path.is_file() else None
     meters = None if depth is None else depth.astype(np.float32) / 1000
-    return Preview(int(number), cv2.cvtColor(color, cv2.COLOR_BGR2RGB), meters)
+    return Preview(row, cv2.cvtColor(color, cv2.COLOR_BGR2RGB), meters)

@@ -79,11 +79,6 @@ class TriangleSurface:
         """Vertices [V,3] and faces [L,3], those of no area left out."""
         return self._vertices, self._faces
 
-    @property
-    def area_m2(self) -> float:
-        """Sum of the triangles' areas."""
-        return float(self._areas.sum())
-
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
         """Points spread evenly by area, float64 [count,3]; [0,3] for a mesh without area.
 

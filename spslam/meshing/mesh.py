@@ -37,14 +37,6 @@ class TriangleMesh:
                 wanted = f"{np.dtype(dtype).name} {list(shape)}"
                 raise ValueError(f"TriangleMesh: {name} must be {wanted}, got {array.dtype} {list(array.shape)}")
 
-    def select_faces(self, keep: np.ndarray) -> TriangleMesh:
-        """The mesh of the faces where bool `keep` [L] holds, without the vertices that no face uses any more.
-
-        Normals are kept as they were, so that a cut does not bend the shading beside it.
-        """
-        faces, used = compact(self.faces[keep], len(self.vertices))
-        return TriangleMesh(self.vertices[used], faces, self.colors[used], self.normals[used])
-
 
 def compact(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
     """Renumbers faces over the vertices they use.

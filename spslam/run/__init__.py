@@ -1,5 +1,5 @@
-"""A run over a sequence: frames fed to the SLAM system, and what is left of it in an output folder.
+"""A run over a sequence: reading frames, the frame loop, checkpoints, and the results in an output folder.
 
-Import from the modules: this package itself stays free of torch, so that `reader_launch` can start a process before
-torch is loaded.
+Import from the modules, for example `from spslam.run.sequence import RunRequest, run_sequence`. This package does not
+import torch, so that `reader_launch` can start a process while torch is loaded.
 """

@@ -1,4 +1,4 @@
-"""Writing checkpoints beside the frame loop."""
+"""Asynchronous writing of checkpoints."""
 
 import os
 import threading
@@ -14,12 +14,12 @@ from spslam.slam.state import SlamState
 
 
 class CheckpointWriter:
-    """Writes one checkpoint at a time: on CUDA on a thread, from a snapshot on the device; on the CPU in place.
+    """Writes one checkpoint at a time: on CUDA on a thread, from a snapshot on the device; on the CPU in the loop.
 
-    There a thread would have to copy the whole state first, and share the kernels' cores.
+    On the CPU a thread would need a copy of the whole state, and would take cores from the kernels.
 
     Args:
-        path: the checkpoint's file.
+        path: file of the checkpoint.
         threaded: whether to write on a thread.
     """
 
@@ -34,16 +34,16 @@ class CheckpointWriter:
         return self._thread is not None and self._thread.is_alive()
 
     def write(self, state: SlamState, config: Config, source: dict[str, Any], log_descriptor: int) -> None:
-        """Writes the state as it is now, after the log, which so holds the frames of every checkpoint.
+        """Writes the current state. The log is flushed to disk before, so that it has the frames of every checkpoint.
 
         Args:
-            state: after a whole frame.
+            state: after a complete frame.
             config: of the run.
-            source: what `load_checkpoint` is to return.
-            log_descriptor: of the log, to which the frames' lines were written.
+            source: returned by `load_checkpoint`.
+            log_descriptor: file descriptor of the log, which has the lines of all processed frames.
 
         Raises:
-            OutputError: this or the last checkpoint can't be written; the one before is left as it was.
+            OutputError: this or the last checkpoint can't be written; the file of the one before is left unchanged.
         """
         self.wait()
         snapshot = take_snapshot(state, config, source, copy=self.threaded)
@@ -57,7 +57,7 @@ class CheckpointWriter:
         self._thread.start()
 
     def wait(self) -> None:
-        """Returns when nothing is being written any more; raises what went wrong since the last call."""
+        """Waits until the checkpoint is written; raises its error, if any."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -66,7 +66,7 @@ class CheckpointWriter:
             raise error
 
     def close(self) -> None:
-        """Returns when nothing is being written any more; an error of the last checkpoint is raised."""
+        """The same as `wait`, for `contextlib.closing`."""
         self.wait()
 
     def _keep_error(self, write: Callable[[], None]) -> None:
@@ -77,7 +77,7 @@ class CheckpointWriter:
 
 
 def _write(path: Path, snapshot: Snapshot, log_descriptor: int) -> None:
-    # The log must hold the frames of every checkpoint, also after a power cut.
+    # The log must have the frames of every checkpoint, also after a power failure.
     os.fsync(log_descriptor)
     write_snapshot(path, snapshot)
 
@@ -85,7 +85,7 @@ def _write(path: Path, snapshot: Snapshot, log_descriptor: int) -> None:
 def _on_own_stream(
     device: torch.device, taken: torch.cuda.Event | None, write: Callable[[], None]
 ) -> Callable[[], None]:
-    """`write`, done on a stream that waits for the snapshot and for nothing that came after it."""
+    """`write` on a new CUDA stream, which waits for the snapshot but not for later work of the loop."""
     if taken is None:
         return write
 

@@ -1,4 +1,4 @@
-"""The device of a run: choosing it, and what to say when it fails."""
+"""The device of a run: how it is selected, and clear errors when it fails."""
 
 import contextlib
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ def resolve_device(name: str) -> torch.device:
     """The torch device of `auto`, `cpu`, `cuda` or `cuda:N`.
 
     Raises:
-        DeviceError: the device is not there.
+        DeviceError: the device is not available.
     """
     if name == "auto":
         name = "cpu" if ops.CUDA_OFF_REASON else "cuda"
@@ -36,10 +36,10 @@ def resolve_device(name: str) -> torch.device:
 
 @contextlib.contextmanager
 def explained_failures(device: torch.device) -> Iterator[None]:
-    """Turns what torch raises when a device fails into one line that says what to change.
+    """Replaces torch's errors about a failing device by one line that says what to change.
 
     Raises:
-        DeviceError: memory is used up, or the GPU does not answer any more.
+        DeviceError: out of memory, or the GPU has failed.
     """
     try:
         yield
@@ -48,7 +48,7 @@ def explained_failures(device: torch.device) -> Iterator[None]:
     except RuntimeError as error:
         if _CPU_OUT_OF_MEMORY in str(error):
             raise _out_of_memory(torch.device("cpu")) from error
-        if any(mark in str(error) for mark in _CUDA_FAILED):
+        if any(text in str(error) for text in _CUDA_FAILED):
             raise _failed(device, error) from error
         raise
 
@@ -75,7 +75,7 @@ def _name(device: torch.device) -> str:
 
 
 def _in_use(device: torch.device) -> str:
-    """How much memory this process and all others hold; nothing where that can't be told."""
+    """GPU memory in use by this process and by all; empty where it is not known."""
     if device.type != "cuda":
         return ""
     try:

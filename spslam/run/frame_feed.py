@@ -1,4 +1,4 @@
-"""Frames read, decoded, sampled and brought to the device ahead of need, here or in a process of their own."""
+"""Asynchronous reading: frames are read, decoded, sampled and uploaded ahead of need, here or in another process."""
 
 import os
 import time
@@ -18,25 +18,32 @@ from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 from spslam.slam.upload import Uploader
 
-# More threads than this decode little faster: they wait for each other's turn at the interpreter, and slow the loop.
-MOST_WORKERS = 16
-LEAST_WORKERS = 2
-LEAST_AHEAD = 8
+# More threads hardly decode faster: they wait for Python's lock, and slow down the frame loop.
+MAX_WORKERS = 16
+MIN_WORKERS = 2
+MIN_AHEAD = 8
 
 
 class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
-    """The frames of a data set from a position on, in order; one that can't be read comes as its error.
+    """Iterates over the frames of a data set in order; a frame that can't be read comes as its `DatasetError`.
 
-    What the frames hold depends neither on the number of threads nor on where these are (`run.reader`): threads of
-    another process leave this one's interpreter to the loop; where the data set can't be pickled they are here. At most
-    `run.prefetch_ahead` frames exist at a time. Nothing is read before the first frame is asked for.
+    The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
+    another process do not compete with the frame loop for Python's lock. A data set that can't be pickled is read by
+    threads of this process. At most `run.prefetch_ahead` frames exist at the same time. Nothing is read before the
+    first frame is requested.
+
+    Args:
+        dataset: the frames.
+        config: how they are read and sampled.
+        device: receives the pixels.
+        start: position of the first frame.
     """
 
     def __init__(self, dataset: RgbdDataset, config: Config, device: torch.device, start: int = 0):
         self._record = event_recorder(device)
         run = config.run
         workers = automatic_workers(device) if run.prefetch_workers is None else run.prefetch_workers
-        ahead = max(2 * workers, LEAST_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
+        ahead = max(2 * workers, MIN_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
         uploader = Uploader(device) if device.type == "cuda" else None
         self._threads = prefetch(FramePreparation(dataset, config, start, uploader), workers, ahead)
         self._process = (
@@ -47,7 +54,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         self._reader: Prefetcher[PreparedFrame] | ReaderProcess | None = None
 
     def prepare(self) -> Iterator[PreparedFrame | DatasetError]:
-        """Waits until frames can be asked for; reads none. Returns what gives them."""
+        """Waits until frames can be requested; reads none. Returns the iterator over the frames."""
         if self._reader is None:
             if self._process is not None and self._process.is_ready():
                 self._reader = self._process
@@ -57,7 +64,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
     @property
     def decode_seconds(self) -> float:
-        """Time spent on preparing the frames handed out, summed over the threads."""
+        """Time spent on preparing the frames returned so far, summed over the reading threads."""
         return self._reader.read_seconds if self._reader else 0.0
 
     def __next__(self) -> PreparedFrame | DatasetError:
@@ -77,7 +84,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
 
 def automatic_workers(device: torch.device) -> int:
-    """Reading threads for a run on `device`: a GPU is fed by half the cores, CPU kernels get by with fewer."""
+    """Number of reading threads for a run on `device`: half the cores for a GPU, a quarter beside CPU kernels."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = cores // 2 if device.type == "cuda" else cores // 4
-    return min(max(wanted, LEAST_WORKERS), MOST_WORKERS)
+    return min(max(wanted, MIN_WORKERS), MAX_WORKERS)

@@ -1,4 +1,4 @@
-"""Ctrl-C at a moment that suits."""
+"""Ctrl-C deferred to the end of the current frame."""
 
 import signal
 import threading
@@ -6,22 +6,22 @@ from types import FrameType, TracebackType
 
 
 class Interruption:
-    """Notes the first Ctrl-C instead of raising it, so that a loop can end between two frames; a second one raises.
+    """Records the first Ctrl-C instead of raising it, so that a loop can end between two frames; a second one raises.
 
-    Outside the main thread, or where the program has a handler of its own, nothing is changed.
+    Outside the main thread, and where the program has installed its own SIGINT handler, nothing is changed.
 
     Attributes:
-        noted: whether there was one.
+        requested: whether Ctrl-C was pressed.
     """
 
     def __init__(self) -> None:
-        self.noted = False
+        self.requested = False
         self._installed = False
 
     def __enter__(self) -> "Interruption":
         in_main_thread = threading.current_thread() is threading.main_thread()
         if in_main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self._note)
+            signal.signal(signal.SIGINT, self._record)
             self._installed = True
         return self
 
@@ -31,7 +31,7 @@ class Interruption:
         if self._installed:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.noted:
+    def _record(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
             raise KeyboardInterrupt
-        self.noted = True
+        self.requested = True

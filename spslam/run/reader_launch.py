@@ -1,4 +1,7 @@
-"""Starting the process that reads frames; without torch, so that it can load torch while this process does the same."""
+"""Starts the process that reads frames. Does not import torch: the new process loads it while this one does the same.
+
+See `reader_process` for the protocol and `reader_service` for what the process runs.
+"""
 
 import os
 import subprocess
@@ -10,11 +13,13 @@ from pathlib import Path
 
 from spslam.config import Config
 
-# NVIDIA's driver, and the one of Windows under Linux.
+# What the process runs. By name, as importing the module here would load torch; a test checks that it exists.
+SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.reader_service", "serve"
+# Device files of NVIDIA's driver: under Linux, and under Linux inside Windows (WSL).
 _GPU_DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/dxg"))
 _ENVIRONMENT = {
     "CUDA_VISIBLE_DEVICES": "",
-    # glibc keeps the memory of images that were let go; each frame's would come page by page else.
+    # glibc keeps the memory of freed images; otherwise each image would page-fault its memory anew.
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
 }
@@ -25,9 +30,9 @@ class LaunchedReader:
     """A process that waits for its work.
 
     Attributes:
-        process: it.
-        connection: to it.
-        shared: file descriptor of memory, empty as yet, that it has too.
+        process: the process.
+        connection: socket to the process.
+        shared: file descriptor of shared memory, empty as yet, that both processes have open.
     """
 
     process: subprocess.Popen
@@ -36,18 +41,22 @@ class LaunchedReader:
 
 
 def launch() -> LaunchedReader:
-    """Starts a process that reads; it ends when its connection does. Raises OSError or TypeError where none can be."""
+    """Starts a reader process; it ends when its connection is closed.
+
+    Raises:
+        OSError, TypeError: the process can't be started.
+    """
     shared = os.memfd_create("spslam-frames")
     own, other = Pipe()
-    code = f"from spslam.run.reader_service import serve; serve({other.fileno()}, {shared})"
+    code = f"from {SERVICE_MODULE} import {SERVICE_FUNCTION}; {SERVICE_FUNCTION}({other.fileno()}, {shared})"
     try:
         process = subprocess.Popen(
             [sys.executable, "-c", code],
             stdin=subprocess.DEVNULL,
             pass_fds=(other.fileno(), shared),
-            # What is importable here must be there.
+            # What can be imported here can be imported there.
             env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            # Ctrl-C is for the loop, which ends it.
+            # Ctrl-C reaches the frame loop only, which then ends the process.
             start_new_session=True,
         )
     except BaseException:
@@ -63,7 +72,7 @@ _standby: list[LaunchedReader] = []
 
 
 def launch_standby(config: Config) -> None:
-    """Starts the process for the run to come, if it is likely to want one: early, as it takes seconds to load torch."""
+    """Starts a standby reader if the run will probably use one: early, as loading torch takes seconds."""
     run_wants_it = config.run.reader == "process" or (
         config.run.reader == "auto" and config.device != "cpu" and any(driver.exists() for driver in _GPU_DRIVERS)
     )
@@ -75,20 +84,20 @@ def launch_standby(config: Config) -> None:
 
 
 def has_standby() -> bool:
-    """Whether `take_standby` would give one."""
+    """Whether there is a standby reader."""
     return bool(_standby)
 
 
 def take_standby() -> LaunchedReader | None:
-    """The process that `launch_standby` started, once."""
+    """The standby reader, which is then no longer on standby; None where there is none."""
     return _standby.pop() if _standby else None
 
 
 def end_standby() -> None:
-    """Ends what nobody took."""
-    spare = take_standby()
-    if spare is not None:
-        spare.connection.close()
-        os.close(spare.shared)
-        spare.process.kill()
-        spare.process.wait()
+    """Ends the standby reader if no run took it."""
+    standby = take_standby()
+    if standby is not None:
+        standby.connection.close()
+        os.close(standby.shared)
+        standby.process.kill()
+        standby.process.wait()

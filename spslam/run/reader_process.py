@@ -1,8 +1,8 @@
-"""Frames prepared by the threads of another process, so that they and the loop need no turns at one interpreter.
+"""Frames prepared by the threads of another process, so that they don't compete with the frame loop for Python's lock.
 
-Both processes map the same memory, divided into slots of one frame's pixels. The loop's end of a socket sends the work,
-then the numbers of slots that are free again; the reader's end sends a message a frame. Either end notices by the
-socket when the other is gone, however it went, and the memory goes with the last of them.
+Both processes map the same memory, divided into slots that hold one frame's pixels each. Over a socket the loop sends
+the work and then the numbers of slots that are free again; the reader sends one message per frame. Either side detects
+by the closed socket that the other has ended, for whatever reason; the system frees the memory with the last of them.
 """
 
 import contextlib
@@ -21,13 +21,13 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, SpslamError
 from spslam.run.reader_launch import launch, take_standby
-from spslam.run.reader_service import GONE, Message, Work, mapped
+from spslam.run.reader_service import DISCONNECTED, Message, Work, mapped
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload, Uploader
 
 _WORD_BYTES = 4
-_LAST_WORDS_S = 5.0
+_EXIT_TIMEOUT_S = 5.0
 
 
 class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
@@ -45,20 +45,20 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         blank: FramePixels,
         uploader: Uploader | None,
     ):
-        """See `start`.
+        """Use `start`.
 
         Args:
-            process: that reads.
-            connection: to it.
-            memory: int32 [slots, words], mapped by both.
-            blank: a frame's pixels without content.
-            uploader: takes the pixels to a device; they are copied out of the slot where None.
+            process: the reading process.
+            connection: socket to the process.
+            memory: int32 [slots, words], shared memory.
+            blank: pixels of a frame without content, for the shapes.
+            uploader: copies the pixels to a device; if None, they are copied out of the slot on the host.
         """
         self.read_seconds = 0.0
         self._process, self._connection = process, connection
         self._memory, self._blank, self._uploader = memory, blank, uploader
         self._in_use: deque[tuple[int, Upload]] = deque()
-        self._begun = self._is_locked = False
+        self._has_started = self._is_locked = False
 
     @classmethod
     def start(
@@ -70,18 +70,18 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         ahead: int,
         uploader: Uploader | None,
     ) -> "ReaderProcess | None":
-        """Starts the process; it reads nothing before the first frame is asked for.
+        """Starts the process, or takes the standby reader. It reads nothing before the first frame is requested.
 
         Args:
             dataset: the frames.
             config: how they are sampled.
             start: position of the first frame.
-            workers: threads.
-            ahead: most frames that exist at a time.
-            uploader: see the class.
+            workers: number of reading threads.
+            ahead: maximum number of frames that exist at the same time.
+            uploader: copies the pixels to a device; None for the CPU.
 
         Returns:
-            None where it can't be done: the data set can't be pickled, or no process started.
+            None if the data set can't be pickled or the process can't be started.
         """
         slots = max(ahead // 2, 1)
         blank = blank_pixels(dataset.camera, config)
@@ -95,15 +95,19 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         os.ftruncate(reader.shared, max(slots * words * _WORD_BYTES, 1))
         memory = mapped(reader.shared, slots, words)
         os.close(reader.shared)
-        with contextlib.suppress(*GONE):
+        with contextlib.suppress(*DISCONNECTED):
             reader.connection.send_bytes(content)
         return cls(reader.process, reader.connection, memory, blank, uploader)
 
     def is_ready(self) -> bool:
-        """Waits until it can read. False where the data set means nothing to another process, which has then ended."""
+        """Waits until the process can read.
+
+        Returns:
+            False where the data set's class can't be imported by another process, which has then ended.
+        """
         try:
             ready = self._connection.recv()
-        except GONE:
+        except DISCONNECTED:
             ready = False
         if not ready:
             self.close()
@@ -114,17 +118,17 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
     def __next__(self) -> PreparedFrame | DatasetError:
         try:
             return self._receive()
-        except GONE:
+        except DISCONNECTED:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_LAST_WORDS_S)
+                self._process.wait(_EXIT_TIMEOUT_S)
             self.close()
-            raise SpslamError(_epitaph(self._process.returncode)) from None
+            raise SpslamError(_describe_exit(self._process.returncode)) from None
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Ends the process, which has nothing to save. May be called again."""
+        """Kills the process, which has nothing to save. May be called again."""
         if self._connection.closed:
             return
         self._connection.close()
@@ -138,9 +142,9 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
     def _receive(self) -> PreparedFrame | DatasetError:
         if self._connection.closed:
             raise StopIteration
-        if not self._begun:
+        if not self._has_started:
             self._connection.send(None)
-            self._begun = True
+            self._has_started = True
         self._return_slots()
         message: Message = self._connection.recv()
         if message.failure is not None:
@@ -150,22 +154,22 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             return message.error
         if message.slot is None:
             raise StopIteration
-        pixels = self._taken(message.slot, message.valid_depth_share)
+        pixels = self._take(message.slot, message.valid_depth_share)
         return PreparedFrame(message.index, message.timestamp, pixels, message.decode_ms)
 
-    def _taken(self, slot: int, valid_depth_share: float) -> FramePixels | Upload:
-        """The pixels out of a slot, or on their way out of it."""
+    def _take(self, slot: int, valid_depth_share: float) -> FramePixels | Upload:
+        """A copy of the pixels in a slot, or their upload."""
         pixels = replace(self._blank, buffer=self._memory[slot], valid_depth_share=valid_depth_share)
         if self._uploader is None:
-            taken = pixels.holding(pixels.buffer.clone())
+            copy = pixels.holding(pixels.buffer.clone())
             self._connection.send(slot)
-            return taken
+            return copy
         upload = self._uploader.send(pixels)
         self._in_use.append((slot, upload))
         return upload
 
     def _return_slots(self) -> None:
-        """Gives back what was copied; waits where the reader would have no slot otherwise."""
+        """Frees the slots whose upload is complete; waits for one where the reader has no slot left."""
         while self._in_use:
             slot, upload = self._in_use[0]
             if not upload.end.is_complete():
@@ -176,7 +180,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             self._connection.send(slot)
 
 
-def _epitaph(code: int | None) -> str:
+def _describe_exit(code: int | None) -> str:
     how = f"by {signal.Signals(-code).name}" if code is not None and code < 0 else f"with code {code}"
     return (
         f"the process that reads frames ended {how}; where memory was short, lower run.prefetch_ahead; "

@@ -1,4 +1,4 @@
-"""What the process does that reads frames for a `ReaderProcess`."""
+"""What the process that reads frames runs, for a `ReaderProcess`."""
 
 import contextlib
 import mmap
@@ -21,13 +21,23 @@ from spslam.errors import DatasetError
 from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import FramePreparation
 
-# How either side learns that the other is gone.
-GONE = (EOFError, ConnectionError)
+# Raised by a connection whose other end is closed.
+DISCONNECTED = (EOFError, ConnectionError)
 
 
 @dataclass(frozen=True)
 class Work:
-    """What the reader is to do; `workers` threads, `ahead` frames beyond those that lie in the slots."""
+    """What the process is to read.
+
+    Attributes:
+        dataset: the frames.
+        config: how they are sampled.
+        start: position of the first frame.
+        workers: number of reading threads.
+        ahead: number of frames kept ready beyond those in the slots.
+        slots: number of slots in the shared memory.
+        words: size of a slot in 32-bit words.
+    """
 
     dataset: RgbdDataset
     config: Config
@@ -40,15 +50,15 @@ class Work:
 
 @dataclass(frozen=True)
 class Message:
-    """What the reader tells: of a frame, of one that can't be read, that there are no more, or that it must stop.
+    """From the process: a frame, a frame that can't be read, a failure, or the end of the data set (all defaults).
 
     Attributes:
-        read_ms: time that a thread spent on it.
-        slot: where the frame's pixels are; None where there is no frame.
+        read_ms: time that a reading thread spent on the frame.
+        slot: slot that holds the frame's pixels; None where there is no frame.
         index, timestamp, decode_ms: as in `PreparedFrame`.
         valid_depth_share: as in `FramePixels`.
-        error: in place of a frame.
-        failure: traceback of an exception that is no fault of the data.
+        error: of a frame that can't be read.
+        failure: traceback of an exception that is not the data's fault; the process then ends.
     """
 
     read_ms: float = 0.0
@@ -62,38 +72,47 @@ class Message:
 
 
 def mapped(shared: int, slots: int, words: int) -> torch.Tensor:
-    """int32 [slots, words] in the memory of a file descriptor."""
+    """Maps the shared memory.
+
+    Args:
+        shared: its file descriptor.
+        slots: number of slots.
+        words: size of a slot in 32-bit words.
+
+    Returns:
+        int32 [slots, words].
+    """
     content = np.frombuffer(mmap.mmap(shared, 0), np.int32, slots * words)
     return torch.from_numpy(content).view(slots, words)
 
 
 def serve(socket: int, shared: int) -> None:
-    """The reader's side, in its own process: takes the work, and tells of each frame.
+    """Main function of the process: receives the work, then sends a message per frame.
 
     Args:
-        socket: file descriptor of the connection to the loop.
-        shared: of the memory.
+        socket: file descriptor of the connection to the frame loop.
+        shared: file descriptor of the shared memory.
     """
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     ops.set_num_threads(1)
-    with contextlib.suppress(*GONE), Connection(socket) as connection:
+    with contextlib.suppress(*DISCONNECTED), Connection(socket) as connection:
         try:
             work: Work = pickle.loads(connection.recv_bytes())
-        except (AttributeError, ImportError):  # a data set of a class that isn't known here
+        except (AttributeError, ImportError):  # the data set's class can't be imported here
             connection.send(False)
             return
         connection.send(True)
         connection.recv()
         try:
-            _tell_frames(work, mapped(shared, work.slots, work.words), connection)
-        except GONE:
+            _send_frames(work, mapped(shared, work.slots, work.words), connection)
+        except DISCONNECTED:
             raise
         except Exception:
             connection.send(Message(failure=traceback.format_exc()))
 
 
-def _tell_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
+def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
     preparation = FramePreparation(work.dataset, work.config, work.start)
     free, before = deque(range(work.slots)), 0.0
     with prefetch(preparation, work.workers, work.ahead) as frames:
@@ -104,10 +123,11 @@ def _tell_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
                 continue
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
-            told = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
-            connection.send(Message(read_ms, slot, *told))
+            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
+            connection.send(Message(read_ms, slot, *described))
     connection.send(Message())
-    with contextlib.suppress(*GONE):
+    # Stay until the loop closes the connection: it still returns slots.
+    with contextlib.suppress(*DISCONNECTED):
         while True:
             connection.recv()
 

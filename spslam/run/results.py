@@ -2,38 +2,29 @@
 
 import json
 import resource
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from spslam import __version__
-from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError
 from spslam.evaluation.trajectory import ate, rpe
 from spslam.io import atomic_write
-from spslam.run.output_folder import RunFiles
+from spslam.run.clock import RunClock
+from spslam.run.provenance import provenance
+from spslam.run.request import RunRequest
+from spslam.run.session import RunSession
 from spslam.slam.system import SlamSystem
 
 
-def write_results(
-    system: SlamSystem,
-    dataset: RgbdDataset,
-    config: Config,
-    files: RunFiles,
-    clock: dict[str, Any],
-    mesh: bool,
-) -> dict[str, Any]:
-    """Writes everything; the checkpoint goes last, as from then on there is nothing to resume.
+def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest, session: RunSession) -> dict[str, Any]:
+    """Writes all results and then removes the checkpoint, as there is nothing left to resume.
 
     Args:
         system: after the last frame.
-        dataset: what the run was over.
-        config: of the run.
-        files: of its output folder.
-        clock: `start_s` before the loop, `wall_s` of it, `decode_s` of reading, and the `frames` that they are for.
-        mesh: whether to extract the mesh.
+        dataset: of the run.
+        request: of the run; says whether a mesh is wanted.
+        session: with the output folder and the clock of the whole run.
 
     Returns:
         What is written to metrics.json.
@@ -41,13 +32,14 @@ def write_results(
     Raises:
         SpslamError: there is no frame, or a file can't be written.
     """
-    frames, skipped = system.state.frames, files.read_skipped()
+    config, folder, clock = request.config, session.folder, session.clock
+    frames, skipped = system.state.frames, folder.read_skipped()
     if len(frames) == 0:
         raise DatasetError(f"{dataset.name}: no frame could be read; the first: {skipped[0]['error']}")
-    trajectory, ground_truth, log = system.trajectory(), dataset.poses(), files.read_log()
+    trajectory, ground_truth, log = system.trajectory(), dataset.poses(), folder.read_log()
     lost = trajectory.lost
-    trajectory.save_tum(files.trajectory)
-    system.state.scene.save(files.map)
+    trajectory.save_tum(folder.trajectory)
+    system.state.scene.save(folder.map)
     metrics = {
         **provenance(config, system.device),
         "frames": len(frames),
@@ -57,56 +49,37 @@ def write_results(
         "tracking_failures": int((lost[1:] & ~lost[:-1]).sum()) + int(lost[0]),
         "recovered_frames": sum(line["recovered"] for line in log),
         "relocalized_frames": sum(line["relocalized"] for line in log),
-        **_most_doubt(log),
+        **_max_error_probability(log),
         "skipped_frames": len(skipped),
         **_sizes(system),
     }
     if ground_truth is not None:
         known = trajectory.ground_truth_of_known(ground_truth[frames.indices.numpy()])
         metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
-    if mesh:
+    if request.mesh:
         tracked = trajectory.poses[~lost]
-        metrics["mesh_s"] = files.write_mesh(system.state.scene, config.mesh.resolution_m, system.camera, tracked)
-    atomic_write(files.metrics, json.dumps(metrics, indent=1) + "\n")
-    files.write_report(dataset, frames.indices.tolist(), ground_truth, config.run.previews)
-    files.checkpoint.unlink(missing_ok=True)
+        metrics["mesh_s"] = folder.write_mesh(system.state.scene, config.mesh.resolution_m, system.camera, tracked)
+    atomic_write(folder.metrics, json.dumps(metrics, indent=1) + "\n")
+    folder.write_previews(dataset, frames.indices.tolist(), ground_truth, config.run.previews)
+    folder.write_report()
+    folder.checkpoint.unlink(missing_ok=True)
     return metrics
 
 
-def provenance(config: Config, device: torch.device) -> dict[str, Any]:
-    """What a run's files say of where they come from."""
-    return {
-        "version": __version__,
-        "torch": torch.__version__,
-        "seed": config.seed,
-        "device": str(device),
-        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
-    }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return "cpu"
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "cpu")
-
-
-def _most_doubt(log: list[dict[str, Any]]) -> dict[str, float]:
-    """The highest doubt about a pose that was taken."""
+def _max_error_probability(log: list[dict[str, Any]]) -> dict[str, float]:
+    """The highest error probability of the accepted poses; empty where none was judged."""
     error_probabilities = [
         line["error_probability"] for line in log if not line["lost"] and line["error_probability"] is not None
     ]
     return {"max_error_probability": max(error_probabilities)} if error_probabilities else {}
 
 
-def _speed(clock: dict[str, Any]) -> dict[str, float]:
-    frames, wall_s = clock["frames"], clock["wall_s"]
+def _speed(clock: RunClock) -> dict[str, float]:
     return {
-        "start_s": clock["start_s"],
-        "wall_s": wall_s,
-        "fps": frames / wall_s if wall_s else 0.0,
-        "decode_ms": 1e3 * clock["decode_s"] / max(frames, 1),
+        "start_s": clock.start_s,
+        "wall_s": clock.wall_s,
+        "fps": clock.frames / clock.wall_s if clock.wall_s else 0.0,
+        "decode_ms": 1e3 * clock.decode_s / max(clock.frames, 1),
     }
 
 
@@ -122,12 +95,12 @@ def _sizes(system: SlamSystem) -> dict[str, float]:
     return sizes
 
 
-def _timings(log: list[dict[str, Any]], clock: dict[str, Any]) -> dict[str, float]:
-    """The timing figures of metrics.json, from the log: where a frame's time goes, and iterations by themselves."""
+def _timings(log: list[dict[str, Any]], clock: RunClock) -> dict[str, float]:
+    """Timings of metrics.json from the log: the stages' share of the loop, and time per iteration."""
     tracked = [line for line in log if line["tracking_iterations"]]
     mapped = [line for line in log if line["mapping_iterations"]]
     later = mapped[1:]
-    figures = _shares(log, clock)
+    figures = _stage_times(log, clock)
     if tracked:
         seconds = sum(line["tracking_ms"] for line in tracked) / 1e3
         iterations = sum(line["tracking_iterations"] for line in tracked)
@@ -143,12 +116,12 @@ def _timings(log: list[dict[str, Any]], clock: dict[str, Any]) -> dict[str, floa
     return figures
 
 
-def _shares(log: list[dict[str, Any]], clock: dict[str, Any]) -> dict[str, float]:
-    """Milliseconds a frame, on average; waiting, the stages and the rest add up to the loop's time."""
-    frames = max(clock["frames"], 1)
+def _stage_times(log: list[dict[str, Any]], clock: RunClock) -> dict[str, float]:
+    """Mean ms/frame of each stage. Waiting, the stages and `other_ms` add up to the loop's time; uploads overlap."""
+    frames = max(clock.frames, 1)
     figures = {
         name: sum(line[name] for line in log) / frames
         for name in ("upload_ms", "wait_ms", "tracking_ms", "encode_ms", "mapping_ms")
     }
     spent_ms = sum(figures.values()) - figures["upload_ms"]
-    return {**figures, "other_ms": max(1e3 * clock["wall_s"] / frames - spent_ms, 0.0)}
+    return {**figures, "other_ms": max(1e3 * clock.wall_s / frames - spent_ms, 0.0)}

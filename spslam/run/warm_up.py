@@ -1,4 +1,4 @@
-"""A rehearsal before the first frame: a GPU loads a kernel at its first use, which takes longer than its work."""
+"""Warm-up before the first frame: loading a CUDA kernel at its first use takes longer than running it."""
 
 import numpy as np
 import torch
@@ -20,22 +20,22 @@ WAVES = 6  # across the image
 
 
 def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameReport]:
-    """Takes a few views of a made-up wall through a system that is then let go.
+    """Processes a few synthetic frames of a wall with a system that is then discarded.
 
     Args:
-        config: of the run. Its sizes and options are used, with few iterations.
-        camera: of the run's frames.
-        device: where it will run.
+        config: of the run; used with few iterations.
+        camera: intrinsics of the run's frames.
+        device: of the run.
 
     Returns:
-        The reports of those frames. Nothing else remains but loaded kernels and reserved memory.
+        The reports of those frames. Loaded kernels and reserved memory are all that remains; results don't change.
     """
-    rehearsal = _shortened(config)
-    system = SlamSystem(rehearsal, camera, device=device)
+    shortened = _shortened(config)
+    system = SlamSystem(shortened, camera, device=device)
     uploader = Uploader(device) if device.type == "cuda" else None
     reports = []
     for index in range(FRAMES):
-        pixels = sample_frame(_view_of_wall(camera, config, index), camera, rehearsal)
+        pixels = sample_frame(_wall_frame(camera, config, index), camera, shortened)
         sent = uploader.send(pixels) if uploader else pixels
         reports.append(system.submit(PreparedFrame(index, float(index), sent)).result())
     system.finish()
@@ -44,15 +44,15 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
 
 
 def _shortened(config: Config) -> Config:
-    """The same with few iterations, mapping after each frame, and more frames than a mapping call takes."""
+    """The configuration with few iterations, mapping after each frame, and fewer frames per mapping call than exist."""
     mapping = config.mapping.model_copy(
         update={"every": 1, "iterations": 2, "first_iterations": 4, "frames": 2, "recent": 1, "covisible": 1}
     )
     return config.model_copy(update={"mapping": mapping})
 
 
-def _view_of_wall(camera: Camera, config: Config, index: int) -> RgbdFrame:
-    """A wall with some relief, within the range that counts as measured."""
+def _wall_frame(camera: Camera, config: Config, index: int) -> RgbdFrame:
+    """A frame of a wall with some relief, within the valid depth range."""
     dataset = config.dataset
     depth_m = float(np.clip(DEPTH_M, 1.1 * dataset.min_depth_m, 0.9 * dataset.max_depth_m))
     v, u = np.mgrid[: camera.height, : camera.width] * (2 * np.pi * WAVES / camera.width)

@@ -1,10 +1,10 @@
-"""Small suites and made-up outcomes for the tests of the benchmark."""
+"""Small suites and synthetic outcomes for the tests of the benchmark."""
 
 from __future__ import annotations
 
 from spslam.benchmark.jobs import Job, Plan
 from spslam.benchmark.pool import Outcome
-from spslam.benchmark.suites import GICP, SPSLAM, Sequence, Study, Suite, Variant
+from spslam.benchmark.suites import SPSLAM, Sequence, Study, Suite, Variant
 from spslam.benchmark.summary import Summary, summarize
 
 ENVIRONMENT = {
@@ -38,7 +38,7 @@ def tiny_job(method: str = SPSLAM, seed: int = 0, **changes) -> Job:
 
 
 def study(**changes) -> Study:
-    """Two iterations of two series over two sequences, with a plot."""
+    """Two series with two numbers of iterations over two sequences, with a plot."""
     variants = tuple(
         Variant(f"{series} {x}", options=(("mapping.iterations", x),), series=series, x=float(x))
         for series in ("with", "without")
@@ -48,7 +48,7 @@ def study(**changes) -> Study:
         "name": "prior",
         "title": "With & without",
         "note": "A note.",
-        "sequences": tuple(Sequence(name, name, "demo") for name in ("room", "hall")),
+        "sequences": tuple(Sequence(name, "demo") for name in ("room", "hall")),
         "variants": variants,
         "columns": ("ate_rmse_cm", "f1_1cm"),
         "x_label": "iterations",
@@ -59,7 +59,7 @@ def study(**changes) -> Study:
 
 
 def made_up_summary(suite: Suite, figures, seeds: int = 1) -> Summary:
-    """Results as ``figures(sequence, variant name, seed)`` gives them, None for a failed run."""
+    """Results by `figures(sequence, variant name, seed)`, which returns None for a failed run."""
     cells, outcomes = {}, {}
     for part in suite.studies:
         for sequence in part.sequences:
@@ -76,6 +76,3 @@ def made_up_summary(suite: Suite, figures, seeds: int = 1) -> Summary:
 def ablation(**changes) -> Suite:
     """A suite of one study."""
     return Suite("ablation", "Parts & pieces", 1, (study(**changes),))
-
-
-__all__ = ["ENVIRONMENT", "GICP", "SPSLAM", "ablation", "made_up_summary", "study", "tiny_job"]

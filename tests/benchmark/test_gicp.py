@@ -25,7 +25,7 @@ def run(dataset, depths):
     return odometry
 
 
-def test_the_path_is_found():
+def test_trajectory_is_accurate():
     dataset = Recorded(FRAMES)
     odometry = run(dataset, (frame.depth for frame in dataset))
     poses = np.array(odometry.poses)
@@ -37,20 +37,20 @@ def test_the_path_is_found():
                                atol=1e-12)  # fmt: skip
 
 
-def test_one_thread_gives_the_same_path_twice():
+def test_one_thread_is_deterministic():
     dataset = Recorded(5)
     first, second = (run(dataset, (frame.depth for frame in dataset)) for _ in range(2))
     np.testing.assert_array_equal(first.poses, second.poses)
 
 
-def test_a_frame_without_depth_is_lost_and_bridged_by_constant_speed():
+def test_frame_without_depth_is_lost_and_predicted():
     dataset = Recorded(6)
     odometry = run(dataset, (0 * frame.depth if frame.index == 3 else frame.depth for frame in dataset))
     assert odometry.lost == [False, False, False, True, False, False]
     assert ate(np.array(odometry.poses), dataset.poses())["ate_rmse_cm"] < 1.0
 
 
-def test_a_missing_package_is_named(monkeypatch):
+def test_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(SpslamError, match=r"needs small_gicp: pip install 'spslam\[bench\]'"):
         GicpOdometry(Recorded(1).camera, np.eye(4))

@@ -1,4 +1,4 @@
-"""Runs in processes: records, resumption, failure, kill."""
+"""Runs in processes: records, resuming, failure, kill."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def test_runs_leave_records_once(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / RECORDS).iterdir()} == before
 
 
-def test_a_failing_run_is_told_and_tried_again(tmp_path):
+def test_failed_run_is_reported_and_tried_again(tmp_path):
     job = tiny_job(config="7scenes", options=(), data=str(tmp_path / "nothing"), sequence="kitchen")
     outcome = run_jobs(by_key(job), tmp_path / "out", PoolOptions())[job.key()]
     assert outcome.record is None
@@ -52,7 +52,7 @@ def test_a_failing_run_is_told_and_tried_again(tmp_path):
     assert not list((tmp_path / "out" / RECORDS).glob("*.json"))
 
 
-def test_a_damaged_record_is_run_again(tmp_path):
+def test_damaged_record_is_run_again(tmp_path):
     job = tiny_job(GICP)
     record_path(tmp_path, job.key()).parent.mkdir()
     record_path(tmp_path, job.key()).write_text('{"figures"')
@@ -83,7 +83,7 @@ def test_kill_leaves_nothing_half_written(tmp_path):
     process.wait()
     size = settled_size(log)
     time.sleep(0.5)
-    assert log.stat().st_size == size, "the run goes on though nobody waits for it"
+    assert log.stat().st_size == size, "the run continues after its parent was killed"
     assert not list((output / RECORDS).iterdir())
 
     assert run_jobs(by_key(job), output, PoolOptions())[job.key()].record
@@ -128,6 +128,8 @@ def test_the_command_prints_tables_and_writes_them(tmp_path):
         (("quick", "--data", "nowhere"), "--data must be a folder that holds the data sets, got nowhere"),
         (("quick", "--frames", "9"), "--frames must be START:STOP"),
         (("quick", "--sequences", "x"), "sequence must be one of room"),
+        (("quick", "--folders", "x.yaml"), "--folders needs --data"),
+        (("quick", "--data", ".", "--folders", "x.yaml"), "x.yaml: can't be read: No such file"),
     ],
 )
 def test_wrong_arguments_give_one_line(tmp_path, arguments, message):
@@ -143,14 +145,14 @@ def test_suites_and_runs_are_listed(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_to_run_is_said(tmp_path):
+def test_nothing_to_run_is_reported(tmp_path):
     done = spslam("bench", "tum", cwd=tmp_path)
     assert done.returncode == 2
     assert "skipped fr1/desk: no --data given" in done.stderr
     assert "nothing of tum could be run" in done.stderr
 
 
-def test_an_output_that_is_a_file_is_refused(tmp_path):
+def test_output_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file: can't be used for results"):
         run_jobs({}, tmp_path / "file", PoolOptions())

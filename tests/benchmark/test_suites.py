@@ -1,16 +1,18 @@
-"""The shipped suites, and what the paper prints about them."""
+"""The shipped suites and the paper's figures for them."""
 
 import sys
 
 import pytest
 
 from spslam.benchmark.figures import FIGURES
+from spslam.benchmark.folders import read_folders, with_folders
 from spslam.benchmark.jobs import Job, make_plan
 from spslam.benchmark.published import AVERAGE, published
 from spslam.benchmark.suites import GICP, load_suite, suite_names
 from spslam.config import load_config
 from spslam.errors import ConfigError
 from tests.benchmark.examples import tiny_job
+from tests.cli.command import ROOT
 
 DATASETS = {"replica": 8, "synthetic_rgbd": 6, "scannet": 6, "tum": 3, "7scenes": 7}
 
@@ -41,8 +43,8 @@ def test_datasets_have_the_papers_scenes_five_seeds_and_the_baseline(name, scene
 
 
 @pytest.mark.parametrize("name", ["replica", "synthetic_rgbd", "scannet", "7scenes"])
-def test_the_papers_own_average_is_that_of_its_row(name):
-    """Several baselines' aren't, in the paper itself."""
+def test_published_averages_match_their_rows(name):
+    """Not so for some baselines, in the paper itself."""
     *values, average = published(name)["ate"].rows["SP-SLAM (paper)"]
     assert average == pytest.approx(sum(values) / len(values), abs=0.05)
 
@@ -58,7 +60,7 @@ def test_nothing_is_published_about_other_suites():
     assert published("quick") == published(None) == {}
 
 
-def test_a_suite_is_narrowed():
+def test_part_of_a_suite():
     suite = load_suite("quick", ["fast"], ["room", "gray"], None, "0:5", 3, baseline=False)
     (study,) = suite.studies
     assert [sequence.name for sequence in study.sequences] == ["room", "gray"]
@@ -77,12 +79,12 @@ def test_a_suite_is_narrowed():
         ({"name": "quick", "studies": ["prior"]}, "study must be one of all, got prior"),
     ],
 )
-def test_unknown_names_are_named(arguments, message):
+def test_unknown_names_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
         load_suite(**arguments)
 
 
-def test_a_plan_takes_the_data_that_is_there_and_says_what_is_not(tmp_path):
+def test_plan_has_the_data_that_is_there_and_lists_what_is_missing(tmp_path):
     (tmp_path / "replica" / "room1").mkdir(parents=True)
     (tmp_path / "replica" / "room1_mesh.ply").touch()
     plan = make_plan(load_suite("replica", seeds=2), tmp_path, "cpu")
@@ -96,7 +98,51 @@ def test_a_plan_takes_the_data_that_is_there_and_says_what_is_not(tmp_path):
     )
 
 
-def test_without_data_only_what_needs_none_is_planned():
+def test_folders_from_a_file(tmp_path):
+    (tmp_path / "mine" / "kitchen").mkdir(parents=True)
+    file = tmp_path / "folders.yaml"
+    file.write_text(f"quick: {{kitchen: mine/kitchen, rpy: {tmp_path / 'absent'}}}\n7scenes: {{fire: elsewhere}}\n")
+    suite = with_folders(load_suite("quick", ["fast"], ["kitchen", "rpy", "gray"], baseline=False), read_folders(file))
+    plan = make_plan(suite, tmp_path, "cpu")
+    assert [job.data for job in plan.jobs.values()] == [str(tmp_path / "mine" / "kitchen")]
+    assert plan.skipped["rpy"].startswith(f"none of {tmp_path / 'absent'} in {tmp_path}; --folders FILE names other")
+    assert plan.skipped["gray"].startswith("none of neural_rgbd_data/grey_white_room, ")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "can't be read: No such file"),
+        ("a: [", "must be YAML"),
+        ("- quick", "must hold SUITE: {SEQUENCE: FOLDER}, got"),
+        ("quik: {kitchen: x}", "suite must be one of .*quick.*, got quik"),
+        ("quick: kitchen", "quick must hold SEQUENCE: FOLDER, got kitchen"),
+        ("quick: {kitschen: x}", "a sequence of quick must be one of kitchen, .*, got kitschen"),
+        ("quick: {room: x}", "a sequence of quick must be one of kitchen, .*, got room"),
+        ("quick: {kitchen: 3}", "the folder of quick, kitchen must be text, got 3"),
+    ],
+)
+def test_wrong_file_of_folders_is_one_line(tmp_path, content, message):
+    file = tmp_path / "folders.yaml"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(ConfigError, match=f"folders.yaml: {message}") as error:
+        read_folders(file)
+    assert "\n" not in str(error.value)
+
+
+def test_repository_file_of_folders_is_valid():
+    assert set(read_folders(ROOT / "experiments" / "bench_folders.yaml")) <= set(suite_names())
+
+
+def test_suites_name_public_folders_only():
+    """A suite lists parent folders of the data set's own folder name; other names belong in a `--folders` file."""
+    for name in suite_names():
+        for sequence in load_suite(name).studies[0].sequences:
+            assert len({folder.rpartition("/")[2] for folder in sequence.folders}) <= 1, sequence.name
+
+
+def test_without_data_only_generated_sequences_are_planned():
     plan = make_plan(load_suite("quick"), None, "cpu")
     assert {job.sequence for job in plan.jobs.values()} == {"room"}
     assert set(plan.skipped.values()) == {"no --data given"}
@@ -109,13 +155,13 @@ def test_without_its_package_the_baseline_is_skipped(monkeypatch):
     assert plan.skipped == {"GICP odometry, 4 cm": "needs small_gicp: pip install 'spslam[bench]'"}
 
 
-def test_studies_share_their_runs():
+def test_studies_share_runs():
     plan = make_plan(load_suite("ablation", studies=["fusion", "targets"], sequences=["room"]), None, "cpu")
     assert plan.cells["fusion", "room", "with fusion"] == plan.cells["targets", "room", "cosine targets"]
     assert len(plan.jobs) == 5
 
 
-def test_a_key_names_what_decides_on_the_figures():
+def test_key_depends_on_all_that_affects_the_figures():
     job = tiny_job()
     others = [
         tiny_job(seed=1),
@@ -131,7 +177,7 @@ def test_a_key_names_what_decides_on_the_figures():
     assert job.key().startswith("room-fast-seed0-")
 
 
-def test_other_weights_are_another_run(tmp_path):
+def test_key_depends_on_the_weights(tmp_path):
     from spslam.prior.encoder import SHIPPED
 
     content = bytearray(SHIPPED.read_bytes())
@@ -144,6 +190,6 @@ def test_other_weights_are_another_run(tmp_path):
     assert len(keys) == 2
 
 
-def test_a_job_comes_back_from_its_text():
+def test_job_from_its_text():
     for job in (tiny_job(), tiny_job(method=GICP)):
         assert Job.from_json(job.to_json()) == job

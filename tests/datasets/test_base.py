@@ -68,7 +68,6 @@ def test_subset(bounds, expected):
     assert [frame.index for frame in subset] == list(range(len(expected)))
     np.testing.assert_allclose(subset.timestamps(), np.array(expected) / 10)
     np.testing.assert_allclose(subset.poses()[:, 0, 0], list(expected))
-    assert list(subset.source_indices) == list(expected)
 
 
 def test_subset_keeps_the_depth_range_and_unknown_poses():

@@ -1,1 +1,1 @@
-"""Tests of what the benchmarks compare."""
+"""Tests of the scripts in experiments/."""

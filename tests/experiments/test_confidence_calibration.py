@@ -1,11 +1,11 @@
-"""The fit behind the doubt: it finds the coefficients that data were made with."""
+"""The fit of the error probability recovers the coefficients that the data were generated with."""
 
 import numpy as np
 
 from experiments.confidence_calibration import COLUMNS, coefficients
 
 
-def test_coefficients_of_made_up_poses():
+def test_coefficients_of_synthetic_poses():
     random = np.random.default_rng(0)
     table = np.stack(
         [
@@ -14,7 +14,7 @@ def test_coefficients_of_made_up_poses():
             random.exponential(3, 20000),
             random.exponential(2, 20000),
             random.uniform(0, 0.3, 20000),
-            random.uniform(-1, 1, 20000),  # likeness takes no part in the fit
+            random.uniform(-1, 1, 20000),  # brightness correlation is not part of the fit
         ],
         axis=1,
     )
@@ -24,5 +24,5 @@ def test_coefficients_of_made_up_poses():
     odds = true @ [np.ones(len(table)), table[:, 0], np.log10(table[:, 1]), prediction_error, table[:, 4]]
     wrong = random.uniform(size=len(table)) < 1 / (1 + np.exp(-odds))
     found = coefficients(table[~wrong], table[wrong])
-    # The ridge takes some off; the constant says how many of each kind there are, which does not count.
+    # The ridge shrinks the slopes; the constant depends on the class frequencies and is not compared.
     np.testing.assert_allclose(found[1:], true[1:], rtol=0.25)

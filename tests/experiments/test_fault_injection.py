@@ -1,4 +1,4 @@
-"""The plan of trials: nothing is shown that was mapped before, and all comes back to what was seen."""
+"""The plan of trials: no frame is processed twice, and the camera returns to places that were mapped."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The benchmark of whole runs, on a few small frames."""
+"""The script that measures whole runs, on a few small frames."""
 
 import argparse
 import json
@@ -21,7 +21,7 @@ SMALL = [
 ]
 
 
-def test_runs_of_one_seed_are_one_result():
+def test_runs_with_one_seed_are_identical():
     args = argparse.Namespace(config="demo", data=None, frames="0:4", device="cpu", repeats=2, set=SMALL)
     runs = sequence.run_preset(args, "fast")
     row = sequence.summarize("fast", runs)
@@ -31,7 +31,7 @@ def test_runs_of_one_seed_are_one_result():
     assert 0 < stages < 1.01e3 / row["fps_least"]
 
 
-def test_results_that_differ_are_an_error(tmp_path):
+def test_different_results_are_an_error(tmp_path):
     """Seeds that differ stand in for a kernel that does not repeat itself."""
     code = (
         "import sys\nfrom experiments import sequence\n"

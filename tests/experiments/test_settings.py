@@ -1,4 +1,4 @@
-"""The benchmark of settings: what its arguments mean, and that one run does not end the others."""
+"""The script that compares settings: its arguments, and that a failed run does not end the others."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ SMALL = ["width=96", "height=72"]
 LIGHT = "fast,pixels.per_frame=2000,mapping.first_iterations=5,mapping.iterations=2"
 
 
-def test_a_sequence_names_its_frames_and_options():
+def test_sequence_argument_has_frames_and_options():
     job = parse_job("gray=synthetic_rgbd:some/room:10:110:2,dataset.depth_variant=exact,seed=4", "balanced", 3)
     assert (job.name, job.config, job.folder, job.start, job.stop, job.step) == (
         *("gray", "synthetic_rgbd", "some/room"),
@@ -27,7 +27,7 @@ def test_settings_come_from_a_file(tmp_path):
     assert read_settings(path) == ["balanced", "balanced,mapping.every=2"]
 
 
-def test_rows_come_as_runs_end_and_are_not_run_again(tmp_path):
+def test_rows_are_written_as_runs_finish_and_are_not_run_again(tmp_path):
     rows = tmp_path / "rows.jsonl"
     sequence = "room=demo::0:3," + ",".join(f"dataset.{option}" for option in SMALL)
     command = [sys.executable, "-m", "experiments.settings", "--sequence", sequence, "--seeds", "2", "--workers", "2"]
@@ -43,7 +43,7 @@ def test_rows_come_as_runs_end_and_are_not_run_again(tmp_path):
     assert sum("error" not in row for row in again) == 2
 
 
-def test_the_table_has_means_over_seeds(capsys):
+def test_table_has_means_over_seeds(capsys):
     row = {"setting": "a", "name": "b", "rpe_cm": 1.0, "rpe_deg": 1.0, "lost": 0, "fps": 9.0}
     print_table([{**row, "seed": 0, "ate_rmse_cm": 1.0}, {**row, "seed": 1, "ate_rmse_cm": 2.0}])
     last = capsys.readouterr().out.splitlines()[-1].split()

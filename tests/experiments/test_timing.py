@@ -1,4 +1,4 @@
-"""What a benchmark writes down, and that the room it runs in is one."""
+"""What the timing scripts write, and that their room is consistent."""
 
 import json
 import time
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from experiments import room, timing
-from experiments.ops import grid_sample
+from experiments.composable_ops import grid_sample
 from spslam import ops
 
 
@@ -21,7 +21,7 @@ def test_report_holds_rows_and_environment(tmp_path, capsys):
 
 
 @pytest.mark.cuda
-def test_the_clock_of_the_gpu_leaves_out_what_python_takes():
+def test_gpu_time_excludes_launch_overhead():
     def slow_to_launch():
         time.sleep(2e-3)
         return torch.ones(10, device="cuda").sum()
@@ -43,6 +43,6 @@ def test_rays_end_at_the_walls(generator):
     assert (seen.cosine > 0).all()
 
 
-def test_the_sampler_of_torch_does_the_same(generator):
+def test_grid_sample_gives_the_same(generator):
     image, uv = torch.randn(7, 9, 3, generator=generator), torch.rand(50, 2, generator=generator) * 6
     torch.testing.assert_close(grid_sample(image, uv), ops.bilinear_interpolate(image, uv), rtol=1e-4, atol=1e-4)

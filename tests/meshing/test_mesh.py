@@ -9,7 +9,7 @@ import trimesh
 from spslam.errors import OutputError
 from spslam.meshing import TriangleMesh, save_mesh
 from spslam.meshing.cleaning import in_large_part
-from spslam.meshing.mesh import face_normals, vertex_normals
+from spslam.meshing.mesh import compact, face_normals, vertex_normals
 
 
 def _sphere(subdivisions=3, offset=0.0):
@@ -49,15 +49,14 @@ def test_degenerate_faces_have_no_normal():
     assert not vertex_normals(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32)).any()
 
 
-def test_select_faces_drops_unused_vertices():
+def test_compact_drops_unused_vertices():
     mesh = _sphere()
-    keep = mesh.vertices[mesh.faces].mean(1)[:, 2] > 0
-    half = mesh.select_faces(keep)
-    assert len(half.faces) == keep.sum() and len(half.vertices) < len(mesh.vertices)
-    np.testing.assert_array_equal(half.vertices[half.faces], mesh.vertices[mesh.faces[keep]])
-    np.testing.assert_array_equal(half.colors[half.faces], mesh.colors[mesh.faces[keep]])
-    nothing = mesh.select_faces(np.zeros(len(mesh.faces), bool))
-    assert len(nothing.vertices) == len(nothing.faces) == 0
+    kept = mesh.faces[mesh.vertices[mesh.faces].mean(1)[:, 2] > 0]
+    faces, used = compact(kept, len(mesh.vertices))
+    assert len(faces) == len(kept) and len(used) < len(mesh.vertices)
+    np.testing.assert_array_equal(mesh.vertices[used][faces], mesh.vertices[kept])
+    no_faces, none_used = compact(mesh.faces[:0], len(mesh.vertices))
+    assert len(no_faces) == len(none_used) == 0
 
 
 def test_small_parts():

@@ -1,4 +1,4 @@
-"""Checkpoints written beside the loop hold the state of their moment."""
+"""Asynchronous checkpoints have the state at the time of the call."""
 
 import threading
 
@@ -36,8 +36,8 @@ def go_on(system):
         system.process(Recorded(8)[i])
 
 
-def test_a_thread_writes_the_state_of_its_moment(monkeypatch, tmp_path, system, log):
-    """The thread is held back until four more frames were taken in."""
+def test_thread_writes_the_state_at_the_time_of_the_call(monkeypatch, tmp_path, system, log):
+    """The thread is delayed until four more frames have been processed."""
     CheckpointWriter(tmp_path / "in_place", threaded=False).write(system.state, system.config, SOURCE, log)
     may_write, write = threading.Event(), checkpoint_writer.write_snapshot
     monkeypatch.setattr(checkpoint_writer, "write_snapshot", lambda *args: may_write.wait(60) and write(*args))
@@ -51,7 +51,7 @@ def test_a_thread_writes_the_state_of_its_moment(monkeypatch, tmp_path, system, 
     assert (tmp_path / "beside").read_bytes() == (tmp_path / "in_place").read_bytes()
 
 
-def test_the_state_that_is_read_back_goes_on_to_the_same(tmp_path, system, log, device):
+def test_restored_state_continues_identically(tmp_path, system, log, device):
     writer = CheckpointWriter(tmp_path / "checkpoint", threaded=True)
     writer.write(system.state, system.config, SOURCE, log)
     go_on(system)
@@ -64,7 +64,7 @@ def test_the_state_that_is_read_back_goes_on_to_the_same(tmp_path, system, log, 
     assert torch.equal(system.state.frames.poses, resumed.state.frames.poses)
 
 
-def test_what_goes_wrong_on_the_thread_is_raised(tmp_path, system, log):
+def test_error_on_the_thread_is_raised(tmp_path, system, log):
     writer = CheckpointWriter(tmp_path / "absent" / "checkpoint", threaded=True)
     writer.write(system.state, system.config, SOURCE, log)
     with pytest.raises(OutputError, match="absent/checkpoint: can't be written: No such file or directory"):

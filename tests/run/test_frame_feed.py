@@ -1,4 +1,4 @@
-"""Frames made ready ahead of need: order, content, times, and the way to the device."""
+"""Asynchronous reading of frames: order, content, times and upload."""
 
 import pytest
 import torch
@@ -46,7 +46,7 @@ def test_frames_come_in_order_with_their_pixels(device, reader, workers, ahead):
 
 
 @pytest.mark.cuda
-def test_an_upload_waits_for_nothing():
+def test_upload_does_not_synchronize():
     dataset, config, device = Recorded(2), settings(), torch.device("cuda")
     uploader = Uploader(device)
     pixels = sample_frame(dataset[0], dataset.camera, config)
@@ -66,6 +66,6 @@ def test_an_upload_waits_for_nothing():
     ("cores", "kind", "workers"),
     [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (64, "cuda", 16), (16, "cuda", 8)],
 )
-def test_number_of_threads_suits_cores_and_device(monkeypatch, cores, kind, workers):
+def test_number_of_threads_depends_on_cores_and_device(monkeypatch, cores, kind, workers):
     monkeypatch.setattr(frame_feed.os, "sched_getaffinity", lambda _: range(cores), raising=False)
     assert automatic_workers(torch.device(kind)) == workers

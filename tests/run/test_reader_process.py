@@ -1,5 +1,6 @@
-"""Frames read by another process: what happens where that can't be, or where either side goes."""
+"""Frames read by another process: fallback to threads, and what happens when either process ends."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from spslam.run import reader_launch
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.reader_launch import end_standby, has_standby, launch_standby
 from spslam.run.reader_process import ReaderProcess
+from spslam.run.reader_service import serve
 from spslam.slam.device_events import HostEvent
 from spslam.slam.pixels import sample_frame
 from spslam.slam.upload import Upload
@@ -43,13 +45,24 @@ def has_ended(pid: int) -> bool:
     return state == "Z"
 
 
-def test_a_data_set_that_cannot_be_pickled_is_read_by_threads():
+def test_the_function_that_the_process_runs_exists():
+    """It is named by a string, as importing it would load torch."""
+    module = importlib.import_module(reader_launch.SERVICE_MODULE)
+    assert getattr(module, reader_launch.SERVICE_FUNCTION) is serve
+
+
+def test_starting_the_process_does_not_import_torch():
+    code = "import sys, spslam.run.reader_launch, spslam.run.request; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=PATIENCE_S)
+
+
+def test_data_set_that_cannot_be_pickled_is_read_by_threads():
     with feed_of(Recorded(FRAMES, lambda frame: None)) as feed:
         assert not isinstance(feed.prepare(), ReaderProcess)
         assert [frame.index for frame in feed] == list(range(FRAMES))
 
 
-def test_a_data_set_unknown_to_another_process_is_read_by_threads(monkeypatch):
+def test_data_set_that_cannot_be_imported_is_read_by_threads(monkeypatch):
     class Stranger(Recorded):
         pass
 
@@ -62,7 +75,7 @@ def test_a_data_set_unknown_to_another_process_is_read_by_threads(monkeypatch):
         assert [frame.index for frame in feed] == list(range(FRAMES))
 
 
-def test_a_process_started_early_is_used_once():
+def test_standby_reader_is_used_once():
     launch_standby(settings("run.reader=process"))
     launch_standby(settings("run.reader=process"))
     pid = reader_launch._standby[0].process.pid
@@ -73,7 +86,7 @@ def test_a_process_started_early_is_used_once():
 
 
 class LateUploader:
-    """As `Uploader`, without a device: copies end some frames later; notes what happens to the pages."""
+    """Like `Uploader`, without a device: copies are complete some frames later; records calls about pages."""
 
     def __init__(self, can_lock):
         self.can_lock, self.notes, self.sent = can_lock, [], 0
@@ -100,7 +113,7 @@ class LateEvent(HostEvent):
 
 
 @pytest.mark.parametrize(("can_lock", "notes"), [(True, ["lock", "unlock"]), (False, ["lock"])])
-def test_slots_are_given_back_when_their_copies_have_ended(can_lock, notes):
+def test_slots_are_freed_when_their_uploads_are_complete(can_lock, notes):
     dataset, config, uploader = Recorded(FRAMES), settings(), LateUploader(can_lock)
     reader = ReaderProcess.start(dataset, config, start=0, workers=1, ahead=4, uploader=uploader)
     assert reader.is_ready()
@@ -112,7 +125,7 @@ def test_slots_are_given_back_when_their_copies_have_ended(can_lock, notes):
     assert uploader.notes == notes
 
 
-def test_a_process_that_nobody_takes_is_ended():
+def test_unused_standby_reader_is_ended():
     launch_standby(settings("run.reader=process"))
     pid = reader_launch._standby[0].process.pid
     end_standby()
@@ -120,17 +133,17 @@ def test_a_process_that_nobody_takes_is_ended():
 
 
 @pytest.mark.parametrize("options", [("device=cpu",), ("run.reader=threads", "device=cuda")])
-def test_a_run_that_wants_no_process_starts_none(options):
+def test_no_standby_reader_where_the_run_uses_threads(options):
     launch_standby(settings(*options))
     assert not has_standby()
 
 
-def test_a_bug_in_a_data_set_shows_where_it_is():
+def test_exception_in_a_data_set_keeps_its_traceback():
     with feed_of(Recorded(FRAMES, fail)) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
         next(feed)
 
 
-def test_a_reader_that_was_killed_is_told_of_in_one_line():
+def test_killed_reader_is_reported_in_one_line():
     with feed_of(Recorded(FRAMES)) as feed:
         next(feed)
         feed.prepare()._process.send_signal(signal.SIGKILL)
@@ -138,14 +151,14 @@ def test_a_reader_that_was_killed_is_told_of_in_one_line():
             list(feed)
 
 
-def test_closing_half_way_leaves_no_process():
+def test_closing_early_ends_the_process():
     with feed_of(Recorded(FRAMES)) as feed:
         next(feed)
         pid = feed.prepare()._process.pid
     assert has_ended(pid)
 
 
-def test_the_reader_ends_with_a_loop_that_was_killed():
+def test_reader_ends_when_the_loop_is_killed():
     script = (
         "import time\nfrom tests.run.test_reader_process import FRAMES, Recorded, feed_of\n"
         "feed = feed_of(Recorded(FRAMES))\nnext(feed)\n"

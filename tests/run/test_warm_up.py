@@ -1,4 +1,4 @@
-"""The rehearsal before a run uses all that the run will, and leaves no trace in its results."""
+"""The warm-up runs what a run will, and does not change its results."""
 
 import pytest
 
@@ -15,12 +15,12 @@ def test_frames_are_tracked_and_mapped(device, preset):
     assert all(report.tracking_iterations for report in reports[1:])
 
 
-def test_a_range_without_the_walls_depth_does_not_matter(device):
+def test_depth_range_without_the_default_distance(device):
     config = settings("dataset.min_depth_m=3", "dataset.max_depth_m=4")
     assert not any(report.lost for report in warm_up(config, Recorded(1).camera, device))
 
 
-def test_results_do_not_depend_on_it(monkeypatch, tmp_path, device):
+def test_results_do_not_depend_on_warm_up(monkeypatch, tmp_path, device):
     options = ("mapping.first_iterations=5", f"device={device}")
     run_on(monkeypatch, Recorded(6), tmp_path / "one", *options)
     warm_up(settings("seed=5"), Recorded(1).camera, device)

@@ -12,7 +12,7 @@ from spslam.config import Config, load_config
 from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.generated import GeneratedDataset
-from spslam.run.sequence import run_sequence
+from spslam.run.sequence import RunRequest, run_sequence
 from tests.datasets.layouts import matrix_text, write_color, write_depth
 
 WIDTH, HEIGHT = 160, 120
@@ -28,7 +28,7 @@ def _rendered(count: int) -> tuple[GeneratedDataset, list[RgbdFrame]]:
 
 
 class Recorded(RgbdDataset):
-    """The generated room's first frames, rendered once; `change(frame)` may spoil a copy, or raise."""
+    """The generated room's first frames, rendered once; `change(frame)` may modify a copy, or raise."""
 
     name = "recorded"
 
@@ -63,7 +63,8 @@ def run_on(monkeypatch, dataset: RgbdDataset, output: Path, *overrides: str, **a
     """`run_sequence` over a data set made by a test; returns the metrics."""
     config = settings(*overrides, preset=arguments.pop("preset", None))
     monkeypatch.setattr(registry, "open_dataset", lambda *_: dataset)
-    return run_sequence(config, None, output, mesh=arguments.pop("mesh", False), **arguments)
+    progress = arguments.pop("progress", None)
+    return run_sequence(RunRequest(config, None, output, **{"mesh": False, **arguments}), progress)
 
 
 def write_room(scene: Path, count: int) -> Path:
@@ -79,5 +80,5 @@ def write_room(scene: Path, count: int) -> Path:
 
 
 def results(output: Path) -> tuple[bytes, bytes]:
-    """What must be the same to the byte: trajectory and map."""
+    """The bytes of trajectory and map."""
     return (output / "trajectory.txt").read_bytes(), (output / "map.safetensors").read_bytes()

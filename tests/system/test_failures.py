@@ -119,7 +119,7 @@ def test_without_checkpoints_ctrl_c_leaves_none(monkeypatch, tmp_path):
 def test_a_second_ctrl_c_interrupts_at_once():
     with pytest.raises(KeyboardInterrupt), Interruption() as interruption:
         os.kill(os.getpid(), signal.SIGINT)
-        assert interruption.noted
+        assert interruption.requested
         os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -133,4 +133,4 @@ def test_a_programs_own_handler_is_kept():
     finally:
         signal.signal(signal.SIGINT, before)
     assert caught == [1]
-    assert not interruption.noted
+    assert not interruption.requested

@@ -1,4 +1,4 @@
-"""Interrupted runs: what is left, and that going on gives the bytes of a run that was never interrupted."""
+"""Interrupted runs: what they leave, and that resuming gives the bytes of an uninterrupted run."""
 
 import json
 import os
@@ -13,15 +13,15 @@ import pytest
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
 from spslam.run import loop as run_loop
-from spslam.run.sequence import run_sequence
+from spslam.run.sequence import RunRequest, run_sequence
 from tests.cli.command import ROOT
 from tests.system.sequences import FAST_SETTINGS, Recorded, results, run_on, settings, write_room
 
 FRAMES = 16
-# Moments that live from one mapping call to the next must survive too.
+# Optimizer moments that are kept from one mapping call to the next must be restored too.
 OVERRIDES = ("run.checkpoint_every=2", "mapping.every=3", "mapping.reset_moments=false", "dataset.type=7scenes")
 
-# Writes half of the third checkpoint, then dies as by kill -9.
+# Writes half of the third checkpoint, then kills itself with SIGKILL.
 DIE_WHILE_SAVING = """
 import os, signal, sys
 import safetensors.torch
@@ -49,7 +49,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def uninterrupted(data, tmp_path_factory):
     output = tmp_path_factory.mktemp("runs") / "whole"
-    run_sequence(settings(*OVERRIDES), data, output, mesh=False)
+    run_sequence(RunRequest(settings(*OVERRIDES), data, output, mesh=False))
     return results(output)
 
 
@@ -71,7 +71,7 @@ def frames_logged(output):
 
 
 def kill_after(process, output, frames, delay_s):
-    """Kills the process once so many frames are logged, and a little later."""
+    """Kills the process a short time after this number of frames is logged."""
     deadline = time.monotonic() + 100
     while process.poll() is None and time.monotonic() < deadline:
         if output.exists() and len(frames_logged(output)) >= frames:
@@ -82,7 +82,7 @@ def kill_after(process, output, frames, delay_s):
     process.communicate()
 
 
-def test_killed_at_random_moments_a_run_goes_on_to_the_same_bytes(data, uninterrupted, tmp_path):
+def test_run_killed_at_random_times_resumes_to_the_same_bytes(data, uninterrupted, tmp_path):
     output, chance = tmp_path / "out", random.Random(os.getpid())
     for frames in (4, 9):
         kill_after(start(*command(data, output, "--resume")), output, frames, chance.uniform(0, 0.1))
@@ -95,14 +95,14 @@ def test_killed_at_random_moments_a_run_goes_on_to_the_same_bytes(data, uninterr
     assert json.loads((output / "metrics.json").read_text())["frames"] == FRAMES
 
 
-def test_killed_while_it_writes_a_checkpoint_the_one_before_is_whole(data, uninterrupted, tmp_path):
+def test_kill_while_writing_a_checkpoint_keeps_the_one_before(data, uninterrupted, tmp_path):
     output = tmp_path / "out"
     process = start(*command(data, output), code=DIE_WHILE_SAVING)
     process.communicate(timeout=120)
     assert process.returncode == -signal.SIGKILL
     assert list(output.glob(".checkpoint.*.tmp.safetensors"))
     assert frames_logged(output) == list(range(6))
-    run_sequence(settings(*OVERRIDES), data, output, resume=True, mesh=False)
+    run_sequence(RunRequest(settings(*OVERRIDES), data, output, resume=True, mesh=False))
     assert results(output) == uninterrupted
     assert frames_logged(output) == list(range(FRAMES))
     assert not list(output.glob(".*"))
@@ -113,7 +113,7 @@ class InterruptedForTestError(Exception):
 
 
 def interrupt(monkeypatch, output, after, *overrides, error=InterruptedForTestError, dataset=None, **arguments):
-    """Runs over recorded frames until `after` of them are done, then fails with `error`."""
+    """Runs over recorded frames and raises `error` after `after` of them."""
 
     def progress(done, total, report):
         if done == after:
@@ -124,7 +124,7 @@ def interrupt(monkeypatch, output, after, *overrides, error=InterruptedForTestEr
 
 
 @pytest.mark.parametrize(("preset", "error"), [("balanced", KeyboardInterrupt), ("paper", InterruptedForTestError)])
-def test_after_an_exception_a_run_goes_on_to_the_same_bytes(monkeypatch, tmp_path, preset, error):
+def test_run_resumes_to_the_same_bytes_after_an_exception(monkeypatch, tmp_path, preset, error):
     run_on(monkeypatch, Recorded(8), tmp_path / "whole", preset=preset)
     interrupt(monkeypatch, tmp_path / "out", 7, "run.checkpoint_every=4", error=error, preset=preset)
     assert frames_logged(tmp_path / "out") == list(range(7))
@@ -152,8 +152,8 @@ def test_skipped_frames_are_counted_once(monkeypatch, tmp_path):
     ]
 
 
-def test_the_last_optimization_is_not_forgotten(monkeypatch, tmp_path):
-    """The frames after the checkpoint can't be read, so only the checkpoint knows that a mapping call is due."""
+def test_last_optimization_runs_after_resuming(monkeypatch, tmp_path):
+    """The frames after the checkpoint can't be read, so only the checkpoint says that a mapping call is due."""
 
     def change(frame):
         if frame.index >= 4:
@@ -166,7 +166,7 @@ def test_the_last_optimization_is_not_forgotten(monkeypatch, tmp_path):
     assert results(tmp_path / "out") == results(tmp_path / "whole")
 
 
-def test_without_a_checkpoint_it_starts_over(monkeypatch, tmp_path):
+def test_run_without_checkpoint_starts_over(monkeypatch, tmp_path):
     output = tmp_path / "out"
     interrupt(monkeypatch, output, 3)
     with pytest.raises(OutputError, match="ended before its first checkpoint; start it over with --resume"):
@@ -175,11 +175,11 @@ def test_without_a_checkpoint_it_starts_over(monkeypatch, tmp_path):
     assert frames_logged(output) == list(range(4))
 
 
-def test_without_anything_it_starts(monkeypatch, tmp_path):
+def test_resume_without_earlier_run_starts_a_new_one(monkeypatch, tmp_path):
     assert run_on(monkeypatch, Recorded(2), tmp_path / "out", resume=True)["frames"] == 2
 
 
-def test_a_finished_run_is_left_alone(monkeypatch, tmp_path):
+def test_finished_run_is_not_changed(monkeypatch, tmp_path):
     output = tmp_path / "out"
     run_on(monkeypatch, Recorded(2), output)
     before = {path.name: path.read_bytes() for path in output.iterdir() if path.is_file()}
@@ -195,36 +195,36 @@ def interrupted(monkeypatch, tmp_path):
     return tmp_path / "out"
 
 
-def test_an_interrupted_run_is_not_overwritten(monkeypatch, interrupted):
+def test_interrupted_run_is_not_overwritten(monkeypatch, interrupted):
     with pytest.raises(OutputError, match="holds an interrupted run; go on with --resume, or use another --output"):
         run_on(monkeypatch, Recorded(8), interrupted)
 
 
 @pytest.mark.parametrize("override", ["seed=1", "tracking.pixels=512", "scene.voxel_size_m=0.05", "dataset.stride=2"])
-def test_other_settings_are_refused(monkeypatch, interrupted, override):
+def test_resuming_with_other_settings_is_refused(monkeypatch, interrupted, override):
     with pytest.raises(OutputError, match="belongs to a run with other settings") as error:
         run_on(monkeypatch, Recorded(8), interrupted, override, resume=True)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("override", ["run.checkpoint_every=3", "mesh.resolution_m=0.05", "scene.max_voxels=9000000"])
-def test_settings_that_do_not_decide_the_result_may_change(monkeypatch, interrupted, override):
+def test_settings_that_do_not_affect_the_result_may_change(monkeypatch, interrupted, override):
     assert run_on(monkeypatch, Recorded(8), interrupted, override, resume=True)["frames"] == 8
 
 
-def test_other_frames_of_the_same_number_are_refused(monkeypatch, interrupted):
+def test_resuming_with_other_frames_is_refused(monkeypatch, interrupted):
     with pytest.raises(OutputError, match="belongs to a run over other data or frames; use another --output"):
         run_on(monkeypatch, Recorded(20), interrupted, resume=True, frames=slice(2, 10))
 
 
-def test_another_folder_is_refused(monkeypatch, interrupted, tmp_path):
+def test_resuming_with_another_data_folder_is_refused(monkeypatch, interrupted, tmp_path):
     monkeypatch.setattr(registry, "open_dataset", lambda *_: Recorded(8))
     with pytest.raises(OutputError, match="belongs to a run over other data"):
-        run_sequence(settings(), tmp_path, interrupted, resume=True, mesh=False)
+        run_sequence(RunRequest(settings(), tmp_path, interrupted, resume=True, mesh=False))
 
 
 @pytest.mark.parametrize("size", [0, 7, 1000])
-def test_a_damaged_checkpoint_is_one_line(monkeypatch, interrupted, size):
+def test_damaged_checkpoint_is_one_line(monkeypatch, interrupted, size):
     checkpoint = interrupted / "checkpoint.safetensors"
     checkpoint.write_bytes(checkpoint.read_bytes()[:size])
     with pytest.raises(OutputError, match=r"checkpoint.safetensors: not a readable checkpoint \(") as error:
@@ -236,5 +236,5 @@ def test_a_damaged_checkpoint_is_one_line(monkeypatch, interrupted, size):
     ("every", "last_saved", "done", "due"),
     [(0, 0, 500, False), (100, 0, 99, False), (100, 0, 100, True), (100, 5000, 5100, False), (100, 5000, 5556, True)],
 )
-def test_checkpoints_come_after_so_many_frames_or_a_tenth_of_all(every, last_saved, done, due):
+def test_checkpoint_interval_is_at_least_a_tenth_of_the_frames(every, last_saved, done, due):
     assert run_loop._is_checkpoint_due(every, last_saved, done) == due

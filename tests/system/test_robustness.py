@@ -1,4 +1,4 @@
-"""Sequences that real cameras and disks produce: holes, blackouts, limits, full disks."""
+"""Difficult sequences and systems: missing depth, black frames, limits, full disks."""
 
 import resource
 
@@ -9,7 +9,7 @@ from spslam.camera import Camera
 from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError, OutputError, SpslamError
-from spslam.run import sequence as run_module
+from spslam.run.sequence import RunRequest, run_sequence
 from spslam.scene import Scene
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
@@ -53,7 +53,7 @@ def test_no_readable_frame_is_one_line(monkeypatch, tmp_path):
         run_on(monkeypatch, Recorded(3, unreadable(0, 1, 2)), tmp_path / "out")
 
 
-def test_frames_without_depth_are_lost_and_found_again(monkeypatch, tmp_path):
+def test_frames_without_depth_are_lost_and_tracking_recovers(monkeypatch, tmp_path):
     dataset = Recorded(12, without_depth(5, 6))
     metrics = run_on(monkeypatch, dataset, tmp_path / "out")
     assert (metrics["frames"], metrics["lost_frames"]) == (12, 2)
@@ -62,17 +62,17 @@ def test_frames_without_depth_are_lost_and_found_again(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("change", [without_depth(0, 1), unreadable(0, 1)])
-def test_the_map_starts_with_the_first_frame_that_has_depth(monkeypatch, tmp_path, change):
+def test_map_starts_with_the_first_frame_that_has_depth(monkeypatch, tmp_path, change):
     metrics = run_on(monkeypatch, Recorded(8, change), tmp_path / "out", "mapping.optimize_poses=true")
     assert metrics["lost_frames"] + metrics["skipped_frames"] == 2
     assert metrics["voxels"] > 1000
     poses = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt").poses
-    # The founding frame is held where it was put.
-    founding = poses[-6]
-    np.testing.assert_allclose(founding, Recorded(8).poses()[0], atol=1e-6)
+    # The first mapped frame keeps its pose.
+    first_mapped = poses[-6]
+    np.testing.assert_allclose(first_mapped, Recorded(8).poses()[0], atol=1e-6)
 
 
-def test_a_sequence_without_any_depth_ends_well(monkeypatch, tmp_path):
+def test_sequence_without_any_depth_finishes(monkeypatch, tmp_path):
     metrics = run_on(monkeypatch, Recorded(3, without_depth(0, 1, 2)), tmp_path / "out", mesh=True)
     assert (metrics["lost_frames"], metrics["voxels"]) == (3, 0)
     assert Scene.load(tmp_path / "out" / "map.safetensors").volume.num_voxels == 0
@@ -88,7 +88,7 @@ def test_black_frames_are_tracked_by_their_depth(monkeypatch, tmp_path):
     assert metrics["ate_max_cm"] < 1
 
 
-def test_depth_that_is_no_number_is_left_out(monkeypatch, tmp_path):
+def test_nonfinite_depth_is_ignored(monkeypatch, tmp_path):
     def change(frame):
         if frame.index in (0, 4):
             frame.depth[20:60, 20:90] = np.nan
@@ -100,7 +100,7 @@ def test_depth_that_is_no_number_is_left_out(monkeypatch, tmp_path):
     assert metrics["ate_max_cm"] < 1
 
 
-def test_depth_beyond_the_limit_counts_as_none(monkeypatch, tmp_path):
+def test_depth_beyond_the_limit_is_invalid(monkeypatch, tmp_path):
     def change(frame):
         if frame.index == 3:
             frame.depth *= 1e6
@@ -108,7 +108,7 @@ def test_depth_beyond_the_limit_counts_as_none(monkeypatch, tmp_path):
     assert run_on(monkeypatch, Recorded(5, change), tmp_path / "out")["lost_frames"] == 1
 
 
-def test_noise_without_a_surface_founds_no_map():
+def test_noise_does_not_start_the_map():
     dataset = Recorded(3)
     system = SlamSystem(settings(), dataset.camera)
     frame = dataset[0]
@@ -135,13 +135,13 @@ def test_shortest_sequences(monkeypatch, tmp_path, count):
         ("pixels.budget_mb=0.001", "pixels.budget_mb must hold at least one frame"),
     ],
 )
-def test_a_limit_is_one_line(monkeypatch, tmp_path, override, message):
+def test_exceeded_limit_is_one_line(monkeypatch, tmp_path, override, message):
     with pytest.raises(SpslamError, match=message) as error:
         run_on(monkeypatch, Recorded(12), tmp_path / "out", override, "run.checkpoint_every=2")
     assert "\n" not in str(error.value)
 
 
-def test_after_the_voxel_limit_a_run_goes_on_with_a_higher_one(monkeypatch, tmp_path):
+def test_run_resumes_with_a_higher_voxel_limit(monkeypatch, tmp_path):
     run_on(monkeypatch, Recorded(12), tmp_path / "whole")
     with pytest.raises(SpslamError, match="max_voxels"):
         run_on(monkeypatch, Recorded(12), tmp_path / "out", "scene.max_voxels=18000", "run.checkpoint_every=2")
@@ -159,7 +159,7 @@ def test_first_pose_too_far_away_is_one_line():
 
 @pytest.fixture
 def tiny_disk():
-    """No file may grow past so many bytes, as on a full disk; Python turns the signal into an OSError."""
+    """Limits the size of files, as on a full disk; Python turns the signal into an OSError."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -189,7 +189,7 @@ def test_full_disk_keeps_the_checkpoint_before(monkeypatch, tmp_path, tiny_disk)
 
 
 class Tiny(RgbdDataset):
-    """Frames of one size, too small for a co-visibility depth_thumbnail of more than a cell."""
+    """Frames so small that their co-visibility thumbnail has a single cell."""
 
     name, camera = "tiny", Camera(16, 16, 14, 14, 7.5, 7.5)
 
@@ -214,7 +214,7 @@ def test_tiny_images_work(monkeypatch, tmp_path):
 
 def test_every_nth_frame(monkeypatch, tmp_path):
     monkeypatch.setattr(registry, "open_dataset", lambda *_: Recorded(9))
-    metrics = run_module.run_sequence(settings(), None, tmp_path / "out", slice(1, None, 3), mesh=False)
+    metrics = run_sequence(RunRequest(settings(), None, tmp_path / "out", slice(1, None, 3), mesh=False))
     found = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt")
     assert metrics["frames"] == 3
     np.testing.assert_allclose(found.timestamps, Recorded(9).timestamps()[1::3], atol=1e-6)

@@ -1,6 +1,6 @@
-"""The composable ops against plain torch, forward and backward, at the sizes of a mapping iteration.
+"""Speed of the composable ops compared with plain torch, forward and backward, at the sizes of a mapping iteration.
 
-python -m experiments.ops --device cpu --threads 2
+python -m experiments.composable_ops --device cpu --threads 2
 """
 
 from collections.abc import Callable, Sequence
@@ -12,11 +12,12 @@ from experiments.compose import TORCH, unpack_pixels, world_points
 from spslam import ops
 
 RAYS, UNIFORM, SURFACE = 2048, 32, 11
-Case = tuple[str, Callable, Callable, list, Sequence[int]]  # name, ours, torch's, arguments, which are differentiable
+# Name, spslam's function, torch's, their arguments, which of these are differentiable.
+Case = tuple[str, Callable, Callable, list, Sequence[int]]
 
 
 def grid_sample(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
-    """`bilinear_interpolate` by torch's own sampler."""
+    """`bilinear_interpolate` as `torch.nn.functional.grid_sample`."""
     height, width = texels.shape[:2]
     scaled = uv * uv.new_tensor([2 / (width - 1), 2 / (height - 1)]) - 1
     image = texels.permute(2, 0, 1)[None]
@@ -25,7 +26,7 @@ def grid_sample(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
 
 
 def sample_and_sort(depth: torch.Tensor) -> torch.Tensor:
-    """`sample_along_rays` with torch's generator."""
+    """`sample_along_rays` with torch's random generator."""
     u = torch.rand(len(depth), UNIFORM + SURFACE, device=depth.device)
     i, j = torch.arange(UNIFORM, device=depth.device), torch.arange(SURFACE, device=depth.device)
     uniform = depth[:, None] * (0.2 + 0.82 * (i + u[:, :UNIFORM]) / UNIFORM)
@@ -34,7 +35,7 @@ def sample_and_sort(depth: torch.Tensor) -> torch.Tensor:
 
 
 def cases(generator: torch.Generator, device: torch.device) -> list[Case]:
-    """Every op with the inputs it sees in a mapping iteration of the room."""
+    """Every op with its inputs in a mapping iteration of the room."""
     scene = room.make_scene(generator, device)
     rays = room.make_rays(generator, RAYS, room.FRAMES, device)
     seen = unpack_pixels(rays.pixels, rays.intrinsics, torch.float32)

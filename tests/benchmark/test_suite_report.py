@@ -1,4 +1,4 @@
-"""Statistics, tables, plots and pages from made-up results."""
+"""Statistics, tables, plots and pages from synthetic results."""
 
 import json
 import xml.etree.ElementTree as ElementTree
@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from spslam.benchmark.figures import Statistic
-from spslam.benchmark.report import describe_gaps, fill_regions, update_page, write_results
+from spslam.benchmark.suite_report import describe_gaps, fill_regions, update_page, write_results
 from spslam.benchmark.suites import load_suite
 from spslam.benchmark.tables import make_tables, to_markdown, to_text
 from spslam.errors import OutputError
@@ -30,7 +30,7 @@ def test_statistics():
     assert Statistic.of([2.0]).text(1) == Statistic.of([2.0, 2.0]).text(1) == "2.0"
 
 
-def test_the_papers_figures_stand_beside_ours(replica):
+def test_tables_include_the_papers_figures(replica):
     ate, averages, runs = make_tables(replica)
     rows = {row[0]: row[1:] for row in ate.rows}
     assert ate.header == ("method", "room0", "office4", "average")
@@ -85,7 +85,7 @@ def test_files(replica, tmp_path):
     assert "<td>SP-SLAM (paper)</td>" in (tmp_path / "results.html").read_text()
 
 
-def test_plots_are_svg_and_stand_in_the_page(tmp_path):
+def test_plots_are_svg_and_part_of_the_page(tmp_path):
     def rising(sequence, variant, seed):
         return {"ate_rmse_cm": 100.0 if variant == "without 1" and sequence == "hall" else 1.0 + seed}
 
@@ -119,7 +119,7 @@ stays
 """
 
 
-def test_a_pages_regions_are_filled_and_the_rest_is_left(tmp_path):
+def test_regions_of_a_page_are_replaced_and_the_rest_is_kept(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(PAGE)
     summary = made_up_summary(ablation(), figures)
@@ -133,7 +133,7 @@ def test_a_pages_regions_are_filled_and_the_rest_is_left(tmp_path):
     assert page.read_text() == text
 
 
-def test_a_page_without_regions_is_refused(tmp_path):
+def test_page_without_regions_is_refused(tmp_path):
     page = tmp_path / "page.md"
     with pytest.raises(OutputError, match="page.md: no such page"):
         update_page(page, made_up_summary(ablation(), figures))

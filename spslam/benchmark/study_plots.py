@@ -1,4 +1,4 @@
-"""Plots of a study as SVG: a panel a sequence, a line a series, seeds as bars from the least to the greatest."""
+"""Plots of a study as SVG: one panel per sequence, one line per series, a bar from the lowest to the highest seed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spslam.benchmark.summary import Summary
 WIDTH, HEIGHT = 330, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 30, 42
 _LEGEND_HEIGHT = 26
-# Told apart with any color vision, and by their markers in print.
+# Distinguishable with color-vision deficiencies; in print the markers tell the lines apart.
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _STYLE = (
     "text{font:12px sans-serif;fill:#222}.title{font-weight:600}.grid{stroke:#ddd}.axis{stroke:#888}"
@@ -39,7 +39,7 @@ class Panel:
 
 
 def plot_study(summary: Summary, study: Study, name: str) -> str | None:
-    """A study's figure over its axis, one panel a sequence; None where nothing was measured."""
+    """A figure over a study's axis, one panel per sequence; None where nothing was measured."""
     panels = [
         Panel(sequence, lines)
         for sequence in summary.sequences(study)
@@ -64,9 +64,15 @@ def _lines(summary: Summary, study: Study, sequence: str, name: str) -> list[Lin
 
 
 def draw(panels: Sequence[Panel], x_label: str, y_label: str, x_log: bool) -> str:
-    """Panels side by side over one legend, as a file of its own: white ground, no script, no font but the system's.
+    """An SVG file with panels side by side above one legend.
 
-    A value axis whose values span more than a factor of 20 is logarithmic, as is the other with ``x_log``.
+    A value axis is logarithmic if its values span more than a factor of 20.
+
+    Args:
+        panels: at least one.
+        x_label: of the horizontal axis.
+        y_label: of the value axis; part of each panel's title.
+        x_log: whether the horizontal axis is logarithmic.
     """
     names = list(dict.fromkeys(line.name for panel in panels for line in panel.lines))
     parts = [_panel(panel, i * WIDTH, names, x_label, y_label, x_log) for i, panel in enumerate(panels)]
@@ -127,7 +133,7 @@ def _legend(names: list[str], top: float) -> str:
 
 
 def _scale(low: float, high: float, start: float, stop: float, log: bool) -> Callable[[float], float]:
-    """From [low, high] to [start, stop] of the picture."""
+    """Maps [low, high] to [start, stop] in the picture."""
     place = math.log10 if log else float
     span = place(high) - place(low) or 1.0
     return lambda value: start + (stop - start) * (place(value) - place(low)) / span
@@ -142,6 +148,6 @@ def _ticks(high: float) -> list[float]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten about [low, high]."""
+    """The powers of ten that enclose [low, high]."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     return [10.0**power for power in range(first, last + 1)]

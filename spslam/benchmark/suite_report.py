@@ -1,4 +1,4 @@
-"""The files a benchmark leaves: summary.json, results.md, results.html, plots, and tables put into a page of ours."""
+"""Results of a suite: summary.json, results.md, results.html, plots, and tables in regions of a Markdown page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from spslam.benchmark.figures import figure
-from spslam.benchmark.plots import plot_study
+from spslam.benchmark.study_plots import plot_study
 from spslam.benchmark.summary import Summary
 from spslam.benchmark.tables import Table, make_tables, to_markdown
 from spslam.errors import OutputError
@@ -23,9 +23,17 @@ _REGION = re.compile(r"(<!-- bench ([^>]+?) -->\n).*?(<!-- /bench -->)", re.DOTA
 
 
 def write_results(summary: Summary, output: Path) -> list[Table]:
-    """Write summary.json, results.md, results.html and plots/ into a folder; returns the tables.
+    """Writes summary.json, results.md, results.html and plots/ into a folder.
 
-    Raises OutputError when a file can't be written.
+    Args:
+        summary: of the suite.
+        output: the folder.
+
+    Returns:
+        The tables.
+
+    Raises:
+        OutputError: a file can't be written.
     """
     tables = make_tables(summary)
     plots = write_plots(summary, output / PLOTS, f"{summary.suite.name}-")
@@ -36,7 +44,16 @@ def write_results(summary: Summary, output: Path) -> list[Table]:
 
 
 def write_plots(summary: Summary, folder: Path, prefix: str) -> dict[str, list[Path]]:
-    """Draw every study's plots into a folder; returns their files by study."""
+    """Writes the plots of all studies.
+
+    Args:
+        summary: of the suite.
+        folder: for the SVG files; created if there is a plot.
+        prefix: of the file names.
+
+    Returns:
+        The files by study.
+    """
     files: dict[str, list[Path]] = {}
     for study in summary.suite.studies:
         for name in study.plots:
@@ -50,19 +67,20 @@ def write_plots(summary: Summary, folder: Path, prefix: str) -> dict[str, list[P
 
 
 def update_page(page: Path, summary: Summary) -> list[str]:
-    """Put tables and plots into a Markdown page's regions; the rest of it stays as it is.
+    """Replaces the content of a Markdown page's regions by tables and plots; the rest of the page is kept.
 
-    A region ``<!-- bench SUITE NAME -->`` to ``<!-- /bench -->`` holds the table NAME of the suite, ``SUITE machine``
-    what it was measured on, ``SUITE plots STUDY`` a study's plots, which are written into ``images/`` beside the page.
+    The region from `<!-- bench SUITE NAME -->` to `<!-- /bench -->` holds the suite's table NAME, `SUITE machine` what
+    it was measured on, and `SUITE plots STUDY` a study's plots, which are written into `images/` beside the page.
 
-    Returns
-    -------
-    The regions filled.
+    Args:
+        page: the file.
+        summary: of the suite.
 
-    Raises
-    ------
-    OutputError
-        The page is missing or has no region of this suite.
+    Returns:
+        Names of the regions replaced.
+
+    Raises:
+        OutputError: the page does not exist or has no region of this suite.
     """
     if not page.is_file():
         raise OutputError(f"{page}: no such page; it must have regions <!-- bench {summary.suite.name} NAME -->")
@@ -74,9 +92,18 @@ def update_page(page: Path, summary: Summary) -> list[str]:
 
 
 def fill_regions(page: Path, prefix: str, content: dict[str, str]) -> list[str]:
-    """Replace what stands in a page's regions ``<!-- bench PREFIX NAME -->`` by ``content[NAME]``; returns the names.
+    """Replaces the content of a Markdown page's regions `<!-- bench PREFIX NAME -->`.
 
-    Raises OutputError when the page has no region of that prefix; regions without content stay as they are.
+    Args:
+        page: the file.
+        prefix: first word of the regions' names.
+        content: new text by NAME; regions without one are kept.
+
+    Returns:
+        Names of the regions replaced.
+
+    Raises:
+        OutputError: the page has no region with this prefix.
     """
     filled: list[str] = []
     regions: list[str] = []
@@ -97,12 +124,12 @@ def fill_regions(page: Path, prefix: str, content: dict[str, str]) -> list[str]:
 
 
 def describe_machine(summary: Summary) -> str:
-    """What the runs were measured on, one line each."""
+    """What the runs were measured on, as a list with a line per machine."""
     return "\n".join(f"- {line}" for line in _machines(summary)) or "Nothing was measured."
 
 
 def describe_gaps(summary: Summary) -> list[str]:
-    """What the tables don't hold: sequences skipped, runs failed; one line each."""
+    """What is missing in the tables: a line per skipped sequence and failed run."""
     lines = [f"skipped {name}: {reason}" for name, reason in summary.skipped.items()]
     return lines + [f"failed {line}" for line in summary.failed]
 
@@ -157,7 +184,7 @@ def _html_page(summary: Summary, tables: list[Table], plots: dict[str, list[Path
     parts.append(_html_list(_machines(summary)))
     for table in tables:
         parts.append(f"<h2>{html.escape(table.title)}</h2><p>{html.escape(table.note)}</p>{_html_table(table)}")
-        # Inside the page, so that it can be passed on as one file.
+        # Inline, so that the page is a single file.
         parts += [path.read_text(encoding="utf-8") for path in plots.get(table.name, [])]
     gaps = describe_gaps(summary)
     parts += [f"<h2>Not measured</h2>{_html_list(gaps)}"] if gaps else []

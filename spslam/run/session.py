@@ -1,0 +1,68 @@
+"""A run from its start, or from its last checkpoint: where it begins and what it continues."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spslam.config import dump_config
+from spslam.datasets.base import RgbdDataset
+from spslam.errors import OutputError
+from spslam.io import atomic_write
+from spslam.run.clock import RunClock
+from spslam.run.output_folder import OutputFolder
+from spslam.run.provenance import provenance
+from spslam.run.request import RunRequest
+from spslam.slam.checkpoint import load_checkpoint
+from spslam.slam.system import SlamSystem
+
+
+@dataclass(frozen=True)
+class RunSession:
+    """One execution of a run; an interrupted run has several.
+
+    Attributes:
+        folder: for the results.
+        identity: JSON object that identifies the frames; a checkpoint is only resumed with the same ones.
+        total: number of frames of the whole run.
+        start: position of the first frame to process.
+        clock: continues the earlier sessions'.
+    """
+
+    folder: OutputFolder
+    identity: dict[str, Any]
+    total: int
+    start: int
+    clock: RunClock
+
+
+def open_session(request: RunRequest, dataset: RgbdDataset, system: SlamSystem) -> RunSession:
+    """Creates the output folder, or restores the system from the folder's checkpoint.
+
+    Args:
+        request: of the run.
+        dataset: its frames.
+        system: new; its state is restored from the checkpoint if the request resumes one.
+
+    Raises:
+        OutputError: the folder can't be used, or its checkpoint belongs to another run.
+    """
+    folder, identity = OutputFolder(Path(request.output_dir)), _identity(dataset, request.data_dir)
+    if request.resume and folder.checkpoint.exists():
+        saved = load_checkpoint(folder.checkpoint, system.state, system.config)
+        if saved["data"] != identity:
+            raise OutputError(f"{folder.path}: belongs to a run over other data or frames; use another --output")
+        folder.remove_temporaries()
+        folder.truncate_log(len(system.state.frames), saved["next"])
+        return RunSession(folder, identity, len(dataset), saved["next"], RunClock(**saved["clock"]))
+    folder.create(request.resume)
+    atomic_write(folder.config, dump_config(system.config, provenance(system.config, system.device)))
+    return RunSession(folder, identity, len(dataset), 0, RunClock())
+
+
+def _identity(dataset: RgbdDataset, data_dir: Path | None) -> dict[str, Any]:
+    return {
+        "folder": str(Path(data_dir).resolve()) if data_dir else "",
+        "frames": len(dataset),
+        "timestamps": hashlib.sha256(dataset.timestamps().tobytes()).hexdigest()[:16],
+    }

@@ -1,0 +1,110 @@
+"""The file names of a run's output folder, in one place.
+
+A run writes these files; evaluation, reports and commands read them.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+MESH_FORMATS = ("ply", "glb", "obj")
+
+_COLOR_PREVIEW = re.compile(r"frame-([0-9]{6,})\.png")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths of the files in a run's output folder; a file need not exist.
+
+    Attributes:
+        path: the folder.
+
+    Example:
+        >>> RunFolder(Path("runs/demo")).trajectory
+        PosixPath('runs/demo/trajectory.txt')
+    """
+
+    path: Path
+
+    @property
+    def trajectory(self) -> Path:
+        """Estimated trajectory in the TUM format."""
+        return self.path / "trajectory.txt"
+
+    @property
+    def map(self) -> Path:
+        """The map: sparse volume, feature planes and decoders."""
+        return self.path / "map.safetensors"
+
+    @property
+    def mesh(self) -> Path:
+        """The mesh that a run extracts."""
+        return self.mesh_as("ply")
+
+    def mesh_as(self, file_format: str) -> Path:
+        """The mesh in one of `MESH_FORMATS`."""
+        return self.path / f"mesh.{file_format}"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON object; written when a run has finished."""
+        return self.path / "metrics.json"
+
+    @property
+    def report(self) -> Path:
+        """The report, one HTML file."""
+        return self.path / "report.html"
+
+    @property
+    def config(self) -> Path:
+        """All options of the run; the first file that a run writes."""
+        return self.path / "config.yaml"
+
+    @property
+    def log(self) -> Path:
+        """One JSON object per processed frame."""
+        return self.path / "log.jsonl"
+
+    @property
+    def skipped(self) -> Path:
+        """One JSON object per frame that could not be read; absent where there is none."""
+        return self.path / "skipped.jsonl"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The state to resume from; removed when the run has finished."""
+        return self.path / "checkpoint.safetensors"
+
+    @property
+    def previews(self) -> Path:
+        """Folder of the input that the report shows: camera, ground truth and some frames."""
+        return self.path / "previews"
+
+    @property
+    def preview_camera(self) -> Path:
+        """Intrinsics of the frames in `previews`, as JSON."""
+        return self.previews / "camera.json"
+
+    @property
+    def preview_ground_truth(self) -> Path:
+        """Ground-truth trajectory in the TUM format; absent where none is known."""
+        return self.previews / "ground_truth.txt"
+
+    def color_preview(self, row: int) -> Path:
+        """Color image of the frame in a row of the trajectory."""
+        return self.previews / f"frame-{row:06d}.png"
+
+    def depth_preview(self, row: int) -> Path:
+        """Depth image of the frame in a row of the trajectory, 16 bits, millimeters."""
+        return self.previews / f"depth-{row:06d}.png"
+
+    def preview_rows(self) -> list[int]:
+        """Rows of the trajectory that have a color preview, ascending."""
+        names = (_COLOR_PREVIEW.fullmatch(path.name) for path in self.previews.glob("*.png"))
+        return sorted(int(name[1]) for name in names if name)
+
+    def files(self) -> list[Path]:
+        """All files that a run or a later command may leave directly in the folder; `previews` is not among them."""
+        meshes = [self.mesh_as(file_format) for file_format in MESH_FORMATS]
+        others = [self.metrics, self.report, self.config, self.log, self.skipped, self.checkpoint]
+        return [self.trajectory, self.map, *meshes, *others]
