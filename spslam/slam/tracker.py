@@ -233,7 +233,7 @@ class Tracker:
         It begins at the last trusted frame, and where that is no good at the stored frames that look most alike.
         """
         tracking, alignment, best = self.config.tracking, IcpAlignment(pixels, self.camera), first
-        last = history.last() if tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost) else None
+        last = history.last() if tracking.recovery and (tracking.optimizer == "gauss_newton" or first.lost) else None
         starts = [] if last is None else [alignment.pose(last, guess) for guess in (start, last.pose)]
         best = self._best(scene, pixels, starts, start, frame, best)
         # After lost frames whose poses agree, the way to where the camera was is not that from the start.

@@ -116,7 +116,7 @@ def test_what_cannot_be_rescued_stays_lost(dataset, system, pixels):
 
 
 def test_rescue_can_be_turned_off(dataset, pixels):
-    off = ("tracking.rescue=false", "tracking.relocalization_candidates=0")
+    off = ("tracking.recovery=false", "tracking.relocalization_candidates=0")
     plain = SlamSystem(settings(*off), dataset.camera, dataset.poses()[0])
     plain.process(dataset[0])
     result = plain.tracker.track(plain.state.scene, pixels, moved(dataset.poses()[10], 50.0, 90.0), 10, plain.history)
