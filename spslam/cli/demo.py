@@ -7,12 +7,17 @@ import shutil
 from pathlib import Path
 
 from spslam.cli.arguments import add_device, add_quiet, at_least_one, overrides
+from spslam.cli.command_name import command_name
+from spslam.cli.download import DEFAULT_DATA
 from spslam.cli.progress import print_summary
 from spslam.cli.run import run
 from spslam.config import load_config
+from spslam.download import find_source
 from spslam.errors import ConfigError, OutputError
 
 DEFAULT_OUTPUT = Path("runs/demo")
+# A short recording of a desk, named when the demo is done.
+FIRST_DOWNLOAD = "tum/fr1_desk"
 # What a run leaves; an earlier demo's are removed, anything else is left alone.
 RUN_FILES = (
     "checkpoint.safetensors",
@@ -50,11 +55,12 @@ def execute(args: argparse.Namespace) -> None:
     resolve_device(config.device)
     _remove_earlier_demo(args.output)
     frames = None if args.frames is None else slice(0, args.frames, 1)
-    command = "spslam run demo" if frames is None else f"spslam run demo --frames 0:{args.frames}"
+    command = f"{command_name()} run demo" + ("" if frames is None else f" --frames 0:{args.frames}")
     run(config, args.output, frames, resume=False, mesh=True, quiet=args.quiet, command=command)
     metrics = _evaluate(args.output)
     if not args.quiet:
         print_summary(metrics, args.output)
+        print(_what_next(args.output))
 
 
 def _remove_earlier_demo(output: Path) -> None:
@@ -72,6 +78,17 @@ def _remove_earlier_demo(output: Path) -> None:
     for path in output.glob(".*.tmp.*"):
         path.unlink()
     shutil.rmtree(output / "previews", ignore_errors=True)
+
+
+def _what_next(output: Path) -> str:
+    """The commands that a newcomer would run after the demo."""
+    spslam, source = command_name(), find_source(FIRST_DOWNLOAD)
+    return f"""
+Open {output / "report.html"} in a browser. Next, a public recording:
+  {spslam} download {source.name}
+  {source.run_command(spslam, DEFAULT_DATA)}
+or your own, see docs/own-data.md:
+  {spslam} run folder --data DIR"""
 
 
 def _evaluate(output: Path) -> dict:
