@@ -2,12 +2,17 @@
 # PYTHON=... uses an environment of your own instead, in which `pip install -e '.[dev]'` was done.
 TORCH ?= 2.13.0
 JOBS ?= $(shell nproc)
+# On a terminal pip shows how far it is.
+PIP := --disable-pip-version-check $(if $(MAKE_TERMOUT),,--quiet)
 SPSLAM_CUDA ?= OFF
 CUDA_ARCHS ?= 90-real
 
 ifeq ($(origin PYTHON), undefined)
 PYTHON := .venv/bin/python
 ENVIRONMENT := .venv/ready
+COMMAND := .venv/bin/spslam
+else
+COMMAND := $(PYTHON) -m spslam
 endif
 # Commands that come with the environment are looked for beside its Python first.
 RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
@@ -15,16 +20,19 @@ RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
 
-.PHONY: help demo test test-gpu dev lint example-cpp test-numpy test-asan
+.PHONY: help demo test test-all test-gpu dev lint example-cpp test-numpy test-asan
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
 demo: dev ## track and map a generated room with known truth, into runs/demo
-	$(PYTHON) -m spslam.cli.main demo
+	$(COMMAND) demo
 
-test: dev ## build, then run the tests on the CPU
+test: dev ## build, then run the tests on the CPU, without the slow sweeps
 	$(PYTHON) -m pytest
+
+test-all: dev ## the same with the slow sweeps, as CI does
+	$(PYTHON) -m pytest -m ""
 
 test-gpu: ## run the tests that need a CUDA device, with the kernels that are there: built in place, or a wheel's
 	$(PYTHON) tests/run_on_gpu.py
@@ -46,7 +54,7 @@ example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, wi
 	$(RUN) ctest --test-dir build/example-cpp --output-on-failure
 
 test-numpy: dev ## install bindings/numpy and test it against the torch ops
-	SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps \
+	SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install $(PIP) --no-deps \
 	  --force-reinstall ./bindings/numpy
 	$(PYTHON) -m pytest bindings/numpy/tests
 
@@ -67,9 +75,15 @@ lint: $(ENVIRONMENT) ## style and types
 	  'examples/*.h' 'examples/*.cpp' 'bindings/*.h' 'bindings/*.cpp')
 	$(PYTHON) -m mypy
 
-# torch first and pinned: a plain 'torch' may bring gigabytes of CUDA libraries.
+# torch first and pinned: a plain 'torch' may bring gigabytes of CUDA libraries. The package is installed as a link to
+# this folder, with the command; `dev` builds its kernels.
 .venv/ready: pyproject.toml
+	@python3 -c 'import sys; sys.exit(sys.version_info < (3, 10) and "spslam needs Python 3.10 or later, got " + sys.version)'
+	@for c in $(CXX) c++ clang++; do command -v $$c > /dev/null && exit 0; done; \
+	  echo "spslam needs a C++17 compiler such as g++" >&2; exit 1
 	python3 -m venv .venv
-	.venv/bin/python -m pip install --quiet --disable-pip-version-check torch==$(TORCH) setuptools
-	.venv/bin/python -m pip install --quiet --disable-pip-version-check $$(.venv/bin/python cmake/requirements.py dev)
+	@echo "Installing torch $(TORCH) and the other requirements into .venv, a few minutes"
+	.venv/bin/python -m pip install $(PIP) torch==$(TORCH) "setuptools>=77"
+	.venv/bin/python -m pip install $(PIP) $$(.venv/bin/python cmake/requirements.py dev)
+	SPSLAM_BUILD=OFF .venv/bin/python -m pip install $(PIP) --no-build-isolation --no-deps --editable .
 	touch $@

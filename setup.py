@@ -11,8 +11,12 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent / "cmake"))
 from setuptools import Extension, find_packages, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
+from setuptools.config.pyprojecttoml import load_file
+from spslam_build import cuda_setting, readme_for_index, torch_dir
 
-OPTIONS = ("SPSLAM_CUDA", "SPSLAM_CUDA_ARCHS", "SPSLAM_CPU_ISAS")
+OPTIONS = ("SPSLAM_CUDA_ARCHS", "SPSLAM_CPU_ISAS")
+ROOT = pathlib.Path(__file__).parent.resolve()
+REPOSITORY = load_file(ROOT / "pyproject.toml")["project"]["urls"]["Homepage"]
 
 
 class CMakeBuild(build_ext):
@@ -25,20 +29,23 @@ class CMakeBuild(build_ext):
         return [str(path) for path in (pathlib.Path(self.build_lib) / "spslam").glob("_ops_*.so")]
 
     def run(self):
-        from spslam_build import torch_dir
-
+        if self.inplace and os.environ.get("SPSLAM_BUILD") == "OFF":
+            return  # an editable install whose kernels come from `make dev`
         torch = torch_dir()
         if torch is None:
             raise SystemExit("spslam: torch is not installed; install torch >= 2.11 first, or set SPSLAM_TORCH_DIR")
-        source = pathlib.Path(__file__).parent.resolve()
         build = pathlib.Path(self.build_temp).resolve()
-        destination = source if self.inplace else pathlib.Path(self.build_lib).resolve()
+        destination = ROOT if self.inplace else pathlib.Path(self.build_lib).resolve()
         build.mkdir(parents=True, exist_ok=True)
         arguments = [f"-DSPSLAM_TORCH_DIR={torch}", f"-DCMAKE_INSTALL_PREFIX={destination}"]
+        cuda, notice = cuda_setting(torch, os.environ.get("SPSLAM_CUDA"))
+        if notice:
+            print(notice, file=sys.stderr)
+        arguments += [f"-DSPSLAM_CUDA={cuda}"]
         arguments += [f"-D{name}={os.environ[name]}" for name in OPTIONS if os.environ.get(name)]
         arguments += shlex.split(os.environ.get("CMAKE_ARGS", ""))
         # --fresh: what an earlier build found (ninja, torch) lay in pip's temporary environment, and is gone.
-        subprocess.check_call(["cmake", "--fresh", "-S", str(source), "-B", str(build), "-G", "Ninja", *arguments])
+        subprocess.check_call(["cmake", "--fresh", "-S", str(ROOT), "-B", str(build), "-G", "Ninja", *arguments])
         jobs = os.environ.get("MAX_JOBS") or os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL")
         subprocess.check_call(["cmake", "--build", str(build), *(["-j", jobs] if jobs else [])])
         subprocess.check_call(["cmake", "--install", str(build), "--component", "python"])
@@ -58,6 +65,8 @@ CONFIG_PACKAGES = {
 }
 
 setup(
+    long_description=readme_for_index((ROOT / "README.md").read_text(encoding="utf-8"), REPOSITORY),
+    long_description_content_type="text/markdown",
     packages=[*find_packages(include=["spslam", "spslam.*"]), *CONFIG_PACKAGES],
     package_dir=CONFIG_PACKAGES,
     package_data={

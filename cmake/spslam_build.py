@@ -8,10 +8,13 @@ one. Only when there is none is torch asked for as a build requirement.
 import importlib.util
 import os
 import pathlib
+import re
 import sysconfig
 
 from setuptools import build_meta as _setuptools
 from setuptools.build_meta import *  # noqa: F403
+
+_ABSOLUTE = r"https?:|mailto:"
 
 
 def torch_dir() -> pathlib.Path | None:
@@ -26,6 +29,36 @@ def torch_dir() -> pathlib.Path | None:
         if (candidate / "version.py").exists():
             return candidate
     return None
+
+
+def cuda_setting(torch: pathlib.Path, chosen: str | None) -> tuple[str, str | None]:
+    """What CMake is given as SPSLAM_CUDA, and a line for the user where that leaves CUDA out.
+
+    Without a choice, or with AUTO, CUDA kernels are built only for a CUDA build of torch (then CMake looks for nvcc):
+    they can't be used with any other. A torch that pip fetched for the build is of the kind that it installs with
+    spslam, as both come from the same index.
+
+    Args:
+        torch: folder of the torch package to build against.
+        chosen: the user's SPSLAM_CUDA.
+    """
+    if chosen and chosen.upper() != "AUTO":
+        return chosen, None
+    if (torch / "lib" / "libtorch_cuda.so").exists():
+        return "AUTO", None
+    return "OFF", f"spslam: no CUDA kernels: the torch in {torch} is a CPU build; set SPSLAM_CUDA=ON to build them"
+
+
+def readme_for_index(text: str, url: str) -> str:
+    """The README as a package index shows it: links and images of the repository by their addresses.
+
+    Args:
+        text: in Markdown, with links relative to the repository.
+        url: of the repository.
+    """
+    raw = url.replace("https://github.com/", "https://raw.githubusercontent.com/")
+    text = re.sub(rf"(!\[[^\]]*\]\()(?!{_ABSOLUTE})", rf"\g<1>{raw}/main/", text)
+    return re.sub(rf"((?<!!)\[[^\]]*\]\()(?!{_ABSOLUTE}|#)", rf"\g<1>{url}/blob/main/", text)
 
 
 def _torch_requirement() -> list[str]:

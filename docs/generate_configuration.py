@@ -5,6 +5,7 @@ Run it from the repository after changing an option; a test says when it is due.
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -16,10 +17,11 @@ sys.path.insert(0, str(ROOT))
 
 from spslam.config import config_names  # noqa: E402
 from spslam.options import PRESETS, Config, Section  # noqa: E402
+from spslam.options.needs import Condition, needs_of  # noqa: E402
 
 HEADER = """# Configuration
 
-<!-- Written by docs/generate_configuration.py; change spslam/options.py or configs/ and run it again. -->
+<!-- Written by docs/generate_configuration.py; change spslam/options/ or configs/ and run it again. -->
 
 A run's options are merged from four places, each winning over the one before:
 
@@ -31,8 +33,9 @@ A run's options are merged from four places, each winning over the one before:
 
 A file may name its `preset`, and under `presets: {{paper: {{...}}}}` give options that apply with that preset alone;
 so `configs/replica.yaml` holds the paper's iterations for Replica without touching the other presets. Unknown options,
-wrong types and values out of range are refused before anything runs. The resolved options of a run are in its
-`config.yaml`, which can be given to `spslam run` again.
+wrong types and values out of range are errors before anything runs. So is an option from a file or `--set` that has no
+effect with the other options: "only with" below says what it needs. The resolved options of a run are in its
+`config.yaml`, marked with `resolved: true`, which can be given to `spslam run` again.
 
 From Python:
 
@@ -72,7 +75,8 @@ def _section(title: str, section: type[Section], prefix: str, values: dict[str, 
         default = _value(values[key]) if key in values else "none, must be given"
         unit = (field.json_schema_extra or {}).get("unit") or ""
         rows.append(f"| `{prefix}{key}` | {default} | {unit} | {_allowed(field)} | {_meaning(field)} |")
-    return f"## {title}\n\n" + "\n".join(rows) + "\n"
+    notes = inspect.cleandoc(section.__doc__ or "").partition("\n\n")[2]
+    return f"## {title}\n\n" + (f"{notes}\n\n" if notes else "") + "\n".join(rows) + "\n"
 
 
 def _preset_table(defaults: dict[str, Any], presets: dict[str, dict[str, Any]]) -> str:
@@ -115,7 +119,15 @@ def _value(value: Any) -> str:
 
 
 def _meaning(field: Any) -> str:
-    return field.description.replace("|", "\\|")
+    needs = [" or ".join(map(_condition, need.any_of)) for need in needs_of(field) if not need.said_by_section]
+    text = field.description + (f"; only with {', and '.join(needs)}" if needs else "")
+    return text.replace("|", "\\|")
+
+
+def _condition(condition: Condition) -> str:
+    value = _value(condition.value).strip("`")
+    forms = {"=": "`{}={}`", "!=": "`{}` other than `{}`", ">": "`{}` above {}"}
+    return forms[condition.relation].format(condition.option, value)
 
 
 def _allowed(field: Any) -> str:

@@ -19,26 +19,28 @@ import pydantic
 import yaml
 
 from spslam.errors import ConfigError
-from spslam.options import PRESETS, Config, Section
+from spslam.options import PRESETS, Config
+from spslam.options.faults import brief, describe_fault, describe_unused, option_paths
 
 __all__ = ["Config", "config_names", "dump_config", "load_config", "option_paths", "resolve_config_path"]
 
 Override = str | tuple[str, Any]
 
+# Marks a file that holds every option of a run, also those that have no effect with the others.
+RESOLVED = "resolved"
+
 
 def load_config(path: str | os.PathLike, preset: str | None = None, overrides: Iterable[Override] = ()) -> Config:
-    """Merge defaults < preset < file < overrides, and check the result.
+    """Merges defaults < preset < file < overrides, and checks the result.
 
-    Parameters
-    ----------
-    path : a YAML file, or the name of a shipped configuration (``7scenes``).
-    preset : one of ``PRESETS``; None is the file's ``preset``, else the default one.
-    overrides : ``section.key=value`` with the value in YAML, or pairs of ``section.key`` and a value.
+    Args:
+        path: a YAML file, or the name of a shipped configuration (`7scenes`).
+        preset: one of `PRESETS`; None is the file's `preset`, else the default one.
+        overrides: `section.key=value` with the value in YAML, or pairs of `section.key` and a value.
 
-    Raises
-    ------
-    ConfigError
-        One line that names the option or the file: unknown key, wrong type, value out of range, unreadable file.
+    Raises:
+        ConfigError: one line that names the option or the file: unknown key, wrong type, value out of range, unreadable
+            file, or an option of the file or the overrides that has no effect with the others.
     """
     path = resolve_config_path(path)
     file = _read(path)
@@ -47,18 +49,25 @@ def load_config(path: str | os.PathLike, preset: str | None = None, overrides: I
     name = preset or dict(changes).get("preset") or file.get("preset") or defaults["preset"]
     if name not in PRESETS:
         raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}")
+    is_resolved = _pop_resolved(file, path, name)
     merged = _merge(defaults, _read(_config_dir() / "presets" / f"{name}.yaml"), "")
-    merged = _merge(merged, file, "")
-    merged = _merge(merged, _preset_section(merged.pop("presets", {}), name), "")
-    for key, value in changes:
-        merged = _merge(merged, _nest(key, value), "")
-    return _validate({**merged, "preset": name})
+    given: set[str] = set()
+    presets = _preset_section(file.pop("presets", {}), name)
+    for layer in (file, presets, *(_nest(key, value) for key, value in changes)):
+        merged = _merge(merged, layer, "")
+        if layer is not file or not is_resolved:
+            given.update(_leaves(layer))
+    config = _validate({**merged, "preset": name})
+    if fault := describe_unused(config, given):
+        raise ConfigError(fault)
+    return config
 
 
 def dump_config(config: Config, header: Mapping[str, Any] | None = None) -> str:
     """The configuration as YAML that :func:`load_config` reads back to an equal one; ``header`` becomes comments."""
     comments = "".join(f"# {key}: {value}\n" for key, value in (header or {}).items())
-    return comments + yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    values = {RESOLVED: True, **config.model_dump(mode="json")}
+    return comments + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 
 def resolve_config_path(path: str | os.PathLike) -> Path:
@@ -86,15 +95,6 @@ def read_shipped(name: str) -> dict[str, Any]:
 def config_names() -> list[str]:
     """Names of the shipped configurations."""
     return sorted(path.stem for path in _config_dir().glob("*.yaml") if path.stem != "defaults")
-
-
-def option_paths(section: type[Section] = Config, prefix: str = "") -> Iterator[str]:
-    """All options as ``section.key``, in the order of :class:`spslam.options.Config`."""
-    for name, field in section.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            yield from option_paths(field.annotation, f"{prefix}{name}.")
-        else:
-            yield prefix + name
 
 
 def _config_dir() -> Path:
@@ -137,7 +137,7 @@ def _read(path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold sections of options, got {_brief(content)}")
+        raise ConfigError(f"{path}: must hold sections of options, got {brief(content)}")
     return content
 
 
@@ -173,21 +173,33 @@ def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict
             if value is None:  # a section whose lines are all commented out
                 continue
             if not isinstance(value, dict):
-                raise ConfigError(f"{prefix}{key} must be a section of options, got {_brief(value)}")
+                raise ConfigError(f"{prefix}{key} must be a section of options, got {brief(value)}")
             merged[key] = _merge(base[key], value, f"{prefix}{key}.")
         else:
             merged[key] = value
     return merged
 
 
+def _pop_resolved(file: dict[str, Any], path: Path, preset: str) -> bool:
+    """Takes the mark of a resolved configuration off its content; returns whether it was there."""
+    is_resolved = file.pop(RESOLVED, False)
+    if not isinstance(is_resolved, bool):
+        raise ConfigError(f"{RESOLVED} must be true or false, got {brief(is_resolved)}")
+    if is_resolved and file.get("preset") != preset:
+        raise ConfigError(
+            f"preset must be {file.get('preset')} or left out, got {preset}: {path} holds every option of a run already"
+        )
+    return is_resolved
+
+
 def _preset_section(presets: Any, name: str) -> dict[str, Any]:
     if not isinstance(presets, dict):
-        raise ConfigError(f"presets must be a section of options, got {_brief(presets)}")
+        raise ConfigError(f"presets must be a section of options, got {brief(presets)}")
     for key, value in presets.items():
         if key not in PRESETS:
             raise ConfigError(f"presets.{key} is not an option; it must be one of {', '.join(PRESETS)}")
         if not isinstance(value, dict):
-            raise ConfigError(f"presets.{key} must be a section of options, got {_brief(value)}")
+            raise ConfigError(f"presets.{key} must be a section of options, got {brief(value)}")
     return presets.get(name, {})
 
 
@@ -197,56 +209,13 @@ def _validate(values: dict[str, Any]) -> Config:
     except pydantic.ValidationError as error:
         # Of several faults the unknown key comes first: it is often the cause of the others.
         faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-        raise ConfigError(_describe(faults[0])) from None
+        raise ConfigError(describe_fault(faults[0])) from None
 
 
-def _describe(fault: Any) -> str:
-    path = ".".join(str(part) for part in fault["loc"])
-    kind, context, value = fault["type"], fault.get("ctx", {}), fault["input"]
-    if kind in ("extra_forbidden", "invalid_key"):
-        return _unknown(path)
-    if kind == "missing":
-        return f"{path} must be given; the configuration file has to say it"
-    if kind == "value_error":
-        return str(context["error"])
-    return f"{_option_path(path)} must {_rule(kind, context)}, got {_brief(value)}"
-
-
-def _unknown(path: str) -> str:
-    section, _, key = path.rpartition(".")
-    known = list(option_paths())
-    siblings = [option.rpartition(".")[2] for option in known if option.rpartition(".")[0] == section]
-    near = [f"{section}.{name}".lstrip(".") for name in difflib.get_close_matches(key, siblings, n=1)]
-    near = near or [option for option in known if option.rpartition(".")[2] == key]
-    near = near or difflib.get_close_matches(path, known, n=1, cutoff=0.8)
-    hint = f"did you mean {near[0]}?" if near else "docs/configuration.md lists them all"
-    return f"{path} is not an option; {hint}"
-
-
-def _option_path(path: str) -> str:
-    """The option a fault is in: pydantic appends the member's name to faults in a union."""
-    return next((option for option in option_paths() if path.startswith(f"{option}.")), path)
-
-
-def _rule(kind: str, context: Mapping[str, Any]) -> str:
-    rules = {
-        "greater_than_equal": "be at least {ge:g}",
-        "greater_than": "be above {gt:g}",
-        "less_than_equal": "be at most {le:g}",
-        "less_than": "be below {lt}",
-        "finite_number": "be finite",
-        "literal_error": "be {expected}",
-        "string_pattern_mismatch": "be auto, cpu, cuda or cuda:N",
-        "string_type": "be text",
-        "int_type": "be a whole number",
-        "int_from_float": "be a whole number",
-        "float_type": "be a number",
-        "bool_type": "be true or false",
-        "model_type": "be a section of options",
-    }
-    return rules.get(kind, "be valid ({kind})").format(kind=kind, **context).replace("'", "")
-
-
-def _brief(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """All options of nested sections as ``section.key``."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"

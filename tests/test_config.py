@@ -61,7 +61,7 @@ def test_later_layers_win(tmp_path):
 
 
 def test_exponents_without_a_point_are_numbers():
-    assert load_config("7scenes", overrides=["mapping.pose_rate=1e-4"]).mapping.pose_rate == 1e-4
+    assert load_config("7scenes", overrides=["tracking.damping=1e-3"]).tracking.damping == 1e-3
 
 
 def test_empty_section_changes_nothing(tmp_path):

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from importlib.metadata import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -18,14 +19,18 @@ DRAW = "from spslam import ops; print(ops.CPU_ISA, ops.philox_uniform(0, 0, 0, 0
 
 
 def spslam(*arguments: str) -> str:
-    return python("-m", "spslam.cli.main", *arguments)
+    """The command that was installed beside this Python."""
+    return run(str(Path(sys.executable).parent / "spslam"), *arguments)
 
 
 def python(*arguments: str, **environment: str) -> str:
-    command = [sys.executable, *arguments]
+    return run(sys.executable, *arguments, **environment)
+
+
+def run(*command: str, **environment: str) -> str:
     finished = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True)
     if finished.returncode:
-        sys.exit(f"check: {' '.join(arguments)} failed:\n{finished.stdout}{finished.stderr}")
+        sys.exit(f"check: {' '.join(command)} failed:\n{finished.stdout}{finished.stderr}")
     return finished.stdout
 
 
@@ -37,6 +42,16 @@ def check_it_is_the_installed_one() -> None:
         and ROOT / "build" not in Path(spslam.__file__).resolve().parents
     ):
         sys.exit(f"check: spslam must be the installed one, got {spslam.__file__}")
+
+
+def check_metadata() -> None:
+    """What a package index shows: links of the description must not be relative."""
+    found = metadata("spslam")
+    links = re.findall(r"\]\(([^)]+)\)", found.get_payload())
+    relative = [link for link in links if not re.match(r"https?:|mailto:|#", link)]
+    if not links or relative:
+        sys.exit(f"check: links of the description must be absolute, got {relative or 'none'}")
+    print(f"{len(links)} links of the description are absolute; {', '.join(found.get_all('Project-URL'))}")
 
 
 def check_doctor() -> None:
@@ -96,6 +111,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         check_it_is_the_installed_one()
+        check_metadata()
         check_doctor()
         check_instruction_sets()
         check_examples()

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from spslam.config import config_names
 from spslam.errors import OutputError
 from spslam.options import PRESETS
 
@@ -47,7 +48,9 @@ def positive_meters(text: str) -> float:
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """CONFIG and what changes it."""
-    parser.add_argument("config", metavar="CONFIG", help="a configuration file, or the name of a shipped one: 7scenes")
+    parser.add_argument(
+        "config", metavar="CONFIG", help=f"a configuration file, or a shipped one: {', '.join(config_names())}"
+    )
     parser.add_argument("--data", metavar="DIR", type=Path, help="folder of the data")
     parser.add_argument(
         "--set",

@@ -7,13 +7,18 @@ import shutil
 from pathlib import Path
 
 from spslam.cli.arguments import add_device, add_quiet, at_least_one, overrides
+from spslam.cli.command_name import command_name
+from spslam.cli.download import DEFAULT_DATA
 from spslam.cli.progress import print_summary
 from spslam.cli.run import make_request, run
 from spslam.config import load_config
+from spslam.download import find_source
 from spslam.errors import ConfigError, OutputError
 from spslam.run_folder import RunFolder
 
 DEFAULT_OUTPUT = Path("runs/demo")
+# A short recording of a desk, named when the demo is done.
+FIRST_DOWNLOAD = "tum/fr1_desk"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,11 +42,12 @@ def execute(args: argparse.Namespace) -> None:
     resolve_device(config.device)
     _remove_earlier_demo(RunFolder(args.output))
     frames = None if args.frames is None else slice(0, args.frames, 1)
-    command = "spslam run demo" if frames is None else f"spslam run demo --frames 0:{args.frames}"
+    command = f"{command_name()} run demo" + ("" if frames is None else f" --frames 0:{args.frames}")
     run(make_request(config, args.output, frames), args.quiet, command)
     metrics = _evaluate(RunFolder(args.output))
     if not args.quiet:
         print_summary(metrics, args.output)
+        print(_what_next(args.output))
 
 
 def _remove_earlier_demo(folder: RunFolder) -> None:
@@ -62,8 +68,19 @@ def _remove_earlier_demo(folder: RunFolder) -> None:
     shutil.rmtree(folder.previews, ignore_errors=True)
 
 
+def _what_next(output: Path) -> str:
+    """The commands that a newcomer would run after the demo."""
+    spslam, source = command_name(), find_source(FIRST_DOWNLOAD)
+    return f"""
+Open {RunFolder(output).report} in a browser. Next, a public recording:
+  {spslam} download {source.name}
+  {source.run_command(spslam, DEFAULT_DATA)}
+or your own, see docs/own-data.md:
+  {spslam} run folder --data DIR"""
+
+
 def _evaluate(folder: RunFolder) -> dict:
-    """Adds figures of the map, compared with the room's exact surface, to metrics and report."""
+    """Adds the mesh's figures, by the room's exact surface, to metrics and report."""
     from spslam.datasets.generated import GeneratedDataset
     from spslam.datasets.registry import open_dataset
     from spslam.evaluation.finished_run import add_metrics, surface_figures, view_figures

@@ -8,10 +8,12 @@ import time
 from pathlib import Path
 
 from spslam.cli.arguments import add_quiet
+from spslam.cli.command_name import command_name
 from spslam.download import SOURCES, Source, download, find_source, is_complete
 from spslam.download.catalog import SCANNET_TERMS
 
 SECONDS_BETWEEN_LINES = 2.0
+DEFAULT_DATA = Path("data")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "name", metavar="NAME", nargs="?", help="a data set (replica) or a part (7scenes/chess); 7scenes is all parts"
     )
     parser.add_argument(
-        "--data", metavar="DIR", type=Path, default=Path("data"), help="folder to put it in; data if not given"
+        "--data",
+        metavar="DIR",
+        type=Path,
+        default=DEFAULT_DATA,
+        help=f"folder to put it in; {DEFAULT_DATA} if not given",
     )
     add_quiet(parser)
 
@@ -51,8 +57,8 @@ def _bring(source: Source, data: Path, quiet: bool) -> None:
         print(f"{source.name}: {source.title}\nterms: {source.terms}", flush=True)
     brought = download(source, data, None if quiet else _Lines())
     if not quiet:
-        command = source.run.replace("--data ", f"--data {data}/")
-        print(f"{'ready' if brought else 'was there already'} in {data}; {command}")
+        state = "ready" if brought else "was there already"
+        print(f"{state} in {data}; next:\n  {source.run_command(command_name(), data)}")
 
 
 class _Lines:

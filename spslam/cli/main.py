@@ -66,8 +66,13 @@ def _run(arguments: list[str]) -> None:
 def _build_parser(command: str | None) -> Parser:
     """The parser; only the chosen command's module is imported, so that help comes at once."""
     from spslam import __version__
+    from spslam.config import config_names
 
-    parser = Parser(prog="spslam", description="Dense RGB-D SLAM: a trajectory and a colored mesh from RGB-D frames.")
+    parser = Parser(
+        prog="spslam",
+        description="Dense RGB-D SLAM: a trajectory and a colored mesh from RGB-D frames.",
+        epilog=f"configurations: {', '.join(config_names())}; spslam COMMAND --help shows the options of a command",
+    )
     parser.add_argument("--version", action="version", version=f"spslam {__version__}")
     _add_debug(parser)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")

@@ -33,8 +33,6 @@ def execute(args: argparse.Namespace) -> None:
     config = load_config(args.config, args.preset, overrides(args))
     if args.resume and args.output is None:
         raise UsageError("--resume needs the interrupted run's folder as --output")
-    if config.dataset.type == "generated" and args.data is not None:
-        raise UsageError("--data has no meaning here: the configuration is of the generated room, which needs no data")
     output = args.output or default_output(args.config)
     metrics = run(make_request(config, output, args.frames, args.resume, not args.no_mesh), args.quiet)
     if not args.quiet:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import re
+import shlex
 from dataclasses import dataclass
+from pathlib import Path
 
 from spslam.errors import DatasetError
 
@@ -57,7 +59,8 @@ class Source:
     terms : its license in words, and the page that has it.
     gigabytes : about what comes over the line.
     archives : its files.
-    run : the command that it is for, below the data folder.
+    config : the configuration that reads it.
+    folder : of one sequence, below the data folder.
     """
 
     name: str
@@ -65,7 +68,12 @@ class Source:
     terms: str
     gigabytes: float
     archives: tuple[Archive, ...]
-    run: str
+    config: str
+    folder: str
+
+    def run_command(self, spslam: str, data: Path) -> str:
+        """The command line that runs on a sequence of it; ``spslam`` is how the command is called."""
+        return f"{spslam} run {self.config} --data {shlex.quote(str(data / self.folder))}"
 
 
 def find_source(name: str) -> Source:
@@ -97,7 +105,8 @@ def _tum(name: str, sequence: str) -> Source:
         "CC BY 4.0; https://cvg.cit.tum.de/data/datasets/rgbd-dataset",
         1.5,
         (Archive(f"{_TUM}/{sequence.partition('_')[0]}/{folder}.tgz", "tum"),),
-        f"spslam run tum --data tum/{folder}",
+        "tum",
+        f"tum/{folder}",
     )
 
 
@@ -109,7 +118,8 @@ def _seven_scenes(scene: str) -> Source:
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes",
         3.0,
         (Archive(f"{_SEVEN_SCENES}/{scene}.zip", "7scenes"),),
-        f"spslam run 7scenes --data 7scenes/{scene}",
+        "7scenes",
+        f"7scenes/{scene}",
     )
 
 
@@ -120,7 +130,8 @@ SOURCES: tuple[Source, ...] = (
         "the Replica research terms, no commercial use; https://github.com/facebookresearch/Replica-Dataset",
         12.4,
         (Archive(f"{_REPLICA}/data/Replica.zip"), Archive(f"{_REPLICA}/cull_replica_mesh.zip")),
-        "spslam run replica --data Replica/room0",
+        "replica",
+        "Replica/room0",
     ),
     Source(
         "synthetic_rgbd",
@@ -128,7 +139,8 @@ SOURCES: tuple[Source, ...] = (
         "by the scenes' authors, CC-BY or CC-0; https://github.com/dazinovic/neural-rgbd-surface-reconstruction",
         7.5,
         (Archive(f"{_NEURAL_RGBD}/neural_rgbd_data.zip"), Archive(f"{_NEURAL_RGBD}/meshes.zip")),
-        "spslam run synthetic_rgbd --data neural_rgbd_data/grey_white_room",
+        "synthetic_rgbd",
+        "neural_rgbd_data/grey_white_room",
     ),
     *(_tum(f"tum/{name}", sequence) for name, sequence in _TUM_SHORT.items()),
     *(_seven_scenes(scene) for scene in _SCENES),

@@ -40,10 +40,10 @@ def _load_cpu() -> str:
 def _load_cuda() -> str | None:
     """Returns why CUDA is off, or None where it is on."""
     path = _FOLDER / "_ops_cuda.so"
-    if not path.exists():
-        return "spslam was built without CUDA"
     if not torch.version.cuda:
         return "the installed torch is a CPU build"
+    if not path.exists():
+        return "spslam was built without CUDA; install it again with SPSLAM_CUDA=ON in the environment"
     try:
         torch.ops.load_library(str(path))
     except OSError as error:

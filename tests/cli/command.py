@@ -5,20 +5,38 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
+
+from spslam.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 
 
-def spslam(*arguments: object, cwd: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    """Run ``spslam ARGUMENTS`` in a folder of its own."""
+def spslam(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run ``spslam ARGUMENTS`` in a folder, in this process: a new one would import torch again."""
+    command, before = [str(argument) for argument in arguments], Path.cwd()
+    with redirect_stdout(StringIO()) as output, redirect_stderr(StringIO()) as error:
+        os.chdir(cwd)
+        try:
+            code = main(command)
+        except SystemExit as end:  # of --help
+            code = int(end.code or 0)
+        finally:
+            os.chdir(before)
+    return subprocess.CompletedProcess(command, code, output.getvalue(), error.getvalue())
+
+
+def spslam_process(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run ``python -m spslam ARGUMENTS`` in a folder."""
     return subprocess.run(
-        [sys.executable, "-m", "spslam.cli.main", *map(str, arguments)],
+        [sys.executable, "-m", "spslam", *map(str, arguments)],
         cwd=cwd,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=timeout,
+        timeout=120,
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 from spslam.cli.progress import ProgressBar, ProgressLines, summarize
 from spslam.config import load_config
 from spslam.slam.fit import Fit
-from tests.cli.command import ROOT, assert_refused, spslam
+from tests.cli.command import ROOT, assert_refused, spslam, spslam_process
 
 SMALL = [
     "--set=dataset.width=96",
@@ -37,7 +37,9 @@ def run(cwd, *arguments):
 def finished(tmp_path_factory):
     """A folder with a finished run in `out`, and what the command said."""
     folder = tmp_path_factory.mktemp("finished")
-    return folder, run(folder, "--frames", "0:8", "--output", "out")
+    result = spslam_process("run", "demo", *SMALL, "--frames", "0:8", "--output", "out", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return folder, result
 
 
 def test_run_leaves_all_files_and_says_where(finished):
@@ -114,9 +116,10 @@ def test_output_is_named_after_configuration_and_time(tmp_path):
 
 
 def test_interruption_is_one_line_and_resumes_to_the_same_bytes(tmp_path):
-    arguments = [*SMALL, "--frames", "0:12", "--no-mesh", "--quiet"]
+    # As many as are still going on when a busy machine notices the first checkpoint.
+    arguments = [*SMALL, "--frames", "0:40", "--no-mesh", "--quiet"]
     run(tmp_path, *arguments, "--output", "whole")
-    command = [sys.executable, "-m", "spslam.cli.main", "run", "demo", *arguments, "--output", tmp_path / "cut"]
+    command = [sys.executable, "-m", "spslam", "run", "demo", *arguments, "--output", tmp_path / "cut"]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     checkpoint = tmp_path / "cut" / "checkpoint.safetensors"
     while not checkpoint.exists() and process.poll() is None:
@@ -133,9 +136,15 @@ def test_interruption_is_one_line_and_resumes_to_the_same_bytes(tmp_path):
 
 def test_demo_replaces_an_earlier_run_over_the_room(finished, tmp_path):
     shutil.copytree(finished[0] / "out", tmp_path / "runs" / "demo")
-    result = spslam("demo", "--frames", 1, "--device", "cpu", cwd=tmp_path, timeout=300)
+    result = spslam("demo", "--frames", 1, "--device", "cpu", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "F1 at 5 cm" in result.stdout
+    commands = re.findall(r"^  .* -m spslam (.*)$", result.stdout, re.MULTILINE)
+    assert commands == [
+        "download tum/fr1_desk",
+        "run tum --data data/tum/rgbd_dataset_freiburg1_desk",
+        "run folder --data DIR",
+    ]
     assert {path.name for path in (tmp_path / "runs" / "demo").iterdir()} == FILES | {"mesh.ply"}
     assert json.loads((tmp_path / "runs" / "demo" / "metrics.json").read_text())["frames"] == 1
 

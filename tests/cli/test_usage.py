@@ -1,6 +1,7 @@
 """The command line itself: help, versions, wrong arguments, and what becomes of errors."""
 
 import argparse
+import re
 import subprocess
 import sys
 
@@ -9,8 +10,10 @@ import pytest
 import spslam as package
 from spslam.cli import main as main_module
 from spslam.cli.arguments import parse_frames
+from spslam.cli.command_name import command_name
 from spslam.cli.doctor import cuda_archs
 from spslam.cli.main import COMMANDS, main
+from spslam.config import config_names
 from spslam.errors import DatasetError
 from tests.cli.command import ROOT, assert_refused, spslam
 
@@ -29,10 +32,22 @@ def test_each_command_has_help(tmp_path, command):
     assert f"usage: spslam {command}" in result.stdout
 
 
-def test_help_comes_without_torch():
-    code = "import sys; from spslam.cli.main import main; main([]); print('torch' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert result.stdout.splitlines()[-1] == "False"
+def test_help_lists_every_configuration(tmp_path):
+    for arguments in (["--help"], ["run", "--help"], ["check-data", "--help"]):
+        words = re.findall(r"\w+", spslam(*arguments, cwd=tmp_path).stdout)
+        assert set(config_names()) <= set(words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(["--help"], 0), (["run", "--help"], 0), (["run", "tum", "--data", "absent"], 2)]
+)
+def test_help_and_wrong_data_come_without_torch(arguments, code):
+    """Loading torch takes seconds."""
+    script = f"import sys, runpy; sys.argv = {['spslam', *arguments]}\n"
+    script += "try: runpy.run_module('spslam', run_name='__main__')\n"
+    script += "except SystemExit as end: print(end.code, 'torch' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert ended.stdout.splitlines()[-1] == f"{code} False"
 
 
 def test_version(tmp_path):
@@ -51,7 +66,9 @@ def test_version(tmp_path):
         (["run", "7scenes", "--frames", "9:5"], "--frames: must select at least one frame, got '9:5'"),
         (["run", "7scenes", "--frames", "0:9:0"], "with STEP at least 1, got '0:9:0'"),
         (["run", "7scenes", "--resume"], "--resume needs the interrupted run's folder as --output"),
-        (["run", "demo", "--data", "."], "--data has no meaning here"),
+        (["run", "demo", "--data", "."], "dataset.path (--data) is not used with dataset.type=generated; remove it or"),
+        (["check-data", "demo", "--data", "."], "dataset.path (--data) is not used with dataset.type=generated"),
+        (["run", "demo", "--set", "tracking.rescue=false"], "tracking.rescue is now called tracking.recovery"),
         (["demo", "--frames", "0"], "--frames: must be a whole number of at least 1, got '0'"),
         (["mesh", "x", "--resolution", "-1"], "--resolution: must be a length in meters above 0, got '-1'"),
         (["mesh", "x", "--format", "stl"], "--format: invalid choice: 'stl'"),
@@ -122,6 +139,28 @@ def test_debug_shows_where_an_error_comes_from(monkeypatch, capsys, arguments):
     assert error.splitlines()[-1].startswith("spslam: unexpected RuntimeError")
 
 
+def test_command_lines_on_the_screen_name_the_command_as_it_was_called(tmp_path, monkeypatch):
+    environment = tmp_path / "my project" / ".venv" / "bin"
+    environment.mkdir(parents=True)
+    program = environment / "spslam"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(program)])
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    assert command_name() == "'my project/.venv/bin/spslam'"
+    monkeypatch.chdir(environment.parent.parent)
+    assert command_name() == ".venv/bin/spslam"
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert command_name() == f"'{program}'"
+    monkeypatch.setenv("PATH", str(environment))
+    assert command_name() == "spslam"
+    monkeypatch.setattr(sys, "argv", ["/somewhere/spslam/__main__.py"])
+    monkeypatch.setattr(sys, "executable", "/opt/env/bin/python")
+    assert command_name() == "/opt/env/bin/python -m spslam"
+
+
 def test_doctor_names_kernels_and_why_cuda_is_off(tmp_path):
     result = spslam("doctor", cwd=tmp_path)
     assert result.returncode == 0
@@ -139,6 +178,6 @@ def test_doctor_reads_the_architectures_of_a_library(tmp_path):
 
 
 def test_reader_that_goes_away_is_no_error():
-    shell = f"{sys.executable} -m spslam.cli.main run --help | head -c 1"
+    shell = f"{sys.executable} -m spslam run --help | head -c 1"
     result = subprocess.run(["bash", "-c", shell], cwd=ROOT, capture_output=True, text=True)
     assert result.stderr == ""

@@ -175,8 +175,10 @@ def truncate(path: Path, keep: float = 0.5) -> None:
 
 
 def shared_data(name: str) -> Path:
-    """A folder of the recordings beside the repository; skips the test where it is absent."""
-    root = Path(os.environ.get("SPSLAM_TEST_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
-    if not (root / name).is_dir():
-        pytest.skip(f"{root / name} is absent; SPSLAM_TEST_DATA names the folder of the test recordings")
-    return root / name
+    """A folder of the recordings in the folder that SPSLAM_TEST_DATA names; skips the test where it is absent."""
+    root = os.environ.get("SPSLAM_TEST_DATA")
+    if not root:
+        pytest.skip("SPSLAM_TEST_DATA doesn't name the folder of the test recordings")
+    if not (Path(root) / name).is_dir():
+        pytest.skip(f"{Path(root) / name} is absent")
+    return Path(root) / name

@@ -1,5 +1,7 @@
 """Data sets by name: what is listed, what is fetched, and what is left alone."""
 
+import re
+
 import pytest
 
 from spslam.cli import download as command
@@ -20,7 +22,7 @@ def site():
 
 def source_of(site, sha256=None):
     archives = Archive(site.url("Rooms.zip"), sha256=sha256), Archive(site.url("desk.tgz"), "tum")
-    return Source("rooms", "rooms of a test", "public domain", 0.001, archives, "spslam run replica --data room")
+    return Source("rooms", "rooms of a test", "public domain", 0.001, archives, "replica", "room")
 
 
 EXPECTED = {**FILES, "tum/desk/rgb.txt": b"1 a.png"}
@@ -102,7 +104,7 @@ def test_names():
 def test_the_catalog_is_consistent():
     assert len({source.name for source in SOURCES}) == len(SOURCES)
     for source in SOURCES:
-        assert source.run.split()[2] in config_names()
+        assert source.config in config_names()
         assert all(archive.url.startswith("http") for archive in source.archives)
         assert "http" in source.terms
 
@@ -118,7 +120,9 @@ def test_the_command(site, tmp_path, monkeypatch, capsys):
     assert "scannet can't be downloaded without a form" in listed
     assert main(["download", "rooms", "--data", str(tmp_path)]) == 0
     printed = capsys.readouterr()
-    assert f"ready in {tmp_path}; spslam run replica --data {tmp_path}/room" in printed.out
+    assert re.search(
+        rf"^ready in {tmp_path}; next:\n  .* -m spslam run replica --data {tmp_path}/room$", printed.out, re.M
+    )
     assert "Rooms.zip: 100% of 0 MB" in printed.err
     assert main(["download", "rooms", "--data", str(tmp_path), "--quiet"]) == 0
     assert capsys.readouterr() == ("", "")

@@ -31,7 +31,9 @@ def test_a_library_that_does_not_load_is_explained(monkeypatch, tmp_path):
     with pytest.raises(ImportError, match=r"torch must be 2.11 or later, got .*: undefined symbol: x"):
         _library._load_cpu()
     monkeypatch.setattr(_library, "_FOLDER", tmp_path)
-    assert _library._load_cuda() == "spslam was built without CUDA"
-    (tmp_path / "_ops_cuda.so").touch()
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert _library._load_cuda() == "the installed torch is a CPU build"
     monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert _library._load_cuda().startswith("spslam was built without CUDA; install it again with SPSLAM_CUDA=ON")
+    (tmp_path / "_ops_cuda.so").touch()
     assert _library._load_cuda() == "_ops_cuda.so does not load: undefined symbol: x"

@@ -78,7 +78,14 @@ def test_adam_does_not_depend_on_threads(generator):
 
 def test_adam_empty(device):
     tensors = [torch.empty(0, 8, device=device) for _ in range(4)]
-    ops.sparse_adam_(*tensors, torch.empty(0, dtype=torch.int32, device=device), 1, lr=1e-2, step=1)
+    stamps = torch.empty(0, dtype=torch.int32, device=device)
+    assert ops.sparse_adam_(*tensors, stamps, 1, lr=1e-2, step=1) is None
+    assert [tuple(tensor.shape) for tensor in (*tensors, stamps)] == [(0, 8)] * 4 + [(0,)]
+    # No row of theirs: the arrays around them stay as they are.
+    whole = [torch.ones(2, 8, device=device) for _ in range(4)]
+    whole_stamps = torch.ones(2, dtype=torch.int32, device=device)
+    ops.sparse_adam_(*(tensor[1:1] for tensor in whole), whole_stamps[1:1], 1, lr=1e-2, step=1)
+    assert all(bool((tensor == 1).all()) for tensor in whole)
 
 
 def _adam_arguments(**changes):

@@ -89,7 +89,7 @@ def test_icp_leads_to_where_tracking_finds_the_pose(dataset, system, pixels, shi
 
 
 @pytest.mark.parametrize(("shift_m", "angle_deg"), [(0.15, 12.0), (50.0, 90.0)])
-def test_a_wrong_start_is_rescued(dataset, system, pixels, shift_m, angle_deg):
+def test_a_wrong_start_is_recovered(dataset, system, pixels, shift_m, angle_deg):
     ground_truth = dataset.poses()[10]
     start = moved(ground_truth, shift_m, angle_deg)
     alone = system.recovery.judge(system.tracker.track(TrackingProblem(system.state.scene, pixels.records, start, 10)))
@@ -108,7 +108,7 @@ class Elsewhere(FrameHistory):
         return Keyframe(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
 
 
-def test_what_cannot_be_rescued_stays_lost(dataset, system, pixels):
+def test_what_cannot_be_recovered_stays_lost(dataset, system, pixels):
     """The view of another place: no start helps."""
     start = moved(dataset.poses()[10], 50.0, 90.0)
     problem = TrackingProblem(system.state.scene, pixels.records, start, 10)
@@ -118,15 +118,15 @@ def test_what_cannot_be_rescued_stays_lost(dataset, system, pixels):
     assert torch.equal(result.pose, start)
 
 
-def test_rescue_can_be_turned_off(dataset, pixels):
-    off = ("tracking.rescue=false", "tracking.relocalization_candidates=0")
+def test_recovery_can_be_turned_off(dataset, pixels):
+    off = ("tracking.recovery=false", "tracking.relocalization_candidates=0")
     plain = SlamSystem(settings(*off), dataset.camera, dataset.poses()[0])
     plain.process(dataset[0])
     result = plain.localize(pixels, moved(dataset.poses()[10], 50.0, 90.0), 10)
     assert result.lost and not result.recovered
 
 
-def test_a_clean_run_needs_no_rescue(system):
+def test_a_clean_run_needs_no_recovery(system):
     assert not any(report.recovered or report.lost for report in system.reports)
     assert (
         min(report.fit.mean_robust_weight for report in system.reports[1:])

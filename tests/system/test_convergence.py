@@ -25,7 +25,7 @@ def accuracy(iterations, *overrides):
     dataset = Recorded(FRAMES)
     # A frame that does not fit must not be helped by others: ICP against them needs no map.
     sizes = (f"mapping.iterations={iterations}", f"mapping.first_iterations={iterations}")
-    changes = (*sizes, "tracking.rescue=false", *overrides)
+    changes = (*sizes, "tracking.recovery=false", *overrides)
     system = SlamSystem(settings(*changes), dataset.camera, dataset.poses()[0])
     for frame in dataset:
         system.process(frame)

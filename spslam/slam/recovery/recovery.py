@@ -152,7 +152,7 @@ class Recovery:
     ) -> list[torch.Tensor]:
         """Poses by ICP against the last trusted frame, from the predicted pose and from that frame's own."""
         tracking = self._config.tracking
-        wanted = tracking.rescue and (tracking.optimizer == "gauss_newton" or first.lost)
+        wanted = tracking.recovery and (tracking.optimizer == "gauss_newton" or first.lost)
         last = history.last() if wanted else None
         return [] if last is None else [alignment.pose(last, guess) for guess in (problem.predicted, last.pose)]
 

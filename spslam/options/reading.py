@@ -1,0 +1,67 @@
+"""Options of the data that a run reads, and of how it reads and saves."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from spslam.options.needs import is_, is_not, need
+from spslam.options.section import Section, option
+
+DatasetType = Literal["generated", "7scenes", "tum", "replica", "synthetic_rgbd", "scannet", "folder"]
+DATASET_TYPES: tuple[str, ...] = get_args(DatasetType)
+
+_GENERATED = need(is_("dataset.type", "generated"))
+_READ_FROM_FILES = need(is_not("dataset.type", "generated"))
+
+
+class DatasetOptions(Section):
+    """Which frames are read, and from where."""
+
+    type: DatasetType = option("format of the data; `generated` is a procedurally generated room that needs no files")
+    path: str | None = option("folder of the data; `--data` overrides it", needs=(_READ_FROM_FILES,))
+    stride: int = option("use every n-th frame", "frames", ge=1)
+    min_depth_m: float = option("smaller depth is treated as missing", "m", ge=0)
+    max_depth_m: float = option("larger depth is treated as missing", "m", gt=0, le=1000)
+    border_px: int = option("depth within this distance of the image border is treated as missing", "px", ge=0, le=1000)
+    sequence: str | int | None = option(
+        "the sequence, `seq-03` or 3; `train` or `test` is the first of that split, null the first in the folder",
+        needs=(need(is_("dataset.type", "7scenes")),),
+    )
+    depth_variant: Literal["filtered", "noisy", "exact"] | None = option(
+        "depth with filtered noise, with noise, or without; null is the first in the folder",
+        needs=(need(is_("dataset.type", "synthetic_rgbd")),),
+    )
+    depth_scale: float | None = option(
+        "depth units per meter; null takes the value from the files",
+        "1/m",
+        needs=(need(is_("dataset.type", "folder")),),
+        gt=0,
+    )
+    frames: int = option("length of the sequence; 300 go around the room once", "frames", needs=(_GENERATED,), ge=1)
+    width: int = option("width of the images", "px", needs=(_GENERATED,), ge=16)
+    height: int = option("height of the images", "px", needs=(_GENERATED,), ge=16)
+    noise: float = option(
+        "0 is exact depth and noise-free color, 1 the noise and missing depth of a Kinect", needs=(_GENERATED,), ge=0
+    )
+    seed: int = option("seed of the room, the trajectory and the noise", needs=(_GENERATED,), ge=0)
+
+    def check(self) -> None:
+        if self.max_depth_m <= self.min_depth_m:
+            raise ValueError(f"dataset.max_depth_m must be above dataset.min_depth_m, got {self.max_depth_m}")
+
+
+class RunOptions(Section):
+    """How frames are read and what is saved during a run."""
+
+    checkpoint_every: int = option("save a checkpoint every n frames; 0 saves none", "frames", ge=0)
+    prefetch_workers: int | None = option(
+        "threads that read and decode images; null chooses by the number of cores and the device", "threads", ge=1
+    )
+    reader: Literal["auto", "process", "threads"] = option(
+        "where these threads run: in a separate `process`, or as `threads` of the run; `auto` is `process` for a GPU "
+        "when the command line starts the run"
+    )
+    prefetch_ahead: int | None = option(
+        "maximum number of frames read ahead; null is two per thread, at least 8", "frames", ge=1
+    )
+    previews: int = option("input frames saved as images for the report", "frames", ge=0)
