@@ -18,7 +18,7 @@ from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.generated import FRAMES_PER_ROUND
 from spslam.errors import DatasetError
-from spslam.evaluation.trajectory import absolute_errors, align
+from spslam.evaluation.trajectory_metrics import absolute_errors, align
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.frame_feed import FrameFeed

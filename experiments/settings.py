@@ -30,7 +30,7 @@ from spslam.config import load_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
-from spslam.evaluation.trajectory import ate, rpe
+from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.run.device import resolve_device
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.warm_up import warm_up

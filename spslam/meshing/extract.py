@@ -8,8 +8,8 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.meshing.cleaning import face_support, faced_by_a_camera, in_large_part
-from spslam.meshing.lattice import SignedDistance, near_surface, near_surface_parts, sample_blocks
 from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
+from spslam.meshing.sdf_sampling import SignedDistance, near_surface, near_surface_parts, sample_blocks
 from spslam.scene import Scene
 
 CHUNK_POINTS = 1 << 19

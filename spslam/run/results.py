@@ -11,7 +11,7 @@ from spslam import __version__
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError
-from spslam.evaluation.trajectory import ate, rpe
+from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.io import atomic_write
 from spslam.run.output_folder import RunFiles
 from spslam.slam.system import SlamSystem
