@@ -46,7 +46,7 @@ def main() -> None:
                 print(f"round {len(held)}", flush=True)
     system.finish()
     path = system.trajectory()
-    known = path.ground_truth_of_known(ground_truth)
+    known = path.mask_lost(ground_truth)
     errors_cm = 100 * absolute_errors(path.poses, known, align(path.poses, known)).reshape(args.rounds, -1)
     lost = path.lost.reshape(args.rounds, -1).sum(1)
     rows = [

@@ -191,7 +191,7 @@ def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
     recovered = sum(report.result().recovered for report in reports)
     fps = len(dataset) / (time.perf_counter() - started)
     estimated = system.trajectory()
-    known = estimated.ground_truth_of_known(ground_truth)
+    known = estimated.mask_lost(ground_truth)
     figures = {**ate(estimated.poses, known), **rpe(estimated.poses, known)}
     counts = {"frames": len(dataset), "lost": int(estimated.lost.sum()), "recovered": recovered, "fps": fps}
     environment = describe_environment(device)

@@ -62,7 +62,7 @@ def write_results(
         **_sizes(system),
     }
     if ground_truth is not None:
-        known = trajectory.ground_truth_of_known(ground_truth[frames.indices.numpy()])
+        known = trajectory.mask_lost(ground_truth[frames.indices.numpy()])
         metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
     if mesh:
         tracked = trajectory.poses[~lost]
