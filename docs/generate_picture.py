@@ -11,7 +11,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from spslam.evaluation import pictures  # noqa: E402
+from spslam.evaluation import report_images  # noqa: E402
 from spslam.evaluation.run_output import RunOutput  # noqa: E402
 from spslam.meshing.render import render_mesh  # noqa: E402
 
@@ -25,7 +25,7 @@ def main(output: Path) -> None:
     if mesh is None or run.camera is None:
         raise SystemExit(f"{output}: has no mesh or no previews")
     poses = run.trajectory.poses
-    above = pictures.overview(mesh, pictures.outward_faces(mesh, run.camera, poses[0]), poses)
+    above = report_images.render_overview(mesh, report_images.outward_faces(mesh, run.camera, poses[0]), poses)
     seen, _ = render_mesh(mesh.vertices, mesh.faces, mesh.colors, run.camera, poses[preview.row], supersampling=2)
     half = (HEIGHT - GAP) // 2
     column = np.concatenate([_tall(preview.color, half), _white(GAP, _tall(seen, half).shape[1]), _tall(seen, half)])

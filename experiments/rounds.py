@@ -18,7 +18,7 @@ from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.generated import FRAMES_PER_ROUND
 from spslam.errors import DatasetError
-from spslam.evaluation.trajectory import absolute_errors, align
+from spslam.evaluation.trajectory_metrics import absolute_errors, align
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.frame_feed import FrameFeed
@@ -46,7 +46,7 @@ def main() -> None:
                 print(f"round {len(held)}", flush=True)
     system.finish()
     path = system.trajectory()
-    known = path.ground_truth_of_known(ground_truth)
+    known = path.mask_lost(ground_truth)
     errors_cm = 100 * absolute_errors(path.poses, known, align(path.poses, known)).reshape(args.rounds, -1)
     lost = path.lost.reshape(args.rounds, -1).sum(1)
     rows = [

@@ -31,7 +31,7 @@ from spslam.config import load_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
-from spslam.evaluation.trajectory import ate, rpe
+from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.run.device import resolve_device
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.warm_up import warm_up
@@ -192,7 +192,7 @@ def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
     recovered = sum(report.result().recovered for report in reports)
     fps = len(dataset) / (time.perf_counter() - started)
     estimated = system.trajectory()
-    known = estimated.ground_truth_of_known(ground_truth)
+    known = estimated.mask_lost(ground_truth)
     figures = {**ate(estimated.poses, known), **rpe(estimated.poses, known)}
     counts = {"frames": len(dataset), "lost": int(estimated.lost.sum()), "recovered": recovered, "fps": fps}
     environment = describe_environment(device)

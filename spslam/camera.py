@@ -15,16 +15,13 @@ class Camera:
     Axes are OpenCV's (x right, y down, z forward); pixel centers lie at whole numbers, so the image spans
     [-0.5, width - 0.5] x [-0.5, height - 0.5].
 
-    Attributes
-    ----------
-    width, height : image size in pixels.
-    fx, fy : focal lengths in pixels.
-    cx, cy : principal point in pixels.
+    Attributes:
+        width, height: image size in pixels.
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels.
 
-    Raises
-    ------
-    ValueError
-        When a size or a focal length isn't positive, or a number isn't finite.
+    Raises:
+        ValueError: a size or a focal length is not positive, or a number is not finite.
     """
 
     width: int
@@ -50,9 +47,15 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> Camera:
-        """The camera of an intrinsic matrix [3,3], or [4,4] with the intrinsics in its upper left corner.
+        """Builds a camera from an intrinsic matrix.
 
-        Raises ValueError for another shape, skew, or a last row other than (0, 0, 1).
+        Args:
+            matrix: [3, 3], or [4, 4] with the intrinsics in its upper left corner.
+            width: image width in pixels.
+            height: image height in pixels.
+
+        Raises:
+            ValueError: another shape, skew, or a last row other than (0, 0, 1).
         """
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape not in ((3, 3), (4, 4)):
@@ -65,11 +68,11 @@ class Camera:
         return cls(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 
     def matrix(self) -> np.ndarray:
-        """The intrinsic matrix, float64 [3,3]."""
+        """The intrinsic matrix, float64 [3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view in an image of another size."""
+        """The camera with the same field of view for another image size in pixels."""
         sx, sy = width / self.width, height / self.height
         return Camera(
             width,
@@ -81,22 +84,23 @@ class Camera:
         )
 
     def ray_directions(self) -> np.ndarray:
-        """Directions through the pixel centers with z = 1, float32 [height,width,3], camera axes."""
+        """Directions through the pixel centers with z = 1, float32 [height, width, 3], camera axes."""
         directions = np.ones((self.height, self.width, 3), dtype=np.float32)
         directions[..., 0] = (np.arange(self.width) - self.cx) / self.fx
         directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, None]
         return directions
 
     def unproject(self, depth: np.ndarray) -> np.ndarray:
-        """Points seen by a depth image.
+        """Back-projects a depth image to points.
 
-        Parameters
-        ----------
-        depth : [height,width], meters along the optical axis; 0 where there is none.
+        Args:
+            depth: [height, width], meters along the optical axis; 0 where there is none.
 
-        Returns
-        -------
-        float32 [height,width,3], camera axes, meters; (0, 0, 0) where the depth is 0.
+        Returns:
+            float32 [height, width, 3], camera axes, meters; (0, 0, 0) where the depth is 0.
+
+        Raises:
+            ValueError: `depth` of another shape.
         """
         depth = np.asarray(depth)
         if depth.shape != (self.height, self.width):
@@ -104,15 +108,16 @@ class Camera:
         return self.ray_directions() * depth[..., None].astype(np.float32, copy=False)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixel coordinates of points.
+        """Projects points to pixel coordinates.
 
-        Parameters
-        ----------
-        points : [...,3], camera axes, meters.
+        Args:
+            points: [..., 3], camera axes, meters.
 
-        Returns
-        -------
-        [...,2] of the points' precision: (u, v); NaN for points that aren't in front of the camera (z <= 0).
+        Returns:
+            [..., 2] of the dtype of `points`: (u, v); NaN for points that are not in front of the camera (z <= 0).
+
+        Raises:
+            ValueError: `points` of another shape.
         """
         points = np.asarray(points)
         if points.ndim < 1 or points.shape[-1] != 3:

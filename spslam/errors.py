@@ -1,17 +1,17 @@
-"""The errors spslam raises for input it can't work with.
+"""Exceptions for invalid user input.
 
-Each message is one line that names the file, the option or the argument at fault. Wrong arguments of a
-function are ``ValueError`` or ``TypeError``, as everywhere in Python; the classes here are for what a user
-brings: configurations, data, output folders, devices and weights.
+Each message is one line that names the file, the option or the argument at fault. Wrong arguments of a function raise
+`ValueError` or `TypeError`, as everywhere in Python. The classes here are for what a user provides: configurations,
+data, output folders, devices and weights.
 """
 
 
 class SpslamError(Exception):
-    """Root of every error that a user can put right."""
+    """Base class of all errors that a user can fix."""
 
 
 class ConfigError(SpslamError):
-    """A configuration has an unknown key or a value out of its range."""
+    """A configuration has an unknown key or a value out of range."""
 
 
 class DatasetError(SpslamError):
@@ -19,12 +19,12 @@ class DatasetError(SpslamError):
 
 
 class OutputError(SpslamError):
-    """A result can't be written, or the output folder belongs to another run."""
+    """A result cannot be written, or the output folder belongs to another run."""
 
 
 class DeviceError(SpslamError):
-    """The device asked for isn't there, or this build has no kernels for it."""
+    """The requested device is not available, or this build has no kernels for it."""
 
 
 class WeightsError(SpslamError):
-    """A file of weights is missing, of another shape, or not one of ours."""
+    """A weights file is missing, has tensors of another shape, or is not one of spslam."""

@@ -1,7 +1,8 @@
-"""Rotations and rigid motions in NumPy, float64.
+"""Rotations and rigid transforms in NumPy, float64.
 
-A pose ``T_world_camera`` is a [4,4] matrix that maps camera points to world points. A quaternion is
-(w, x, y, z). Every function takes leading batch dimensions unless it says otherwise.
+A pose `T_world_camera` is a [4, 4] matrix that maps camera points to world points. A quaternion is (w, x, y, z). Every
+function takes leading batch dimensions unless it says otherwise, and raises ValueError for an argument of another
+shape.
 """
 
 from __future__ import annotations
@@ -10,7 +11,13 @@ import numpy as np
 
 
 def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrices [...,3,3] of quaternions [...,4], which need not have unit length but not 0."""
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4].
+
+    Quaternions are normalized first.
+
+    Raises:
+        ValueError: a quaternion of length 0.
+    """
     quaternion = _as_floats("quaternion_to_matrix", "quaternion", quaternion, (4,))
     norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     if np.any(norm == 0):
@@ -25,10 +32,10 @@ def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternions [...,4] with w >= 0 of rotation matrices [...,3,3].
+    """Unit quaternions [..., 4] with w >= 0 of rotation matrices [..., 3, 3].
 
-    Of the four ways to divide, the one with the largest divisor is used (Shepperd 1978), so it is exact for
-    half turns too.
+    Of the four ways to divide, the one with the largest divisor is used (Shepperd 1978), so it is exact for rotations
+    by 180 degrees too.
     """
     rotation = _as_floats("matrix_to_quaternion", "rotation", rotation, (3, 3))
     m = rotation
@@ -41,7 +48,7 @@ def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
         1 - trace + 2 * m[..., 1, 1],
         1 - trace + 2 * m[..., 2, 2],
     )
-    # Row i is 4 q_i q: each is the quaternion up to a factor, the one with the largest diagonal the safest.
+    # Row i is 4 q_i q, the quaternion up to a factor. The row with the largest diagonal entry is the most accurate.
     outer = np.stack(
         [np.stack(row, -1) for row in ((ww, wx, wy, wz), (wx, xx, xy, xz), (wy, xy, yy, yz), (wz, xz, yz, zz))],
         axis=-2,
@@ -53,7 +60,7 @@ def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def orthonormalize(rotation: np.ndarray) -> np.ndarray:
-    """The rotation matrices [...,3,3] nearest to given matrices in the Frobenius norm, by SVD."""
+    """The rotation matrices [..., 3, 3] nearest to given matrices in the Frobenius norm, by SVD."""
     rotation = _as_floats("orthonormalize", "rotation", rotation, (3, 3))
     u, _, vt = np.linalg.svd(rotation)
     u = u.copy()
@@ -62,7 +69,7 @@ def orthonormalize(rotation: np.ndarray) -> np.ndarray:
 
 
 def compose(*poses: np.ndarray) -> np.ndarray:
-    """The product [...,4,4] of poses [...,4,4], the last applied first."""
+    """The product [..., 4, 4] of poses [..., 4, 4], from left to right; the identity without any."""
     if not poses:
         return np.eye(4)
     product = _as_floats("compose", "poses", poses[0], (4, 4))
@@ -72,14 +79,14 @@ def compose(*poses: np.ndarray) -> np.ndarray:
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
-    """The inverse [...,4,4] of rigid motions [...,4,4]; their rotations must be orthonormal."""
+    """The inverse [..., 4, 4] of rigid transforms [..., 4, 4]; their rotations must be orthonormal."""
     pose = _as_floats("inverse", "pose", pose, (4, 4))
     transposed = np.swapaxes(pose[..., :3, :3], -1, -2)
     return pose_from(transposed, -(transposed @ pose[..., :3, 3:])[..., 0])
 
 
 def pose_from(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Poses [...,4,4] of rotations [...,3,3] and translations [...,3]."""
+    """Poses [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]."""
     rotation = _as_floats("pose_from", "rotation", rotation, (3, 3))
     translation = _as_floats("pose_from", "translation", translation, (3,))
     pose = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
@@ -90,30 +97,35 @@ def pose_from(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def pose7_to_matrix(pose7: np.ndarray) -> np.ndarray:
-    """Poses [...,4,4] of rows [...,7]: quaternion (w, x, y, z), then translation."""
+    """Poses [..., 4, 4] of rows [..., 7]: quaternion (w, x, y, z), then translation."""
     pose7 = _as_floats("pose7_to_matrix", "pose7", pose7, (7,))
     return pose_from(quaternion_to_matrix(pose7[..., :4]), pose7[..., 4:])
 
 
 def matrix_to_pose7(pose: np.ndarray) -> np.ndarray:
-    """Rows [...,7], quaternion (w, x, y, z) with w >= 0 and translation, of poses [...,4,4]."""
+    """Rows [..., 7], quaternion (w, x, y, z) with w >= 0 and translation, of poses [..., 4, 4]."""
     pose = _as_floats("matrix_to_pose7", "pose", pose, (4, 4))
     return np.concatenate((matrix_to_quaternion(pose[..., :3, :3]), pose[..., :3, 3]), axis=-1)
 
 
 def constant_speed(pose_before_last: np.ndarray, last_pose: np.ndarray) -> np.ndarray:
-    """The pose [4,4] after two given ones if the camera goes on as it went: ``T1 T0^-1 T1``.
+    """The next pose [4, 4] by the constant velocity model: `T1 T0^-1 T1` of the last two poses T0 and T1.
 
-    The rotation is projected back to SO(3), so that repeated prediction doesn't drift off it.
+    The rotation is projected to SO(3), so that repeated prediction keeps it orthonormal.
     """
     predicted = compose(last_pose, inverse(pose_before_last), last_pose)
     return pose_from(orthonormalize(predicted[..., :3, :3]), predicted[..., :3, 3])
 
 
 def interpolate_pose(pose_a: np.ndarray, pose_b: np.ndarray, fraction: np.ndarray | float) -> np.ndarray:
-    """Poses [...,4,4] between two: rotation by slerp along the shorter way, translation linearly.
+    """Poses [..., 4, 4] between two poses [..., 4, 4].
 
-    ``fraction`` [...] is 0 at ``pose_a`` and 1 at ``pose_b``.
+    The rotation is interpolated by slerp along the shorter arc, the translation linearly.
+
+    Args:
+        pose_a: pose at `fraction` 0.
+        pose_b: pose at `fraction` 1.
+        fraction: [...], where to interpolate.
     """
     a = _as_floats("interpolate_pose", "pose_a", pose_a, (4, 4))
     b = _as_floats("interpolate_pose", "pose_b", pose_b, (4, 4))
@@ -122,7 +134,7 @@ def interpolate_pose(pose_a: np.ndarray, pose_b: np.ndarray, fraction: np.ndarra
     cosine = np.sum(qa * qb, axis=-1, keepdims=True)
     qb, cosine = np.where(cosine < 0, -qb, qb), np.minimum(np.abs(cosine), 1)
     angle = np.arccos(cosine)
-    # Below this angle sin(angle) loses its digits and the linear blend is exact to double precision.
+    # Below this angle sin(angle) loses precision, and linear interpolation is exact to double precision.
     near = angle < 1e-7
     sine = np.where(near, 1, np.sin(angle))
     weight_a = np.where(near, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
@@ -132,13 +144,13 @@ def interpolate_pose(pose_a: np.ndarray, pose_b: np.ndarray, fraction: np.ndarra
 
 
 def rotation_angle(rotation: np.ndarray) -> np.ndarray:
-    """Angles [...] in radians, 0 to pi, of rotation matrices [...,3,3]; exact for small angles too."""
+    """Angles [...] in radians, 0 to pi, of rotation matrices [..., 3, 3]; exact for small angles too."""
     quaternion = matrix_to_quaternion(rotation)
     return 2 * np.arctan2(np.linalg.norm(quaternion[..., 1:], axis=-1), quaternion[..., 0])
 
 
 def transform_points(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points [N,3] moved by one pose [4,4]; float64."""
+    """Points [N, 3] transformed by one pose [4, 4]; float64."""
     pose = _as_floats("transform_points", "pose", pose, (4, 4))
     points = _as_floats("transform_points", "points", points, (3,))
     return points @ pose[:3, :3].T + pose[:3, 3]
@@ -147,15 +159,22 @@ def transform_points(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 def umeyama(
     estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """The rotation R [3,3], translation t [3] and scale s that carry points onto others best (Umeyama 1991).
+    """The rotation, translation and scale that align points with others in the least-squares sense (Umeyama 1991).
 
-    Minimizes ``sum |reference - (s R estimated + t)|^2`` over rigid motions (s = 1), or over similarities
-    with ``with_scale``.
+    Minimizes `sum |reference - (s R estimated + t)|^2` over rigid transforms (s = 1), or over similarity transforms
+    with `with_scale`.
 
-    Parameters
-    ----------
-    estimated, reference : [N,3], paired by row, N >= 1. Fewer than three points, or points on one line, leave
-        the rotation undetermined; one of the best is returned.
+    Args:
+        estimated: [N, 3], N >= 1. With fewer than three points, or points on one line, the rotation is not unique; one
+            of the minimizers is returned.
+        reference: [N, 3], paired with `estimated` by row.
+        with_scale: estimate the scale too.
+
+    Returns:
+        R [3, 3], t [3] and s.
+
+    Raises:
+        ValueError: arrays of other or different shapes, or no point.
     """
     estimated = _as_floats("umeyama", "estimated", estimated, (3,))
     reference = _as_floats("umeyama", "reference", reference, (3,))

@@ -1,4 +1,4 @@
-"""Writing files so that a reader sees the old content or the new, never a part."""
+"""Atomic writing of files: a reader sees the old content or the new, never a part of it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from spslam.errors import OutputError
 
 
 def atomic_write(path: str | os.PathLike, content: bytes | str | Callable[[Path], object]) -> None:
-    """Write a file by way of a temporary one beside it: write, fsync, rename, fsync the folder.
+    """Writes a file atomically: write a temporary file beside it, fsync, rename, fsync the folder.
 
-    Parameters
-    ----------
-    path : the file to write. Its folder must exist.
-    content : the bytes, the text (encoded as UTF-8), or a function that is given the temporary file's path,
-        which has the same suffix, and writes it.
+    On any error `path` is left as it was, and the temporary file is removed. Only a killed process leaves one behind
+    (`.NAME.PID.tmp.SUFFIX`), which no reader looks at.
 
-    Raises
-    ------
-    OutputError
-        When the system refuses. Whatever goes wrong, ``path`` is left as it was and the temporary file is
-        removed; only a killed process leaves one (``.NAME.PID.tmp.SUFFIX``), and no reader looks at it.
+    Args:
+        path: the file to write. Its folder must exist.
+        content: bytes, text (encoded as UTF-8), or a function that takes the path of the temporary file, which has the
+            same suffix, and writes it.
+
+    Raises:
+        OutputError: the operating system refuses.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
@@ -41,7 +40,7 @@ def atomic_write(path: str | os.PathLike, content: bytes | str | Callable[[Path]
 
 def _write(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
     if callable(content):
-        # Some writers make files that only their owner may read; a result is as readable as any other new file.
+        # Some writers create files that only their owner can read. Results get the default permissions instead.
         path.touch()
         mode = path.stat().st_mode
         content(path)

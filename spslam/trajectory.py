@@ -1,4 +1,4 @@
-"""A camera's path and its file."""
+"""A camera trajectory and its file."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ _NO_POSE = " 0 0 0 0 0 0 1"
 
 @dataclass
 class Trajectory:
-    """Poses in time.
+    """Camera poses over time.
 
-    Attributes
-    ----------
-    timestamps : float64 [F], seconds.
-    poses : float64 [F,4,4], ``T_world_camera``.
-    lost : bool [F], frames whose pose isn't known; all False if not given. Their rows of ``poses`` repeat the last
-        known pose, or the first known one before it, so that they are finite; they say nothing.
+    Attributes:
+        timestamps: float64 [F], seconds.
+        poses: float64 [F, 4, 4], `T_world_camera`.
+        lost: bool [F], frames without a known pose; all False if not given. Their rows of `poses` are finite
+            placeholders: the last known pose before them, or the first known pose where there is none before.
+
+    Raises:
+        ValueError: arrays of other or different shapes.
     """
 
     timestamps: np.ndarray
@@ -51,16 +53,18 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def ground_truth_of_known(self, ground_truth: np.ndarray) -> np.ndarray:
-        """True poses, float64 [F,4,4], with NaN for the lost frames: what errors are measured against."""
+    def mask_lost(self, ground_truth: np.ndarray) -> np.ndarray:
+        """Ground-truth poses, float64 [F, 4, 4], set to NaN for the lost frames, to measure errors against."""
         return np.where(self.lost[:, None, None], np.nan, ground_truth)
 
     def save_tum(self, path: str | os.PathLike) -> None:
-        """Write the TUM format, a line a frame: ``timestamp tx ty tz qx qy qz qw``, camera to world.
+        """Writes the TUM format, one line per frame: `timestamp tx ty tz qx qy qz qw`, camera to world.
 
-        A lost frame has no pose but a comment in its place, ``# lost timestamp``, which other readers skip. The same
-        trajectory gives the same bytes. Poses are kept to a nanometer and 1e-9 in the quaternion. Written at once or
-        not at all; raises OutputError.
+        A lost frame is written as a comment, `# lost timestamp`, which other readers skip. Values are rounded to 1e-9
+        (meters, and quaternion components). The same trajectory gives the same bytes. The file is written atomically.
+
+        Raises:
+            OutputError: the file cannot be written.
         """
         lines = [_HEADER]
         for timestamp, row, lost in zip(self.timestamps, matrix_to_pose7(self.poses), self.lost, strict=True):
@@ -71,11 +75,15 @@ class Trajectory:
 
     @classmethod
     def load_tum(cls, path: str | os.PathLike, skip_unknown: bool = False) -> Trajectory:
-        """Read the TUM format; rows stay in the file's order. A file without a frame gives an empty trajectory.
+        """Reads the TUM format; rows stay in the file's order. A file without a frame gives an empty trajectory.
 
-        With ``skip_unknown`` rows with a number that isn't finite are left out; they say that the pose is unknown.
-        Raises DatasetError, naming file and line, for a missing file or a line that isn't eight finite numbers
-        with a quaternion of a length above 0.
+        Args:
+            path: the file.
+            skip_unknown: leave out rows with a number that is not finite, by which some datasets mark an unknown pose.
+
+        Raises:
+            DatasetError: a missing file, or a line that is not eight finite numbers with a quaternion of a length
+                above 0. Names file and line.
         """
         path = Path(path)
         try:
@@ -98,7 +106,7 @@ class Trajectory:
 
 
 def _hold_known(poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """Poses with each lost row replaced by the last known one, those before the first known one by that."""
+    """Poses with each lost row replaced by the last known row, or by the first known row where none is before."""
     known = np.flatnonzero(~lost)
     if not lost.any() or not len(known):
         return poses

@@ -29,7 +29,7 @@ def test_points_without_depth_and_behind_the_camera():
     assert CAMERA.project(np.zeros((0, 3))).shape == (0, 2)
 
 
-def test_resized_sees_the_same_view():
+def test_resized_keeps_the_field_of_view():
     half = CAMERA.resized(32, 24)
     corner = CAMERA.project(np.array([0.3, -0.2, 1.0]))
     np.testing.assert_allclose(half.project(np.array([0.3, -0.2, 1.0])), (corner + 0.5) / 2 - 0.5)

@@ -36,7 +36,7 @@ def test_matrix_to_quaternion_inverts_quaternion_to_matrix(quaternion):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_matrix_to_quaternion_of_half_turns(axis):
+def test_matrix_to_quaternion_of_180_degree_rotations(axis):
     matrix = -np.eye(3)
     matrix[axis, axis] = 1
     expected = np.zeros(4)
@@ -44,7 +44,7 @@ def test_matrix_to_quaternion_of_half_turns(axis):
     np.testing.assert_allclose(geometry.matrix_to_quaternion(matrix), expected, atol=EXACT)
 
 
-def test_batches_of_any_shape_and_empty_ones():
+def test_batches_of_any_shape_and_empty_batches():
     poses = random_poses(6).reshape(2, 3, 4, 4)
     rows = geometry.matrix_to_pose7(poses)
     assert rows.shape == (2, 3, 7)
@@ -53,7 +53,7 @@ def test_batches_of_any_shape_and_empty_ones():
     assert geometry.pose7_to_matrix(np.zeros((0, 7))).shape == (0, 4, 4)
 
 
-def test_orthonormalize_gives_the_nearest_rotation():
+def test_orthonormalize_returns_the_nearest_rotation():
     generator = np.random.default_rng(2)
     rotations = Rotation.random(30, random_state=2).as_matrix()
     disturbed = rotations + generator.normal(scale=1e-2, size=rotations.shape)
@@ -79,14 +79,14 @@ def test_compose_and_inverse():
     np.testing.assert_allclose(geometry.compose(), np.eye(4))
 
 
-def test_constant_speed_goes_on_with_the_last_motion():
+def test_constant_speed_repeats_the_last_motion():
     start = random_poses(1)[0]
     step = geometry.pose_from(Rotation.from_rotvec([0.01, -0.03, 0.02]).as_matrix(), [0.02, 0.0, 0.01])
     expected = start @ step @ step
     np.testing.assert_allclose(geometry.constant_speed(start, start @ step), expected, atol=EXACT)
 
 
-def test_interpolate_pose_turns_evenly_and_takes_the_shorter_way():
+def test_interpolate_pose_rotates_evenly_along_the_shorter_arc():
     a = geometry.pose_from(Rotation.from_rotvec([0, 0, 3.0]).as_matrix(), [0, 0, 0])
     b = geometry.pose_from(Rotation.from_rotvec([0, 0, -3.0]).as_matrix(), [1, 2, 3])
     middle = geometry.interpolate_pose(a, b, 0.5)
@@ -124,7 +124,7 @@ def test_umeyama_recovers_a_similarity(scale):
     assert found == 1
 
 
-def test_umeyama_never_mirrors():
+def test_umeyama_never_returns_a_reflection():
     points = np.random.default_rng(6).normal(size=(20, 3))
     rotation, _, _ = geometry.umeyama(points, points * [1, 1, -1], with_scale=True)
     assert np.linalg.det(rotation) == pytest.approx(1)

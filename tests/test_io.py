@@ -36,7 +36,7 @@ def test_a_missing_folder_is_an_output_error(tmp_path):
         atomic_write(tmp_path / "missing" / "a.txt", "x")
 
 
-def test_a_writer_of_private_files_leaves_an_ordinary_one(tmp_path):
+def test_a_file_written_as_private_gets_default_permissions(tmp_path):
     def write_private(path):
         path.unlink()
         path.touch(mode=0o600)

@@ -22,9 +22,9 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(loaded.lost, trajectory.lost)
 
 
-def test_errors_are_measured_where_the_pose_is_known():
+def test_ground_truth_is_masked_where_the_frame_is_lost():
     ground_truth, lost = make_trajectory(3).poses, [True, False, True]
-    known = Trajectory(np.arange(3.0), ground_truth[::-1], lost).ground_truth_of_known(ground_truth)
+    known = Trajectory(np.arange(3.0), ground_truth[::-1], lost).mask_lost(ground_truth)
     np.testing.assert_array_equal(np.isnan(known).all((1, 2)), lost)
     np.testing.assert_array_equal(known[1], ground_truth[1])
 
@@ -40,7 +40,7 @@ def test_lost_frames_have_no_pose_in_the_file(tmp_path):
     loaded = Trajectory.load_tum(tmp_path / "trajectory.txt")
     np.testing.assert_array_equal(loaded.lost, trajectory.lost)
     np.testing.assert_allclose(loaded.timestamps, trajectory.timestamps, atol=5.1e-7)
-    # What stands there is finite, and the last pose that is known.
+    # Lost frames hold the last known pose, so that all poses are finite.
     np.testing.assert_allclose(loaded.poses, poses[[1, 1, 1, 3, 4, 4, 4]], atol=1e-8)
     np.testing.assert_array_equal(loaded.poses.round(6), trajectory.poses.round(6))
 
@@ -59,7 +59,7 @@ def test_the_same_trajectory_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a.txt").read_text().startswith("# timestamp tx ty tz qx qy qz qw\n1305031229.500000 ")
 
 
-def test_a_line_holds_translation_then_quaternion_with_w_last(tmp_path):
+def test_a_line_has_the_translation_then_the_quaternion_with_w_last(tmp_path):
     quarter_turn = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     Trajectory([0.5], pose_from(quarter_turn, [1, 2, 3])[None]).save_tum(tmp_path / "t.txt")
     numbers = [float(word) for word in (tmp_path / "t.txt").read_text().splitlines()[1].split()]

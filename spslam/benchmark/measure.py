@@ -21,10 +21,10 @@ from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
 from spslam.evaluation.finished_run import NOVEL_VIEWS, surface_figures, view_figures
-from spslam.evaluation.mesh import SAMPLES
+from spslam.evaluation.mesh_metrics import SAMPLES
 from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
-from spslam.evaluation.trajectory import ate, rpe
+from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.run.device import resolve_device
 from spslam.run.sequence import RunRequest, run_sequence
 

@@ -84,7 +84,7 @@ def _evaluate(folder: RunFolder) -> dict:
     from spslam.datasets.generated import GeneratedDataset
     from spslam.datasets.registry import open_dataset
     from spslam.evaluation.finished_run import add_metrics, surface_figures, view_figures
-    from spslam.evaluation.report import write_report
+    from spslam.evaluation.html_report import write_report
     from spslam.evaluation.run_output import RunOutput
 
     dataset = open_dataset(load_config(folder.config).dataset)

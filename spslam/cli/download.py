@@ -1,4 +1,4 @@
-"""``spslam download``: public data sets from their official addresses."""
+"""`spslam download`: downloads public datasets from their official URLs."""
 
 from __future__ import annotations
 
@@ -18,19 +18,22 @@ DEFAULT_DATA = Path("data")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Fetch a public data set from its official address and unpack it. Without NAME the data sets are listed, with "
-        "their terms: downloading is agreeing to them. An interrupted download goes on with the same command."
+        "Download a public dataset from its official URL and unpack it. Without NAME, list the datasets with their "
+        "terms of use; by downloading you agree to them. The same command resumes an interrupted download."
     )
-    parser.epilog = f"{SCANNET_TERMS}. Any sequence of TUM RGB-D can be named: tum/freiburg1_rpy."
+    parser.epilog = f"{SCANNET_TERMS}. Any sequence of TUM RGB-D can be given: tum/freiburg1_rpy."
     parser.add_argument(
-        "name", metavar="NAME", nargs="?", help="a data set (replica) or a part (7scenes/chess); 7scenes is all parts"
+        "name",
+        metavar="NAME",
+        nargs="?",
+        help="a dataset (replica) or a part of one (7scenes/chess; 7scenes: all parts)",
     )
     parser.add_argument(
         "--data",
         metavar="DIR",
         type=Path,
         default=DEFAULT_DATA,
-        help=f"folder to put it in; {DEFAULT_DATA} if not given",
+        help=f"folder to unpack into (default: {DEFAULT_DATA})",
     )
     add_quiet(parser)
 
@@ -41,28 +44,28 @@ def execute(args: argparse.Namespace) -> None:
         return
     parts = [source for source in SOURCES if source.name.startswith(f"{args.name}/")]
     for source in parts or [find_source(args.name)]:
-        _bring(source, args.data, args.quiet)
+        _download(source, args.data, args.quiet)
 
 
 def _list(data: Path) -> None:
     for source in SOURCES:
-        mark = "  (there)" if is_complete(source, data) else ""
+        mark = "  (downloaded)" if is_complete(source, data) else ""
         print(f"{source.name:<20}{source.title}, about {source.gigabytes:g} GB{mark}")
         print(f"{'':<20}{source.terms}")
     print(f"\n{SCANNET_TERMS}")
 
 
-def _bring(source: Source, data: Path, quiet: bool) -> None:
+def _download(source: Source, data: Path, quiet: bool) -> None:
     if not quiet:
         print(f"{source.name}: {source.title}\nterms: {source.terms}", flush=True)
-    brought = download(source, data, None if quiet else _Lines())
+    unpacked = download(source, data, None if quiet else _ProgressLines())
     if not quiet:
-        state = "ready" if brought else "was there already"
-        print(f"{state} in {data}; next:\n  {source.run_command(command_name(), data)}")
+        state = "downloaded to" if unpacked else "was already in"
+        print(f"{state} {data}; next:\n  {source.run_command(command_name(), data)}")
 
 
-class _Lines:
-    """A line every few seconds: how far a file is, and how fast it comes."""
+class _ProgressLines:
+    """Prints a line every few seconds: the share of the file downloaded, and the rate."""
 
     def __init__(self) -> None:
         self._last, self._bytes = time.monotonic(), 0

@@ -24,7 +24,7 @@ def execute(args: argparse.Namespace) -> None:
     require_run_file(RunFolder(args.output).trajectory)
 
     from spslam.evaluation.finished_run import add_metrics, trajectory_figures
-    from spslam.evaluation.report import write_report
+    from spslam.evaluation.html_report import write_report
     from spslam.evaluation.run_output import RunOutput
 
     run = RunOutput.read(args.output)

@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> None:
-    from spslam.prior.plots import plot_training, require_matplotlib
     from spslam.prior.pretrain import pretrain, training_files
+    from spslam.prior.training_plots import plot_training, require_matplotlib
 
     if args.plot:
         require_matplotlib()

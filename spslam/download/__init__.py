@@ -1,4 +1,4 @@
-"""Public data sets from their official addresses: fetched with resume, checked, unpacked where nothing can escape."""
+"""Downloads public datasets from their official URLs, with resume and checksums, and unpacks them safely."""
 
 from spslam.download.catalog import SOURCES, Archive, Source, find_source
 from spslam.download.datasets import download, is_complete

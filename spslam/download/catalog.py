@@ -1,4 +1,4 @@
-"""Where the data sets are, and under which terms."""
+"""Catalog of public datasets: their URLs and licenses."""
 
 from __future__ import annotations
 
@@ -22,20 +22,19 @@ _TUM_SHORT = {
 }
 _SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
 SCANNET_TERMS = (
-    "scannet can't be downloaded without a form: its authors give the address to whoever signs the terms of use at "
-    "http://www.scan-net.org; fetch scans with their script (--type .sens) and run: spslam run scannet --data SCAN"
+    "scannet can't be downloaded without signing its terms of use at http://www.scan-net.org; its authors then send a "
+    "download script; fetch scans with it (--type .sens) and run: spslam run scannet --data SCAN"
 )
 
 
 @dataclass(frozen=True)
 class Archive:
-    """A file to fetch.
+    """An archive file to download.
 
-    Attributes
-    ----------
-    url : its address; the last part is the file's name.
-    folder : where it is unpacked, below the data folder.
-    sha256 : its checksum where the publisher gives one, else None: then the archive's own checksums have to do.
+    Attributes:
+        url: where it is; the last part is the file name.
+        folder: where it is unpacked, below the data folder.
+        sha256: its checksum where the publisher gives one; with None only the checksums inside the archive are checked.
     """
 
     url: str
@@ -44,23 +43,22 @@ class Archive:
 
     @property
     def name(self) -> str:
-        """The file's name."""
+        """The file name."""
         return self.url.rsplit("/", 1)[-1]
 
 
 @dataclass(frozen=True)
 class Source:
-    """A data set, or a part of one, that can be asked for by name.
+    """A dataset, or a part of one, that can be downloaded by name.
 
-    Attributes
-    ----------
-    name : what to ask for.
-    title : what it is.
-    terms : its license in words, and the page that has it.
-    gigabytes : about what comes over the line.
-    archives : its files.
-    config : the configuration that reads it.
-    folder : of one sequence, below the data folder.
+    Attributes:
+        name: name on the command line.
+        title: one-line description.
+        terms: its license, and the page that states it.
+        gigabytes: approximate size of the download, in GB.
+        archives: files to download.
+        config: name of the configuration that reads it.
+        folder: of one sequence, relative to the data folder.
     """
 
     name: str
@@ -77,12 +75,10 @@ class Source:
 
 
 def find_source(name: str) -> Source:
-    """The source of a name: one of ``SOURCES``, or any sequence of TUM RGB-D as ``tum/freiburg1_rpy``.
+    """Looks up a source by name: one of `SOURCES`, or any sequence of TUM RGB-D as `tum/freiburg1_rpy`.
 
-    Raises
-    ------
-    DatasetError
-        For an unknown name, with a suggestion, and for ScanNet, which asks for a form.
+    Raises:
+        DatasetError: an unknown name, with a suggestion, or ScanNet, whose terms of use must be signed first.
     """
     if name.partition("/")[0] == "scannet":
         raise DatasetError(SCANNET_TERMS)
@@ -93,8 +89,8 @@ def find_source(name: str) -> Source:
     if name.startswith("tum/") and sequence is not None:
         return _tum(name, f"freiburg{sequence.group(1)}_{sequence.group(2)}")
     near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {near[0]}?" if near else "spslam download lists the names"
-    raise DatasetError(f"{name} is no data set to download; {hint}")
+    hint = f"did you mean {near[0]}?" if near else "`spslam download` lists the names"
+    raise DatasetError(f"{name}: not a dataset that can be downloaded; {hint}")
 
 
 def _tum(name: str, sequence: str) -> Source:
@@ -114,7 +110,7 @@ def _seven_scenes(scene: str) -> Source:
     return Source(
         f"7scenes/{scene}",
         f"7-Scenes, {scene}",
-        "Microsoft Research's license, research alone; "
+        "Microsoft Research license, research use only; "
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes",
         3.0,
         (Archive(f"{_SEVEN_SCENES}/{scene}.zip", "7scenes"),),
@@ -126,8 +122,8 @@ def _seven_scenes(scene: str) -> Source:
 SOURCES: tuple[Source, ...] = (
     Source(
         "replica",
-        "Replica, eight rooms as rendered for NICE-SLAM, and their meshes",
-        "the Replica research terms, no commercial use; https://github.com/facebookresearch/Replica-Dataset",
+        "Replica, the eight rooms rendered for NICE-SLAM, with ground-truth meshes",
+        "Replica research terms, no commercial use; https://github.com/facebookresearch/Replica-Dataset",
         12.4,
         (Archive(f"{_REPLICA}/data/Replica.zip"), Archive(f"{_REPLICA}/cull_replica_mesh.zip")),
         "replica",
@@ -135,8 +131,8 @@ SOURCES: tuple[Source, ...] = (
     ),
     Source(
         "synthetic_rgbd",
-        "Synthetic RGB-D (Neural RGB-D), its rooms and their culled meshes",
-        "by the scenes' authors, CC-BY or CC-0; https://github.com/dazinovic/neural-rgbd-surface-reconstruction",
+        "Synthetic RGB-D (Neural RGB-D), its rooms with culled ground-truth meshes",
+        "CC-BY or CC-0, by scene; https://github.com/dazinovic/neural-rgbd-surface-reconstruction",
         7.5,
         (Archive(f"{_NEURAL_RGBD}/neural_rgbd_data.zip"), Archive(f"{_NEURAL_RGBD}/meshes.zip")),
         "synthetic_rgbd",

@@ -1,4 +1,4 @@
-"""Unpacking archives from elsewhere: files and folders alone, all of them below the folder given."""
+"""Unpacks untrusted archives: only files and folders, and only below the given folder."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from spslam.errors import DatasetError
 
 
 class ArchiveError(DatasetError):
-    """An archive that can't be unpacked, today or tomorrow."""
+    """An archive that is damaged or unsafe, so that unpacking it again would fail too."""
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack a zip or tar file (plain or compressed) below ``folder``, and the zip files that it holds in turn.
+    """Unpacks a zip or tar file (plain or compressed) below `folder`, and the zip files inside it.
 
-    All names are looked at before anything is written. Zip files inside, as 7-Scenes has them, are unpacked where they
-    lie and removed. Modes, owners and times are not kept.
+    All names are checked before anything is written. Inner zip files, as in 7-Scenes, are unpacked where they are and
+    removed. Modes, owners and times are not kept.
 
-    Raises
-    ------
-    ArchiveError
-        For a file that is no archive or is damaged, a name that leads out of ``folder``, a link or a device in it.
-    DatasetError
-        For a disk too small for what is in it.
+    Args:
+        archive: the file.
+        folder: where to unpack; created if missing.
+
+    Raises:
+        ArchiveError: a file that is not an archive or is damaged, or that contains a path outside `folder`, a link or a
+            device.
+        DatasetError: not enough space on the disk.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -49,7 +51,9 @@ def _unpack_zip(archive: Path, folder: Path) -> None:
         for member in members:
             kind = stat.S_IFMT(member.external_attr >> 16)
             if kind and not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-                raise ArchiveError(f"{archive}: must hold files and folders alone, but {member.filename} is a link")
+                raise ArchiveError(
+                    f"{archive}: must contain only files and folders, but {member.filename} is a link or device"
+                )
         places = [_place(archive, folder, member.filename) for member in members]
         require_space(folder, sum(member.file_size for member in members), f"unpacking {archive.name}")
         nested = []
@@ -67,13 +71,15 @@ def _unpack_zip(archive: Path, folder: Path) -> None:
 
 
 def _unpack_tar(archive: Path, folder: Path) -> None:
-    # Two passes, because the names come between the contents.
+    # Two passes: all names are checked before anything is written, and a tar file has no index.
     with tarfile.open(archive) as file:
         total = 0
         for member in file:
             _place(archive, folder, member.name)
             if not (member.isfile() or member.isdir()):
-                raise ArchiveError(f"{archive}: must hold files and folders alone, but {member.name} is a link")
+                raise ArchiveError(
+                    f"{archive}: must contain only files and folders, but {member.name} is a link or device"
+                )
             total += member.size
     require_space(folder, total, f"unpacking {archive.name}")
     with tarfile.open(archive) as file:
@@ -89,13 +95,13 @@ def _unpack_tar(archive: Path, folder: Path) -> None:
 
 
 def _place(archive: Path, folder: Path, name: str) -> Path:
-    """Where a member goes; raises DatasetError for a name that leads out of the folder."""
+    """The path that a member is unpacked to; raises ArchiveError for a path outside the folder."""
     parts = PurePosixPath(name.replace("\\", "/"))
     inside = not parts.is_absolute() and ".." not in parts.parts and ":" not in (parts.parts or ("",))[0]
     place = folder.joinpath(*parts.parts) if inside else folder
-    # A link that stood in the folder before could lead out too.
+    # A link that was in the folder before could point outside too.
     if not inside or not place.resolve().is_relative_to(folder.resolve()):
-        raise ArchiveError(f"{archive}: must stay in the folder that it is unpacked in, but holds {name}")
+        raise ArchiveError(f"{archive}: must not contain paths outside the folder it is unpacked in, got {name}")
     return place
 
 

@@ -55,7 +55,7 @@ def line_chart(series: Sequence[Series], unit: str, marks: np.ndarray | None = N
     return _svg(WIDTH, HEIGHT, "".join(parts)) + _legend([(line.name, line.kind) for line in series])
 
 
-def path_chart(estimate: np.ndarray, ground_truth: np.ndarray | None, lost: np.ndarray) -> str:
+def trajectory_chart(estimate: np.ndarray, ground_truth: np.ndarray | None, lost: np.ndarray) -> str:
     """A path seen from above, meters, both axes of one scale.
 
     Parameters

@@ -9,13 +9,13 @@ import numpy as np
 
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
-from spslam.evaluation.depth import depth_l1
-from spslam.evaluation.images import psnr_db, ssim
-from spslam.evaluation.mesh import SAMPLES, evaluate_surface, observed_mask
+from spslam.evaluation.depth_metrics import depth_l1
+from spslam.evaluation.image_metrics import psnr_db, ssim
+from spslam.evaluation.mesh_metrics import SAMPLES, evaluate_surface, observed_mask
 from spslam.evaluation.renders import novel_depth, novel_poses, render_view
 from spslam.evaluation.run_output import Mesh, RunOutput, match_times
 from spslam.evaluation.surface import Surface, TriangleSurface
-from spslam.evaluation.trajectory import Alignment, ate, rpe
+from spslam.evaluation.trajectory_metrics import Alignment, ate, rpe
 from spslam.geometry import umeyama
 from spslam.io import atomic_write
 from spslam.scene import Scene

@@ -82,7 +82,7 @@ def novel_depth(
     observed: Callable[[np.ndarray], np.ndarray],
     count: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Depth images of a reconstructed and of the true surface, for :func:`spslam.evaluation.depth.depth_l1`.
+    """Depth images of a reconstructed and of the true surface, for :func:`spslam.evaluation.depth_metrics.depth_l1`.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ _SAME_TIME_S = 2e-6
 
 @dataclass(frozen=True)
 class Preview:
-    """An input frame kept as pictures: its row in the trajectory, uint8 [H,W,3] RGB, float32 [H,W] meters or None."""
+    """An input frame kept as pictures: its row in the trajectory, uint8 [H, W, 3] RGB, float32 [H, W] meters or None."""
 
     row: int
     color: np.ndarray
@@ -31,7 +31,7 @@ class Preview:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices [V,3] in meters, faces [L,3], colors uint8 [V,3]."""
+    """Vertices [V, 3] in meters, faces [L, 3], colors uint8 [V, 3]."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -46,7 +46,7 @@ class RunOutput:
     ----------
     folder : their paths.
     trajectory : estimated, F frames.
-    truth : float64 [F,4,4] true poses of the same frames, NaN where unknown; None if none is known.
+    truth : float64 [F, 4, 4] true poses of the same frames, NaN where unknown; None if none is known.
     metrics : what metrics.json holds.
     log : one entry a frame, as in log.jsonl.
     config : text of config.yaml.
@@ -87,8 +87,8 @@ class RunOutput:
 
     @property
     def known_ground_truth(self) -> np.ndarray | None:
-        """The true poses [F,4,4] of the frames whose pose the run knew, NaN for the others; None if none is known."""
-        return None if self.ground_truth is None else self.trajectory.ground_truth_of_known(self.ground_truth)
+        """The true poses [F, 4, 4] of the frames whose pose the run knew, NaN for the others; None if none is known."""
+        return None if self.ground_truth is None else self.trajectory.mask_lost(self.ground_truth)
 
     def previews(self) -> list[Preview]:
         """The kept input frames, by row; ones that can't be read, or whose pose isn't known, are left out."""
@@ -114,7 +114,7 @@ class RunOutput:
 
 
 def match_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """For each wanted time the index of the same one in ``times``, to the microsecond that files keep; -1 if absent."""
+    """For each wanted time the index of the same one in `times`, to the microsecond that files keep; -1 if absent."""
     if not len(times):
         return np.full(len(wanted), -1)
     order = np.argsort(times, kind="stable")

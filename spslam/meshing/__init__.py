@@ -1,4 +1,4 @@
-"""Meshes: from a map or a signed distance to triangles, and from triangles to files."""
+"""Triangle meshes: extraction from a map or a signed distance field, cleaning, rendering and export."""
 
 from spslam.meshing.export import FORMATS, save_mesh
 from spslam.meshing.extract import cubes_per_cell, extract_mesh, extract_surface

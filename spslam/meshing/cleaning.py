@@ -1,8 +1,9 @@
-"""Which faces of a map's surface to keep.
+"""Removes spurious faces from an extracted mesh.
 
-Truncation leaves surface where nothing was measured: a second sheet behind the seen one, lips behind depth edges, bits
-where the field ran out. Three signs tell them: little was fused there beside where much was, no camera can have seen
-them from the front, and they are small and loose.
+The zero level set of a truncated SDF has surface where nothing was measured: a second layer behind the observed
+surface, fringes behind depth edges, fragments at the border of the mapped space. Three criteria detect it: a fusion
+weight that is small compared with the weights nearby, no camera that sees the front of the face, and a connected
+component with a small area.
 """
 
 from __future__ import annotations
@@ -15,36 +16,36 @@ from spslam.camera import Camera
 from spslam.meshing.mesh import face_components, face_normals
 from spslam.scene import SparseVolume
 
-# More views than this add nothing: neighboring ones see the same.
+# More views than this add nothing, as neighboring views see the same surface.
 MAX_VIEWS = 32
-# Faces this many steps away from a seen one are kept too, so that a noisy normal makes no hole.
+# Faces up to this many edges away from a visible face are kept too, so that a noisy normal does not leave a hole.
 _RINGS = 1
 
 
 def face_support(volume: SparseVolume, vertices: torch.Tensor, faces: torch.Tensor, chunk_faces: int) -> torch.Tensor:
-    """Fusion weight at the middle of each face, as a share of the largest one within a voxel around.
+    """Fusion weight at the centroid of each face, relative to the largest weight within one voxel of it.
 
     Args:
-        volume: weights and where they are.
+        volume: vertices and their fusion weights.
         vertices: float32 [K, 3], m.
         faces: int64 [L, 3].
-        chunk_faces: most faces looked at together.
+        chunk_faces: largest number of faces processed at once.
 
     Returns:
-        float32 [L] in [0, 1]; 1 where nothing was fused all around, so that a map without fusion is kept whole.
+        float32 [L] in [0, 1]; 1 where all weights nearby are 0, so that a map without fused features is kept.
     """
     weights = torch.stack((volume.weights, _largest_around(volume)), 1)
     shares = [weights.new_zeros(0)]
-    for some in faces.split(chunk_faces):
-        # The middle lies within a cell; the corners may lie on its border, where the next cell is asked.
-        corner_ids, local_coords, _ = volume.lookup(vertices[some].mean(1))
+    for chunk in faces.split(chunk_faces):
+        # The centroid lies inside a cell. A corner may lie on its border, where the lookup takes the next cell.
+        corner_ids, local_coords, _ = volume.lookup(vertices[chunk].mean(1))
         here, around = ops.trilinear_interpolate(weights, corner_ids, local_coords).unbind(1)
         shares.append(torch.where(around > 0, here / around, 1.0))
     return torch.cat(shares)
 
 
 def _largest_around(volume: SparseVolume) -> torch.Tensor:
-    """The largest weight float32 [V] among a vertex and its 26 neighbors, one axis after the other."""
+    """The largest weight float32 [V] of each vertex and its 26 neighbors, one axis after the other."""
     largest = volume.weights
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.int32, device=volume.device)
@@ -57,37 +58,40 @@ def _largest_around(volume: SparseVolume) -> torch.Tensor:
     return largest
 
 
-def faced_by_a_camera(
+def front_facing_in_view(
     vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, camera: Camera, poses: np.ndarray
 ) -> np.ndarray:
-    """Bool [L]: whether a face, or one near it, is in the view of some camera and turned towards it.
+    """Whether a face, or one near it, lies in the field of view of some camera and faces that camera.
 
-    What hides it is not looked at. At most `MAX_VIEWS` of the poses, evenly spread, are tried.
+    Occlusion is ignored. At most `MAX_VIEWS` of the poses are tested, evenly spaced.
 
     Args:
         vertices: float32 [K, 3], world, m.
         normals: float32 [K, 3].
         faces: integers [L, 3].
         camera: pinhole intrinsics of all views.
-        poses: [F, 4, 4] T_world_camera; not finite ones are skipped.
+        poses: [F, 4, 4] T_world_camera; poses that are not finite are skipped.
+
+    Returns:
+        bool [L].
 
     Raises:
         ValueError: no pose is finite.
     """
     poses = poses[np.isfinite(poses).all((1, 2))]
     if len(poses) == 0:
-        raise ValueError("faced_by_a_camera: poses must hold a finite one, got none")
+        raise ValueError("front_facing_in_view: poses must have at least one finite pose, got none")
     views = poses[np.unique(np.linspace(0, len(poses) - 1, min(MAX_VIEWS, len(poses))).round().astype(int))]
-    faced = np.zeros(len(vertices), dtype=bool)
+    front_facing = np.zeros(len(vertices), dtype=bool)
     for pose in views:
-        unsure = np.flatnonzero(~faced)
-        faced[unsure] = _faces_view(vertices[unsure], normals[unsure], camera, pose)
+        remaining = np.flatnonzero(~front_facing)
+        front_facing[remaining] = _vertices_front_facing(vertices[remaining], normals[remaining], camera, pose)
     for _ in range(_RINGS):
-        faced[faces[faced[faces].any(1)]] = True
-    return faced[faces].any(1)
+        front_facing[faces[front_facing[faces].any(1)]] = True
+    return front_facing[faces].any(1)
 
 
-def _faces_view(points: np.ndarray, normals: np.ndarray, camera: Camera, pose: np.ndarray) -> np.ndarray:
+def _vertices_front_facing(points: np.ndarray, normals: np.ndarray, camera: Camera, pose: np.ndarray) -> np.ndarray:
     rotation, center = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
     rays = points - center
     x, y, z = (rays @ rotation).T
@@ -97,16 +101,19 @@ def _faces_view(points: np.ndarray, normals: np.ndarray, camera: Camera, pose: n
     return in_view & (np.einsum("ij,ij->i", rays, normals) < 0)
 
 
-def in_large_part(vertices: np.ndarray, faces: np.ndarray, min_area_m2: float) -> np.ndarray:
-    """Bool [L]: whether the connected part that a face belongs to has at least an area.
+def in_large_component(vertices: np.ndarray, faces: np.ndarray, min_area_m2: float) -> np.ndarray:
+    """Whether the connected component that a face belongs to has a minimum area.
 
     Args:
         vertices: float32 [K, 3], m.
         faces: integers [L, 3].
-        min_area_m2: 0 keeps everything.
+        min_area_m2: minimum area, m^2; 0 keeps everything.
+
+    Returns:
+        bool [L].
     """
     if min_area_m2 <= 0 or len(faces) == 0:
         return np.ones(len(faces), dtype=bool)
-    part = face_components(faces, len(vertices))
+    component = face_components(faces, len(vertices))
     areas = np.linalg.norm(face_normals(vertices, faces), axis=1) / 2
-    return np.bincount(part, areas)[part] >= min_area_m2
+    return np.bincount(component, areas)[component] >= min_area_m2

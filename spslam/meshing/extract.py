@@ -1,4 +1,4 @@
-"""From a map, or any signed distance on sparse cells, to a triangle mesh."""
+"""Extracts a triangle mesh from a map, or from any signed distance field on sparse cells."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.meshing.cleaning import face_support, faced_by_a_camera, in_large_part
-from spslam.meshing.lattice import SignedDistance, near_surface, near_surface_parts, sample_blocks
+from spslam.meshing.cleaning import face_support, front_facing_in_view, in_large_component
 from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
+from spslam.meshing.sdf_sampling import SignedDistance, near_surface, near_surface_parts, sample_blocks
 from spslam.scene import Scene
 
 CHUNK_POINTS = 1 << 19
-# The learnt field is no exact distance; beyond this slope a surface could be missed.
+# The learned field is not an exact distance. Where its gradient exceeds this bound, surface could be missed.
 MAX_SLOPE = 1.5
 MIN_SUPPORT = 0.1
-# Smaller loose parts are as likely specks as surface; 20 cm2 is a dozen faces at a resolution of 2 cm.
+# Smaller connected components are likely noise; 20 cm^2 is a dozen faces at a resolution of 2 cm.
 MIN_PART_M2 = 0.002
-# A block of more cubes an axis wastes samples far from the surface, one of fewer repeats too many at its border.
+# Cubes per axis: larger blocks waste samples far from the surface, smaller ones repeat more samples at their borders.
 _CUBES_PER_BLOCK = range(4, 8)
 
 
@@ -30,26 +30,27 @@ def extract_surface(
     max_slope: float = MAX_SLOPE,
     chunk_points: int = CHUNK_POINTS,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Zero level of a signed distance within given cells, welded and without seams.
+    """Extracts the zero level set of a signed distance field within given cells, as one mesh without seams.
 
-    Cells that the surface cannot reach are ruled out by a few samples each; the others are cut into cubes. Memory
-    beside the result: about 9 (n + 1)^3 + 500 bytes for each block of n <= 7 cubes an axis near the surface, which is
-    3 to 5 times the mesh's own size, and 40 bytes for each of `chunk_points`.
+    Cells that the surface cannot pass through are discarded by a few samples each; the others are divided into cubes
+    for marching cubes. Memory beside the result: about 9 (n + 1)^3 + 500 bytes for each block of n <= 7 cubes per axis
+    near the surface, which is 3 to 5 times the size of the mesh, and 40 bytes for each of `chunk_points`.
 
     Args:
-        cell_coords: int32 [M, 3], distinct; cell c fills [c, c + 1] * cell_size_m. The field is looked at nowhere else.
-        cell_size_m: edge of a cell.
-        resolution_m: edge wanted for the cubes; they fit the cells a whole number of times, see `cubes_per_cell`.
+        cell_coords: int32 [M, 3], distinct; cell c fills [c, c + 1] * cell_size_m. The field is sampled only there.
+        cell_size_m: edge length of a cell.
+        resolution_m: desired edge length of the cubes; a cell is divided into a whole number of them, see
+            `cubes_per_cell`.
         sdf: maps float32 points [N, 3] (m) to distances float32 [N] (m, negative inside) and bool [N], whether known.
         max_slope: bound on the gradient of `sdf`; a larger one is safer and slower.
-        chunk_points: most points in one call of `sdf`.
+        chunk_points: largest number of points in one call of `sdf`.
 
     Returns:
-        vertices float32 [K, 3] (m) and faces int64 [L, 3], see `ops.marching_cubes`; empty where nothing crosses 0.
+        vertices float32 [K, 3] (m) and faces int64 [L, 3], see `ops.marching_cubes`; empty without a zero crossing.
         The same input gives the same bits.
 
     Raises:
-        ValueError: a size that is not positive, `cell_coords` of another dtype or shape or with repetitions.
+        ValueError: a size that is not positive, or `cell_coords` of another dtype or shape or with repeated rows.
     """
     for name, value in {"cell_size_m": cell_size_m, "resolution_m": resolution_m, "max_slope": max_slope}.items():
         if not value > 0:
@@ -70,10 +71,10 @@ def extract_surface(
 
 
 def cubes_per_cell(cell_size_m: float, resolution_m: float) -> tuple[int, int]:
-    """Blocks an axis that a cell is cut into, and cubes an axis in each block.
+    """Blocks per axis that a cell is divided into, and cubes per axis in each block.
 
-    Their product is cell_size_m / resolution_m, rounded; from 8 on it is raised, by an eighth at most, to the next
-    number that makes blocks of 4 to 7 cubes.
+    Their product is cell_size_m / resolution_m, rounded. From 8 on it is increased, by at most an eighth, to the next
+    number that can be divided into blocks of 4 to 7 cubes.
     """
     cubes = max(round(cell_size_m / resolution_m), 1)
     if cubes < _CUBES_PER_BLOCK.stop:
@@ -93,21 +94,22 @@ def extract_mesh(
     min_support: float = MIN_SUPPORT,
     min_part_m2: float = MIN_PART_M2,
 ) -> TriangleMesh:
-    """The mesh of a map: its SDF's zero level within the complete cells, colored, without what was never measured.
+    """Extracts the colored mesh of a map, without surface that was never observed.
+
+    The mesh is the zero level set of the map's SDF within the complete cells, cleaned as in `spslam.meshing.cleaning`.
 
     Args:
         scene: the map. Not changed.
-        resolution_m: edge wanted for the cubes, see `extract_surface`.
-        camera: of the views that `poses` tells of.
-        poses: float [F, 4, 4] T_world_camera, the trajectory. Where given, with the camera, and not empty, surface that
-            no view has seen from the front is dropped: second sheets behind walls, and what grew beyond the pictures'
-            borders.
-        min_support: surface is dropped where the fusion weight is below this share of the largest one within a voxel
-            around, as on the lips behind depth edges. 0 keeps everything.
-        min_part_m2: connected parts of a smaller area are dropped.
+        resolution_m: desired edge length of the cubes, see `extract_surface`.
+        camera: intrinsics of the views at `poses`.
+        poses: float [F, 4, 4] T_world_camera, the trajectory. With poses and a camera, surface that no view sees from
+            the front is removed: second layers behind walls, and extrapolation beyond the image borders.
+        min_support: faces are removed where the fusion weight is below this share of the largest weight within one
+            voxel, as on fringes behind depth edges. 0 keeps everything.
+        min_part_m2: connected components with a smaller area, m^2, are removed.
 
     Returns:
-        The mesh; empty for an empty map. Memory is bounded as `extract_surface` says. The same map gives the same mesh.
+        The mesh; empty for an empty map. Memory is bounded as in `extract_surface`. The same map gives the same mesh.
 
     Raises:
         ValueError: `resolution_m` is not positive, or one of `camera` and `poses` is missing.
@@ -127,8 +129,8 @@ def extract_mesh(
     vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
     normals = vertex_normals(vertices, kept)
     if camera is not None and poses is not None and len(poses):
-        kept = kept[faced_by_a_camera(vertices, normals, kept, camera, poses)]
-    kept = kept[in_large_part(vertices, kept, min_part_m2)]
+        kept = kept[front_facing_in_view(vertices, normals, kept, camera, poses)]
+    kept = kept[in_large_component(vertices, kept, min_part_m2)]
     kept, used = compact(kept, len(vertices))
     colors = _colors(scene, points[torch.from_numpy(used).to(points.device)])
     return TriangleMesh(vertices[used], kept, colors, normals[used])
@@ -137,6 +139,6 @@ def extract_mesh(
 def _colors(scene: Scene, points: torch.Tensor) -> np.ndarray:
     """RGB uint8 [N, 3] at points."""
     colors = [np.zeros((0, 3), dtype=np.uint8)]
-    for some in points.split(CHUNK_POINTS):
-        colors.append((scene.color(some) * 255).round().clamp(0, 255).to(torch.uint8).cpu().numpy())
+    for chunk in points.split(CHUNK_POINTS):
+        colors.append((scene.color(chunk) * 255).round().clamp(0, 255).to(torch.uint8).cpu().numpy())
     return np.concatenate(colors)

@@ -1,4 +1,4 @@
-"""A triangle mesh as plain arrays."""
+"""A triangle mesh as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ class TriangleMesh:
         vertices: float32 [K, 3], world, m.
         faces: int32 [L, 3], indices of vertices, counter-clockwise seen from free space.
         colors: uint8 [K, 3] RGB.
-        normals: float32 [K, 3] unit vectors towards free space; 0 where the faces around are degenerate.
+        normals: float32 [K, 3] unit vectors towards free space; 0 where all adjacent faces are degenerate.
+
+    Raises:
+        ValueError: an array of another dtype or shape.
     """
 
     vertices: np.ndarray
@@ -43,10 +46,10 @@ def compact(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarra
 
     Args:
         faces: integers [L, 3].
-        num_vertices: vertices they index into.
+        num_vertices: number of vertices that they index.
 
     Returns:
-        int32 faces [L, 3] over the used vertices, and these vertices' old indices, ascending.
+        int32 faces [L, 3] over the used vertices, and the old indices of these vertices, ascending.
     """
     is_used = np.zeros(num_vertices, dtype=bool)
     is_used[faces] = True
@@ -55,24 +58,24 @@ def compact(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarra
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normals [L, 3] of faces, as long as twice their area, on the side from which they turn counter-clockwise."""
+    """Normals [L, 3] of faces with counter-clockwise vertices; their length is twice the area of the face."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals float32 [K, 3] of vertices: the mean of the faces around, by area; 0 where there is none."""
-    around = face_normals(vertices, faces)
+    """Unit normals float32 [K, 3] of vertices: area-weighted means over the adjacent faces; 0 where there is none."""
+    normals = face_normals(vertices, faces)
     total = np.zeros((len(vertices), 3))
     for axis in range(3):
         for corner in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], around[:, axis], len(vertices))
+            total[:, axis] += np.bincount(faces[:, corner], normals[:, axis], len(vertices))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.divide(total, length, out=np.zeros_like(total), where=length > 0).astype(np.float32)
 
 
 def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Number [L] of the connected part each face belongs to; faces that share a vertex are connected."""
+    """Label [L] of the connected component of each face; faces that share a vertex are connected."""
     edges = np.concatenate((faces[:, :2], faces[:, 1:]))
     graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), (num_vertices, num_vertices))
     _, labels = connected_components(graph, directed=False)

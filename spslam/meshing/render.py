@@ -1,4 +1,4 @@
-"""Pictures of a mesh: a z-buffer rasterizer in NumPy, for reports and for masks of what a camera sees."""
+"""Renders meshes with a z-buffer rasterizer in NumPy, for reports and for depth images of a mesh."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from spslam.camera import Camera
 from spslam.geometry import inverse
 
 NEAREST_M = 0.02
-# Fragments held at once; some 40 bytes each.
+# Largest number of fragments in memory; some 40 bytes each.
 _FRAGMENTS = 2_000_000
 _BACKGROUND = 255
-# Light from the camera, a little from above, on top of light from everywhere.
+# A headlight slightly above the camera, and ambient light.
 _LIGHT = np.array([0.25, -0.5, -1.0]) / np.linalg.norm([0.25, -0.5, -1.0])
 _AMBIENT, _DIFFUSE = 0.55, 0.55
 
 
 @dataclass(frozen=True)
 class Raster:
-    """What each pixel shows.
+    """Depth and visible face of each pixel.
 
-    Attributes
-    ----------
-    depth : float32 [H,W], meters along the optical axis; 0 where nothing is.
-    face_ids : int32 [H,W], -1 where nothing is.
+    Attributes:
+        depth: float32 [H, W], meters along the optical axis; 0 for background.
+        face_ids: int32 [H, W], -1 for background.
     """
 
     depth: np.ndarray
@@ -42,31 +41,29 @@ def render_mesh(
     cull_back: bool = False,
     supersampling: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A shaded picture of a mesh and its depth.
+    """Renders a shaded image of a mesh, and its depth.
 
-    Parameters
-    ----------
-    vertices : [V,3], meters, world axes.
-    faces : integers [L,3].
-    colors : uint8 [V,3] RGB of the vertices; None is plain gray.
-    camera : whose view it is.
-    T_world_camera : [4,4].
-    cull_back : leave out faces seen from behind (counter-clockwise is the front), to look into a room from outside.
-    supersampling : samples a pixel along each axis, for smooth edges.
+    Args:
+        vertices: [V, 3], meters, world axes.
+        faces: integers [L, 3].
+        colors: uint8 [V, 3] RGB of the vertices; None is plain gray.
+        camera: intrinsics of the view.
+        T_world_camera: [4, 4], pose of the view.
+        cull_back: back-face culling (the front is counter-clockwise), to look into a room from outside.
+        supersampling: samples per pixel along each axis, for anti-aliasing.
 
-    Returns
-    -------
-    uint8 [H,W,3] RGB on white, and float32 [H,W] depth in meters, 0 where nothing is. An empty mesh gives an empty
-    picture. Deterministic; a million small faces at 640x480 take about a second.
+    Returns:
+        uint8 [H, W, 3] RGB on white, and float32 [H, W] depth in meters, 0 for background. An empty mesh gives a white
+        image. Deterministic; a million small faces at 640x480 take about a second.
     """
     fine = camera.resized(camera.width * supersampling, camera.height * supersampling)
     points, faces = _to_camera(np.asarray(vertices), T_world_camera), np.asarray(faces).reshape(-1, 3)
     raster = _rasterize(points, faces, fine, cull_back)
-    picture = _shade(points, faces, colors, fine, raster)
+    image = _shade(points, faces, colors, fine, raster)
     if supersampling == 1:
-        return picture, raster.depth
+        return image, raster.depth
     size = camera.width, camera.height
-    smooth = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    smooth = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     middle = supersampling // 2
     return smooth, np.ascontiguousarray(raster.depth[middle::supersampling, middle::supersampling])
 
@@ -74,9 +71,19 @@ def render_mesh(
 def rasterize(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, T_world_camera: np.ndarray, cull_back: bool = False
 ) -> Raster:
-    """The nearest face behind each pixel center; faces are cut at 2 cm before the camera.
+    """Finds the nearest face at each pixel center; faces are clipped at 2 cm in front of the camera.
 
-    Arguments as for :func:`render_mesh`. Of faces at the same depth the one with the highest number wins.
+    Of faces at the same depth the one with the highest index is visible.
+
+    Args:
+        vertices: see `render_mesh`, as all others.
+        faces: integers [L, 3].
+        camera: intrinsics of the view.
+        T_world_camera: [4, 4], pose of the view.
+        cull_back: back-face culling.
+
+    Returns:
+        Depth and face index of each pixel.
     """
     points = _to_camera(np.asarray(vertices), T_world_camera)
     return _rasterize(points, np.asarray(faces).reshape(-1, 3), camera, cull_back)
@@ -99,14 +106,14 @@ def _rasterize(points: np.ndarray, faces: np.ndarray, camera: Camera, cull_back:
 
 @dataclass
 class _Setup:
-    """Triangles in the image: pixel boxes, and functions a + b x + c y of the offset from the box's corner."""
+    """Triangle setup: bounding boxes (px), and functions a + b x + c y of the offset from the corner of the box."""
 
     ids: np.ndarray
     left: np.ndarray
     top: np.ndarray
     width: np.ndarray
     height: np.ndarray
-    # [T,3,3]: two barycentric coordinates and the inverse depth; all three are linear in the image.
+    # [T, 3, 3]: two barycentric coordinates and the inverse depth; all three are linear in the image.
     planes: np.ndarray
 
     @classmethod
@@ -122,7 +129,7 @@ class _Setup:
         # Counter-clockwise in a world with y up is clockwise in an image with v down.
         visible = (area < 0) if cull_back else (area != 0)
         keep = np.flatnonzero(visible & (right >= left) & (bottom >= top))
-        # Small ones first, so that triangles of a chunk are alike.
+        # Small triangles first, so that the triangles of a chunk are of similar size.
         pixels = (right[keep] - left[keep] + 1) * (bottom[keep] - top[keep] + 1)
         keep = keep[np.argsort(pixels, kind="stable")]
         scale = 1 / area[keep]
@@ -139,7 +146,7 @@ class _Setup:
         return cls(ids[keep], left[keep], top[keep], width, height, planes)
 
     def chunks(self) -> list[slice]:
-        """Runs of triangles whose boxes hold about ``_FRAGMENTS`` pixels together."""
+        """Slices of triangles whose boxes have about `_FRAGMENTS` pixels in total."""
         if not len(self.ids):
             return []
         total = np.cumsum(self.width * self.height)
@@ -156,7 +163,7 @@ class _Setup:
         )
         y, x = np.divmod(offset, width.astype(np.int32)[owner])
         planes = self.planes[chunk].reshape(-1, 9)[owner]
-        # float32 all the way: the winner of a pixel is found by equality.
+        # float32 throughout, because the visible face of a pixel is found by equality.
         fx, fy = x.astype(np.float32), y.astype(np.float32)
         first = planes[:, 0] + planes[:, 1] * fx + planes[:, 2] * fy
         second = planes[:, 3] + planes[:, 4] * fx + planes[:, 5] * fy
@@ -164,19 +171,19 @@ class _Setup:
         owner, x, y, planes = owner[inside], x[inside], y[inside], planes[inside, 6:]
         nearness = planes[:, 0] + planes[:, 1] * fx[inside] + planes[:, 2] * fy[inside]
         pixels = (self.top[chunk][owner] + y) * image_width + self.left[chunk][owner] + x
-        # Rounding can carry the rim of a thin triangle that is seen edge-on through infinity.
+        # Rounding can give the edge of a thin triangle that is seen edge-on any inverse depth.
         return pixels, np.clip(nearness, 1e-6, 1 / NEAREST_M), self.ids[chunk][owner]
 
 
 def _to_camera(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
     T_camera_world = inverse(T_world_camera)
-    # Not @: BLAS would set all cores spinning for products this thin.
-    turned = np.einsum("ij,kj->ik", points.reshape(-1, 3), T_camera_world[:3, :3])
-    return turned + T_camera_world[:3, 3]
+    # Not @: for such thin products BLAS would start threads on all cores.
+    rotated = np.einsum("ij,kj->ik", points.reshape(-1, 3), T_camera_world[:3, :3])
+    return rotated + T_camera_world[:3, 3]
 
 
 def _in_view(points: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Faces, and their numbers, that aren't wholly beyond one side of the view."""
+    """Faces, and their indices, that are not entirely outside one plane of the view frustum."""
     x, y, z = points.T
     sides = (
         z < NEAREST_M,
@@ -193,17 +200,19 @@ def _in_view(points: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.
 
 
 def _clip(points: np.ndarray, faces: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners [T,3,3] of the faces' parts beyond ``NEAREST_M``, and the faces' numbers."""
+    """Clips faces at `NEAREST_M`: corners [T, 3, 3] of the resulting triangles, and their face indices."""
     corners, ids = points[faces[0]], faces[1]
     behind = corners[..., 2] < NEAREST_M
     count = behind.sum(axis=1)
     if not count.any():
         return corners, ids
     whole, one, two = (np.flatnonzero(count == number) for number in range(3))
-    # Turned so that the odd corner comes first; order, and so the front, stays.
-    odd_one, odd_two = _turned(corners[one], behind[one].argmax(1)), _turned(corners[two], (~behind[two]).argmax(1))
-    left, right = _cut(odd_one[:, 0], odd_one[:, 1]), _cut(odd_one[:, 0], odd_one[:, 2])
-    tip = np.stack([odd_two[:, 0], _cut(odd_two[:, 1], odd_two[:, 0]), _cut(odd_two[:, 2], odd_two[:, 0])], axis=1)
+    # Rotate the corners cyclically, which keeps the orientation, so that the corner alone on its side comes first.
+    odd_one, odd_two = _rotated(corners[one], behind[one].argmax(1)), _rotated(corners[two], (~behind[two]).argmax(1))
+    left, right = _clip_edge(odd_one[:, 0], odd_one[:, 1]), _clip_edge(odd_one[:, 0], odd_one[:, 2])
+    tip = np.stack(
+        [odd_two[:, 0], _clip_edge(odd_two[:, 1], odd_two[:, 0]), _clip_edge(odd_two[:, 2], odd_two[:, 0])], axis=1
+    )
     parts = [
         corners[whole],
         np.stack([left, odd_one[:, 1], odd_one[:, 2]], axis=1),
@@ -213,18 +222,19 @@ def _clip(points: np.ndarray, faces: tuple[np.ndarray, np.ndarray]) -> tuple[np.
     return np.concatenate(parts), np.concatenate([ids[whole], ids[one], ids[one], ids[two]])
 
 
-def _turned(corners: np.ndarray, first: np.ndarray) -> np.ndarray:
+def _rotated(corners: np.ndarray, first: np.ndarray) -> np.ndarray:
     order = (first[:, None] + np.arange(3)) % 3
     return np.take_along_axis(corners, order[..., None], axis=1)
 
 
-def _cut(behind: np.ndarray, before: np.ndarray) -> np.ndarray:
+def _clip_edge(behind: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """The points [N, 3] where the edges between points behind and before the near plane cross it."""
     share = (NEAREST_M - behind[:, 2:]) / (before[:, 2:] - behind[:, 2:])
     return behind + share * (before - behind)
 
 
 def _pixel_range(coordinates: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and last pixel center between a triangle's corners, inside the image; first > last if there is none."""
+    """First and last pixel center in the extent of a triangle, inside the image; first > last if there is none."""
     first = np.clip(np.ceil(coordinates.min(axis=1)), 0, size)
     last = np.clip(np.floor(coordinates.max(axis=1)), -1, size - 1)
     return first.astype(np.int64), last.astype(np.int64)
@@ -234,9 +244,9 @@ def _shade(
     points: np.ndarray, faces: np.ndarray, colors: np.ndarray | None, camera: Camera, raster: Raster
 ) -> np.ndarray:
     hit = raster.face_ids >= 0
-    picture = np.full((*hit.shape, 3), _BACKGROUND, dtype=np.uint8)
+    image = np.full((*hit.shape, 3), _BACKGROUND, dtype=np.uint8)
     if not hit.any():
-        return picture
+        return image
     shown = faces[raster.face_ids[hit]]
     corners = points.astype(np.float32)[shown]
     places = (camera.ray_directions() * raster.depth[..., None])[hit]
@@ -247,12 +257,12 @@ def _shade(
     else:
         weights = _barycentric(corners, places, normals)
         base = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[shown, :3].astype(np.float32))
-    picture[hit] = np.clip(base * light[:, None], 0, 255).astype(np.uint8)
-    return picture
+    image[hit] = np.clip(base * light[:, None], 0, 255).astype(np.uint8)
+    return image
 
 
 def _lighting(normals: np.ndarray, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Brightness of each hit pixel; normals are turned to the viewer and blurred a little, against facets."""
+    """Brightness of each foreground pixel; normals face the viewer and are blurred slightly, to hide facets."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
     normals = np.where((normals * points).sum(axis=1, keepdims=True) > 0, -normals, normals)
@@ -264,7 +274,7 @@ def _lighting(normals: np.ndarray, points: np.ndarray, hit: np.ndarray) -> np.nd
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Weights [N,3] of a triangle's corners at a point in its plane."""
+    """Barycentric weights [N, 3] of points in the planes of triangles."""
     area = np.maximum((normals * normals).sum(axis=1), 1e-30)
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     wb = (np.cross(points - a, c - a) * normals).sum(axis=1) / area

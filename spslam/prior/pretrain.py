@@ -19,9 +19,9 @@ import torch
 from safetensors.torch import save
 
 from spslam.io import atomic_write
-from spslam.prior.checkpoint import TrainingState, load_state, save_state
 from spslam.prior.shapes import TRAINING_KINDS
 from spslam.prior.training import BatchGradient, PretrainSettings, TrainingPool, initial_networks, split_networks
+from spslam.prior.training_state import TrainingState, load_state, save_state
 from spslam.prior.validation import MM_PER_VOXEL, validate
 
 SCRIPT_VERSION = 1

@@ -11,7 +11,7 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
-from spslam.evaluation.report import write_report
+from spslam.evaluation.html_report import write_report
 from spslam.io import atomic_write
 from spslam.meshing import extract_mesh, save_mesh
 from spslam.run_folder import RunFolder

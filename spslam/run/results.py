@@ -8,7 +8,7 @@ import torch
 
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError
-from spslam.evaluation.trajectory import ate, rpe
+from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
 from spslam.run.provenance import provenance
@@ -54,7 +54,7 @@ def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest,
         **_sizes(system),
     }
     if ground_truth is not None:
-        known = trajectory.ground_truth_of_known(ground_truth[frames.indices.numpy()])
+        known = trajectory.mask_lost(ground_truth[frames.indices.numpy()])
         metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
     if request.mesh:
         tracked = trajectory.poses[~lost]

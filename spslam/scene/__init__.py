@@ -1,4 +1,4 @@
-"""The map and its parts: `SparseVolume` (geometry), `TriPlanes` (color), their decoders, and `Scene`, all of it."""
+"""The map (`Scene`) and its parts: `SparseVolume` for geometry, `TriPlanes` for color, and their decoders."""
 
 from spslam.scene.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import SparseVolume

@@ -1,7 +1,7 @@
-"""Parameters of the two decoders, as the flat vectors that `spslam.ops.mlp` takes.
+"""Parameters of the geometry and color decoders, as flat vectors in the layout of `spslam.ops.mlp`.
 
-Both are in -> hidden -> hidden -> out with ReLU inside: the paper's "2-layer MLP with 32 nodes", as ESLAM's code
-counts.
+Both networks are in -> hidden -> hidden -> out with ReLU between the layers. This is the paper's "2-layer MLP with 32
+nodes", counted as in the code of ESLAM.
 """
 
 import math
@@ -14,7 +14,7 @@ from spslam import ops
 
 @dataclass(frozen=True)
 class MlpShape:
-    """Widths of an in -> hidden -> hidden -> out network."""
+    """Layer widths of an in -> hidden -> hidden -> out network."""
 
     inputs: int
     hidden: int
@@ -36,12 +36,12 @@ COLOR_DECODER = MlpShape(inputs=32, hidden=32, outputs=3)  # tri-plane feature (
 
 
 def random_parameters(shape: MlpShape, seed: int, purpose: int) -> torch.Tensor:
-    """Uniform initialization in +-1/sqrt(inputs) of each layer, weights and biases alike (torch.nn.Linear's).
+    """Random initial parameters: weights and biases uniform in +-1/sqrt(inputs) of each layer, as torch.nn.Linear's.
 
     Args:
         shape: the network.
-        seed: the run's seed.
-        purpose: tells networks of one seed apart.
+        seed: seed of the run.
+        purpose: distinguishes the networks that are initialized from one seed.
 
     Returns:
         float32 [shape.parameters], the same on every machine.

@@ -1,4 +1,4 @@
-"""The map: sparse volume, tri-planes and the two decoders, with one file to save to and load from."""
+"""The map: sparse volume, tri-planes and the two decoders, saved to and loaded from one file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +18,15 @@ _GEOMETRY, _COLOR = 1, 2  # `purpose` of the decoders' initialization
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What the map is made of; stored with it.
+    """Settings of a map; stored in its file.
 
     Attributes:
-        voxel_size_m: edge of a voxel.
-        truncation_m: distance at which the SDF saturates.
-        plane_cell_m: edge of a tri-plane cell.
-        position_scale: factor on positions (m) entering the geometry decoder.
-        max_voxels: vertices above which the volume refuses to grow.
-        max_texels: texels above which the planes refuse to grow; None for never.
+        voxel_size_m: edge length of a voxel, m.
+        truncation_m: truncation distance of the SDF, m.
+        plane_cell_m: edge length of a tri-plane cell, m.
+        position_scale: scale of positions (m) at the input of the geometry decoder, 1/m.
+        max_voxels: largest number of voxel vertices; more raise an error.
+        max_texels: largest number of texels of the planes; more raise an error. None is no limit.
     """
 
     voxel_size_m: float
@@ -38,15 +38,17 @@ class SceneSettings:
 
 
 class Scene:
-    """Geometry and appearance of what was seen.
+    """Geometry and appearance of the observed space.
 
     Attributes:
         settings: sizes and scales.
-        origin: float64 [3] world point (m) that decoder positions are relative to, the first camera's center.
+        seed: seed of the random initial values.
+        device: where the tensors are.
+        origin: float64 [3] world point (m) that decoder positions are relative to: the center of the first camera.
         volume: embeddings at the vertices of allocated voxels.
         planes: color features on three planes.
-        geometry_decoder: flat parameters of position, embedding -> SDF / truncation.
-        color_decoder: flat parameters of tri-plane feature -> RGB.
+        geometry_decoder: flat parameters of the network (position, embedding) -> SDF / truncation.
+        color_decoder: flat parameters of the network tri-plane feature -> RGB.
     """
 
     def __init__(
@@ -57,14 +59,14 @@ class Scene:
         geometry_decoder: torch.Tensor | None = None,
         device: torch.device | str = "cpu",
     ):
-        """An empty map.
+        """Creates an empty map.
 
         Args:
             settings: sizes and scales.
-            seed: of the random initial values.
-            origin: float [3]; the world's origin where not given.
-            geometry_decoder: trained parameters to start from; random ones where not given.
-            device: where the tensors live.
+            seed: seed of the random initial values.
+            origin: float [3], m; the world origin by default.
+            geometry_decoder: trained parameters to start from; random by default.
+            device: where the tensors are.
         """
         self.settings = settings
         self.seed = seed
@@ -78,7 +80,7 @@ class Scene:
         self.color_decoder = random_parameters(COLOR_DECODER, seed, _COLOR).to(self.device)
 
     def view(self) -> ops.SceneView:
-        """The tensors as the fused ops take them. Valid until the scene grows."""
+        """The tensors as input of the fused ops. Valid until the scene grows."""
         return ops.SceneView(
             hash_keys=self.volume.hash_keys,
             hash_values=self.volume.hash_values,
@@ -106,17 +108,24 @@ class Scene:
         return ops.query_sdf(self.view(), points)
 
     def color(self, points: torch.Tensor) -> torch.Tensor:
-        """RGB at world points (eq. 3, 4): float32 [N, 3] in [0, 1] of float32 [N, 3] points (m)."""
+        """RGB at world points (eq. 3, 4).
+
+        Args:
+            points: float32 [N, 3], m.
+
+        Returns:
+            float32 [N, 3] in [0, 1].
+        """
         return ops.query_color(self.view(), points)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the learnable parameters, the paper's model size."""
+        """Size of the learnable parameters in bytes: the model size of the paper."""
         parameters = (self.volume.embeddings, self.planes.texels, self.geometry_decoder, self.color_decoder)
         return sum(p.numel() * p.element_size() for p in parameters)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Everything learnt, where it is; views, so clone what must stay as it is."""
+        """All map tensors by name, on their device. They are views: clone what must not change."""
         return {
             "origin": self.origin,
             "volume.voxel_coords": self.volume.voxel_coords,
@@ -129,11 +138,11 @@ class Scene:
         }
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """`tensors()` on the CPU and contiguous; views where they are so already."""
+        """`tensors()` on the CPU and contiguous; still views where they already are."""
         return {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors().items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Replaces the content by that of `state_dict()`.
+        """Replaces the content by a `state_dict()`.
 
         Raises:
             SpslamError: a tensor is missing or of another shape.
@@ -149,7 +158,11 @@ class Scene:
         self.color_decoder = state["color_decoder"].to(self.device, copy=True)
 
     def save(self, path: str | Path) -> None:
-        """Writes one safetensors file, atomically; the same scene gives the same bytes. Raises OutputError."""
+        """Writes one safetensors file, atomically; the same scene gives the same bytes.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         header = {"format": FORMAT, "seed": self.seed, "settings": vars(self.settings)}
         save_tensors(path, self.state_dict(), header)
 
@@ -158,14 +171,14 @@ class Scene:
         """Reads a file written by `save`.
 
         Raises:
-            SpslamError: no such file, not a map, truncated, or of another shape.
+            SpslamError: no such file, not a map, truncated, or with tensors of another shape.
         """
         state, header = load_tensors(path, FORMAT, "map")
         try:
             scene = cls(SceneSettings(**header["settings"]), header["seed"], device=device)
             scene.load_state_dict(state)
         except (SpslamError, KeyError, TypeError, ValueError) as error:
-            raise SpslamError(f"{path}: a damaged map ({error})") from None
+            raise SpslamError(f"{path}: damaged map ({error})") from None
         return scene
 
     def _empty_volume(self) -> SparseVolume:
@@ -176,7 +189,7 @@ class Scene:
         return TriPlanes(settings.plane_cell_m, self.seed, self.device, settings.max_texels)
 
 
-_LEARNT: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {
+_TENSORS: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {
     "origin": (torch.float64, (3,)),
     "volume.voxel_coords": (torch.int32, (None, 3)),
     "volume.embeddings": (torch.float32, (None, 8)),
@@ -189,7 +202,7 @@ _LEARNT: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {
 
 
 def _check_state(state: dict[str, torch.Tensor]) -> None:
-    for name, (dtype, shape) in _LEARNT.items():
+    for name, (dtype, shape) in _TENSORS.items():
         if name not in state:
             raise SpslamError(f"tensor {name} is missing")
         tensor = state[name]

@@ -1,4 +1,4 @@
-"""The sparse feature volume: voxel vertices with an embedding each, growing as the camera moves."""
+"""The sparse feature volume: voxel vertices with an embedding each, allocated as the camera moves."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,14 +12,14 @@ FEATURES = 8
 
 
 def resize_rows(tensor: torch.Tensor, rows: int) -> torch.Tensor:
-    """`tensor` with another number of rows: the common ones copied, new ones zero. For the optimizer's buffers.
+    """Changes the number of rows of a tensor, such as an optimizer's buffer: new rows are 0.
 
     Args:
         tensor: any dtype, [V, ...].
-        rows: number of rows wanted.
+        rows: new number of rows.
 
     Returns:
-        A new tensor [rows, ...], or `tensor` itself where it already has that many.
+        A new tensor [rows, ...], or `tensor` itself if it already has as many rows.
     """
     if tensor.shape[0] == rows:
         return tensor
@@ -33,13 +33,16 @@ class SparseVolume:
     """Voxel vertices at integer coordinates, `world = coords * voxel_size_m`, each with an 8-d embedding.
 
     An `ops.VoxelHash`, `cells`, with an embedding and a weight for each of its vertices. Tensors of V = `num_voxels`
-    rows are views of buffers of `capacity` rows: a view's memory stays where it is until `capacity` changes.
+    rows are views of buffers of `capacity` rows, whose memory is not reallocated until `capacity` changes.
 
     Args:
-        voxel_size_m: edge of a voxel, meters.
-        max_voxels: most vertices allowed; None for as many as memory holds.
-        device: where the volume lives.
-        capacity: rows to reserve at first.
+        voxel_size_m: edge length of a voxel, meters.
+        max_voxels: largest number of vertices; None is no limit.
+        device: where the tensors are.
+        capacity: initial number of rows to reserve.
+
+    Raises:
+        ValueError: a number out of range.
     """
 
     def __init__(
@@ -63,12 +66,12 @@ class SparseVolume:
 
     @property
     def num_voxels(self) -> int:
-        """V, the vertices there are."""
+        """V, the number of allocated vertices."""
         return self.cells.num_voxels
 
     @property
     def capacity(self) -> int:
-        """Rows reserved; optimizer buffers of as many rows stay valid until it changes."""
+        """Number of reserved rows; optimizer buffers with as many rows are valid until it changes."""
         return self.cells.capacity
 
     @property
@@ -83,12 +86,12 @@ class SparseVolume:
 
     @property
     def voxel_coords(self) -> torch.Tensor:
-        """int32 [V, 3], row i the coordinates of voxel id i."""
+        """int32 [V, 3], the coordinates of voxel id i in row i."""
         return self.cells.voxel_coords
 
     @property
     def corner_ids(self) -> torch.Tensor:
-        """int32 [V, 8], the ids of the cell above each vertex, all -1 where one is missing."""
+        """int32 [V, 8], ids of the corners of the cell whose lowest vertex is i; all -1 if one is missing."""
         return self.cells.corner_ids
 
     @property
@@ -98,12 +101,12 @@ class SparseVolume:
 
     @property
     def weights(self) -> torch.Tensor:
-        """float32 [V], the fusion weight gathered so far (W of equation 1), a view."""
+        """float32 [V], the accumulated fusion weight (W of equation 1), a view."""
         return self._weights[: self.num_voxels]
 
     @property
     def buffers(self) -> ops.VolumeBuffers:
-        """All rows, those not yet in use too, as `ops.encode_frame_` takes them."""
+        """All rows, including unused ones, as input of `ops.encode_frame_`."""
         cells = self.cells
         return ops.VolumeBuffers(
             cells.hash_keys,
@@ -115,7 +118,7 @@ class SparseVolume:
         )
 
     def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor:
-        """Allocates the vertices that are missing; their embeddings and weights start at 0.
+        """Allocates missing vertices; their embeddings and weights are 0.
 
         Args:
             voxel_coords: int32 [N, 3], repetitions allowed; N = 0 changes nothing.
@@ -124,7 +127,7 @@ class SparseVolume:
             voxel_ids int32 [N]. New ids follow the order of (x, y, z).
 
         Raises:
-            SpslamError: more than `max_voxels` would exist. The volume is then as before.
+            SpslamError: more than `max_voxels` vertices are needed. The volume is not changed then.
         """
         with self._growth("insert"):
             return self.cells.insert(voxel_coords)
@@ -138,13 +141,13 @@ class SparseVolume:
             voxel_coords: int32 [M, 3], distinct.
             features: float32 [M, 8].
             feature_weights: float32 [M], at least 0.
-            max_weight: cap of the total weight of a vertex.
+            max_weight: upper limit of the accumulated weight of a vertex.
 
         Returns:
             voxel_ids int32 [M].
 
         Raises:
-            SpslamError: more than `max_voxels` would exist. The volume is then as before.
+            SpslamError: more than `max_voxels` vertices are needed. The volume is not changed then.
         """
         voxel_ids = self.insert(voxel_coords)
         ops.fuse_prior_(self.embeddings, self.weights, voxel_ids, features, feature_weights, max_weight)
@@ -158,17 +161,20 @@ class SparseVolume:
         fusion: ops.FrameFusion,
         tf32: bool = True,
     ) -> ops.EncodedFrame:
-        """Allocates the vertices around a frame's points and fuses their encoding, see `ops.encode_frame_`.
+        """Allocates the vertices around a frame's points and fuses the encoded points, see `ops.encode_frame_`.
 
         Args:
             points: float32 [N, 3], world, meters.
             normals: float32 [N, 3], world, unit; 0 = unknown.
-            encoder_params: float32 [5128], on the volume's device.
-            fusion: settings; of this volume's voxel size.
+            encoder_params: float32 [5128], on the device of the volume.
+            fusion: settings, with the voxel size of this volume.
             tf32: see `ops.encode_points`.
 
+        Returns:
+            See `ops.EncodedFrame`.
+
         Raises:
-            SpslamError: more than `max_voxels` would exist. The volume is then as before.
+            SpslamError: more than `max_voxels` vertices are needed. The volume is not changed then.
         """
         while True:
             known, limit = self.num_voxels, self.cells.max_voxels
@@ -181,13 +187,13 @@ class SparseVolume:
                 self.cells.reserve(known + encoded.new_voxels)
 
     def lookup(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The cell around each point.
+        """Finds the cell that contains each point.
 
         Args:
             points: float32 or float64 [N, 3], world, meters.
 
         Returns:
-            corner_ids int32 [N, 8], local_coords [N, 3] in [0, 1], and valid bool [N]: all eight corners exist.
+            corner_ids int32 [N, 8], local_coords [N, 3] in [0, 1], and valid bool [N], whether all eight corners exist.
         """
         corner_ids, local_coords = self.cells.lookup(points, self.voxel_size_m)
         return corner_ids, local_coords, corner_ids[:, 0] >= 0
@@ -205,10 +211,10 @@ class SparseVolume:
         return ops.trilinear_interpolate(self.embeddings, corner_ids, local_coords), valid
 
     def restore(self, voxel_coords: torch.Tensor, embeddings: torch.Tensor, weights: torch.Tensor) -> None:
-        """Replaces the content by what `voxel_coords`, `embeddings` and `weights` of another volume were.
+        """Replaces the content by the `voxel_coords`, `embeddings` and `weights` of another volume.
 
-        Voxel ids are kept: row i is voxel i again. The hash table and the rows of corner ids follow from the
-        coordinates.
+        Voxel ids are kept: row i is voxel i. The hash table and the corner ids are rebuilt from the coordinates. On an
+        error the volume is not changed.
 
         Args:
             voxel_coords: int32 [V, 3], distinct.
@@ -216,10 +222,8 @@ class SparseVolume:
             weights: float32 [V].
 
         Raises:
-            ValueError: shapes that don't fit each other, or a coordinate that is out of range or occurs twice.
+            ValueError: inconsistent shapes, or a coordinate that is out of range or occurs twice.
             SpslamError: V is above `max_voxels`.
-
-        On an error the volume is as before.
         """
         rows = voxel_coords.shape[0]
         _check_rows("voxel_coords", voxel_coords, (rows, 3))
@@ -233,7 +237,7 @@ class SparseVolume:
 
     @contextmanager
     def _growth(self, function: str) -> Iterator[None]:
-        """Gives embeddings and weights the room that the cells make; says of a limit met where a user sets it."""
+        """Resizes embeddings and weights after the cells grew; a reached limit is reported with its option."""
         try:
             yield
         except ops.VoxelLimitError as error:

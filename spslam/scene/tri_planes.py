@@ -8,21 +8,23 @@ from spslam import ops
 from spslam.errors import SpslamError
 
 FEATURES = 32
-MARGIN_M = 1.0  # grown beyond what is asked for, so that growth is rare
+MARGIN_M = 1.0  # planes grow by this much more than needed, so that they grow rarely
 INITIAL_STD = 0.01
-AXES = ((0, 1), (0, 2), (1, 2))  # of the xy, xz and yz planes
-_BLOCK = 32  # edge of a square of texels that share a Philox key
-_FIRST_KEY = 2**31  # keys of blocks lie around it, away from those of other initial values
+AXES = ((0, 1), (0, 2), (1, 2))  # axes of the xy, xz and yz planes
+_BLOCK = 32  # edge, in texels, of the square blocks that are initialized with one Philox key
+_FIRST_KEY = 2**31  # the keys of blocks are near this one, apart from the keys of other initial values
 
 
 class TriPlanes:
     """Feature texels of the xy, xz and yz planes, as the rows of one table.
 
-    A plane is a rectangle of texels (iu, iv) at world position (iu, iv) * cell_size_m. A texel's initial value depends
-    on the seed, its plane and its (iu, iv) only, so it does not matter in which steps a plane grew.
+    A plane is a rectangle of texels (iu, iv) at world position (iu, iv) * cell_size_m. The initial value of a texel
+    depends only on the seed, its plane and its (iu, iv), so it does not depend on the order in which a plane grew.
 
     Attributes:
-        cell_size_m: edge of a texel, m.
+        cell_size_m: edge length of a texel, m.
+        seed: seed of the initial values.
+        max_texels: largest number of texels in total; None is no limit.
         texels: float32 [P, 32].
         layout: 15 ints, (first row, origin u, origin v, size u, size v) of each plane, as `ops.tri_plane_interpolate`
             takes them.
@@ -35,7 +37,17 @@ class TriPlanes:
         device: torch.device | str = "cpu",
         max_texels: int | None = None,
     ):
-        """Planes of no extent; of at most `max_texels` texels in all, None for as many as memory holds."""
+        """Creates empty planes.
+
+        Args:
+            cell_size_m: edge length of a texel, m.
+            seed: seed of the initial values.
+            device: where the texels are.
+            max_texels: largest number of texels in total; None is no limit.
+
+        Raises:
+            ValueError: `cell_size_m` is not positive.
+        """
         if not cell_size_m > 0:
             raise ValueError(f"TriPlanes: cell_size_m must be positive, got {cell_size_m}")
         self.cell_size_m = float(cell_size_m)
@@ -45,20 +57,28 @@ class TriPlanes:
         self.layout = [0] * 15
 
     def interpolate(self, points: torch.Tensor) -> torch.Tensor:
-        """Sum of the three planes' features (eq. 3): float32 [N, 32] at float32 [N, 3] points, m."""
+        """Sum of the features of the three planes at points (eq. 3).
+
+        Args:
+            points: float32 [N, 3], m.
+
+        Returns:
+            float32 [N, 32].
+        """
         return ops.tri_plane_interpolate(self.texels, points, self.cell_size_m, self.layout)
 
     def cover(self, points: torch.Tensor) -> torch.Tensor | None:
-        """Grows the planes until they reach beyond all points; what they hold is kept.
+        """Grows the planes until they cover all points; existing texels are kept.
 
         Args:
-            points: float [N, 3], m; rows with NaN or infinity are left out.
+            points: float [N, 3], m; rows with NaN or infinity are ignored.
 
         Returns:
-            int64 [old P] the new row of every old one, for buffers kept beside the texels; None where nothing grew.
+            int64 [old P], the new row of each old row, to move other buffers with a row per texel; None if no plane
+            grew.
 
         Raises:
-            SpslamError: the planes would hold more than `max_texels`. They are then as before.
+            SpslamError: more than `max_texels` texels are needed. The planes are not changed then.
         """
         points = points[points.isfinite().all(1)]
         if len(points) == 0:
@@ -73,7 +93,15 @@ class TriPlanes:
         return self._regrow(planes)
 
     def restore(self, texels: torch.Tensor, layout: Sequence[int]) -> None:
-        """Takes over saved texels and layout."""
+        """Replaces texels and layout by saved ones.
+
+        Args:
+            texels: float32 [P, 32].
+            layout: 15 ints.
+
+        Raises:
+            ValueError: `texels` does not have the rows that `layout` describes.
+        """
         rows = sum(layout[5 * plane + 3] * layout[5 * plane + 4] for plane in range(3)) if len(layout) == 15 else -1
         if texels.shape != (rows, FEATURES):
             raise ValueError(f"TriPlanes: texels must have the rows of layout, got {list(texels.shape)}")
@@ -94,7 +122,7 @@ class TriPlanes:
         return u, v, size_u, size_v
 
     def _extended(self, plane: int, low: list[int], high: list[int], margin: int) -> tuple[int, int, int, int]:
-        """The rectangle of a plane that holds low..high too; an axis that must grow gets a margin on that side."""
+        """The rectangle of a plane extended to contain low..high; each side that must grow gets a margin."""
         origins, sizes = [], []
         for slot, axis in enumerate(AXES[plane]):
             begin, size = self._rectangle(plane)[slot], self._rectangle(plane)[slot + 2]
@@ -127,7 +155,7 @@ class TriPlanes:
         return torch.cat(moved) if moved else torch.zeros(0, dtype=torch.int64, device=self.texels.device)
 
     def _initial(self, plane: int, u: int, v: int, size_u: int, size_v: int) -> torch.Tensor:
-        """Initial texels [size_u, size_v, 32]: N(0, 0.01), cut out of blocks that lie at fixed places of the world."""
+        """Initial texels [size_u, size_v, 32], N(0, 0.01): a crop of blocks at fixed world positions."""
         first_u, first_v = u // _BLOCK, v // _BLOCK
         last_u, last_v = (u + size_u - 1) // _BLOCK, (v + size_v - 1) // _BLOCK
         columns = [
@@ -144,5 +172,5 @@ class TriPlanes:
         stream = ops.Stream.INITIALIZATION
         uniform = ops.philox_uniform(self.seed, stream, frame, iteration, count, self.texels.device)
         first, second = uniform.view(_BLOCK, _BLOCK, 2, FEATURES).unbind(2)
-        # Box and Muller; 1 - u lies in (0, 1].
+        # Box-Muller transform; 1 - u lies in (0, 1].
         return INITIAL_STD * (-2 * torch.log(1 - first)).sqrt() * torch.cos(2 * torch.pi * second)

@@ -7,7 +7,7 @@ import pytest
 
 from spslam.benchmark.gicp import GicpOdometry
 from spslam.errors import SpslamError
-from spslam.evaluation.trajectory import ate
+from spslam.evaluation.trajectory_metrics import ate
 from tests.system.sequences import Recorded
 
 FRAMES = 12

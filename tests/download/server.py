@@ -1,4 +1,4 @@
-"""A web server for the tests: files from memory, with ranges, and everything that goes wrong on a line."""
+"""A test web server: files from memory, range requests, and simulated network failures."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass
 class Site:
-    """What the server has and how it behaves.
+    """What the server provides and how it behaves.
 
-    Attributes
-    ----------
-    files : content by path.
-    cuts : how many bytes of a body each of the next answers sends before the line is cut.
-    faults : HTTP codes that the next answers are.
-    ranges : whether ranges are answered.
-    etag : of all files; None sends none.
-    asked : the ranges asked for, None for the whole, in order.
+    Attributes:
+        files: content by path.
+        cuts: bytes of the body that each of the next responses sends before the connection is closed.
+        faults: HTTP status codes of the next responses.
+        ranges: whether range requests are supported.
+        etag: of all files; None sends none.
+        requested: start of the range of each request in order; None for the whole file.
+        base_url: of the running server.
     """
 
     files: dict[str, bytes]
@@ -29,26 +29,26 @@ class Site:
     faults: list[int] = field(default_factory=list)
     ranges: bool = True
     etag: str | None = '"1"'
-    asked: list[int | None] = field(default_factory=list)
-    address: str = ""
+    requested: list[int | None] = field(default_factory=list)
+    base_url: str = ""
 
     def url(self, name: str) -> str:
-        return f"{self.address}/{name}"
+        return f"{self.base_url}/{name}"
 
 
 @contextlib.contextmanager
 def serve(site: Site) -> Iterator[Site]:
-    """Serves a site on a free port of this machine."""
+    """Serves a site on a free local port."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):  # noqa: N802 (the base class calls it so)
-            answer(self, site)
+            respond(self, site)
 
         def log_message(self, *arguments):
             pass
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    site.address = f"http://127.0.0.1:{server.server_port}"
+    site.base_url = f"http://127.0.0.1:{server.server_port}"
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     try:
@@ -59,11 +59,11 @@ def serve(site: Site) -> Iterator[Site]:
         server.server_close()
 
 
-def answer(request: BaseHTTPRequestHandler, site: Site) -> None:
+def respond(request: BaseHTTPRequestHandler, site: Site) -> None:
     content = site.files.get(request.path.lstrip("/"))
     wanted = re.fullmatch(r"bytes=(\d+)-", request.headers.get("Range", ""))
     start = int(wanted.group(1)) if wanted else None
-    site.asked.append(start)
+    site.requested.append(start)
     if site.faults or content is None:
         request.send_error(site.faults.pop(0) if site.faults else 404)
         return

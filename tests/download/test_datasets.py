@@ -1,4 +1,4 @@
-"""Data sets by name: what is listed, what is fetched, and what is left alone."""
+"""Datasets by name: the catalog, downloading, and resuming."""
 
 import re
 
@@ -29,52 +29,52 @@ EXPECTED = {**FILES, "tum/desk/rgb.txt": b"1 a.png"}
 
 
 def data_files(folder):
-    return {name: content for name, content in tree(folder).items() if not name.startswith(datasets.NOTES_FOLDER)}
+    return {name: content for name, content in tree(folder).items() if not name.startswith(datasets.RECORDS_FOLDER)}
 
 
-def test_a_data_set_is_fetched_once(site, tmp_path):
-    told = set()
+def test_a_dataset_is_downloaded_once(site, tmp_path):
+    reported = set()
     source = source_of(site)
     assert not is_complete(source, tmp_path)
-    assert download(source, tmp_path, lambda name, done, total: told.add(name)) == ["Rooms.zip", "desk.tgz"]
+    assert download(source, tmp_path, lambda name, done, total: reported.add(name)) == ["Rooms.zip", "desk.tgz"]
     assert data_files(tmp_path) == EXPECTED
-    assert told == {"Rooms.zip", "desk.tgz"}
+    assert reported == {"Rooms.zip", "desk.tgz"}
     assert is_complete(source, tmp_path)
     (tmp_path / "room_mesh.ply").write_bytes(b"mine")
     assert download(source, tmp_path) == []
-    assert len(site.asked) == 2
+    assert len(site.requested) == 2
     assert (tmp_path / "room_mesh.ply").read_bytes() == b"mine"
-    left = {name for name in tree(tmp_path) if name.startswith(datasets.NOTES_FOLDER)}
-    assert left == {f"{datasets.NOTES_FOLDER}/{name}.json" for name in ("Rooms.zip", "desk.tgz")}
+    left = {name for name in tree(tmp_path) if name.startswith(datasets.RECORDS_FOLDER)}
+    assert left == {f"{datasets.RECORDS_FOLDER}/{name}.json" for name in ("Rooms.zip", "desk.tgz")}
 
 
-def test_what_was_interrupted_goes_on(site, tmp_path):
+def test_an_interrupted_download_resumes(site, tmp_path):
     source = source_of(site)
     site.cuts = [100] + [0] * 10
     with pytest.raises(DatasetError, match="100 bytes are kept"):
         download(source, tmp_path, first_pause_s=0)
-    site.cuts, site.asked = [], []
+    site.cuts, site.requested = [], []
     download(source, tmp_path)
-    assert site.asked == [100, None]
+    assert site.requested == [100, None]
     assert data_files(tmp_path) == EXPECTED
 
 
-def test_an_interrupted_unpacking_needs_no_second_download(site, tmp_path):
-    notes = tmp_path / datasets.NOTES_FOLDER
-    notes.mkdir()
-    (notes / "Rooms.zip").write_bytes(zipped(FILES))
+def test_interrupted_unpacking_does_not_download_again(site, tmp_path):
+    records = tmp_path / datasets.RECORDS_FOLDER
+    records.mkdir()
+    (records / "Rooms.zip").write_bytes(zipped(FILES))
     download(source_of(site), tmp_path)
     assert data_files(tmp_path) == EXPECTED
-    assert len(site.asked) == 1
+    assert len(site.requested) == 1
 
 
-def test_a_wrong_checksum_leaves_nothing(site, tmp_path):
+def test_a_wrong_checksum_leaves_no_files(site, tmp_path):
     with pytest.raises(DatasetError, match="Rooms.zip: SHA-256 must be "):
         download(source_of(site, sha256="0" * 64), tmp_path)
     assert tree(tmp_path) == {}
 
 
-def test_a_damaged_archive_is_removed_so_that_it_is_fetched_anew(site, tmp_path):
+def test_a_damaged_archive_is_removed_and_downloaded_again(site, tmp_path):
     good = site.files["Rooms.zip"]
     site.files["Rooms.zip"] = b"<html>moved</html>"
     with pytest.raises(DatasetError, match="Rooms.zip: must be a zip or tar file"):
@@ -84,18 +84,18 @@ def test_a_damaged_archive_is_removed_so_that_it_is_fetched_anew(site, tmp_path)
     assert data_files(tmp_path) == EXPECTED
 
 
-def test_names():
+def test_sources_are_found_by_name():
     assert find_source("7scenes/chess").archives[0].name == "chess.zip"
     for name in ("tum/freiburg1_rpy", "tum/rgbd_dataset_freiburg1_rpy"):
         (archive,) = find_source(name).archives
         assert archive.url.endswith("/rgbd/dataset/freiburg1/rgbd_dataset_freiburg1_rpy.tgz")
     assert find_source("tum/fr3_office").archives[0].name == "rgbd_dataset_freiburg3_long_office_household.tgz"
     for name, message in {
-        "replca": "replca is no data set to download; did you mean replica?",
-        "tum/../../x": "is no data set to download",
-        "kitti": "spslam download lists the names",
-        "scannet": "scannet can't be downloaded without a form",
-        "scannet/scene0000_00": "scannet can't be downloaded without a form",
+        "replca": "replca: not a dataset that can be downloaded; did you mean replica?",
+        "tum/../../x": "not a dataset that can be downloaded",
+        "kitti": "`spslam download` lists the names",
+        "scannet": "scannet can't be downloaded without signing",
+        "scannet/scene0000_00": "scannet can't be downloaded without signing",
     }.items():
         with pytest.raises(DatasetError, match=message):
             find_source(name)
@@ -109,7 +109,7 @@ def test_the_catalog_is_consistent():
         assert "http" in source.terms
 
 
-def test_the_command(site, tmp_path, monkeypatch, capsys):
+def test_download_command(site, tmp_path, monkeypatch, capsys):
     sources = [source_of(site)]
     monkeypatch.setattr(command, "SOURCES", sources)
     monkeypatch.setattr(command, "find_source", lambda name: sources[0])
@@ -117,22 +117,22 @@ def test_the_command(site, tmp_path, monkeypatch, capsys):
     listed = capsys.readouterr().out
     assert "rooms" in listed
     assert "public domain" in listed
-    assert "scannet can't be downloaded without a form" in listed
+    assert "scannet can't be downloaded without signing" in listed
     assert main(["download", "rooms", "--data", str(tmp_path)]) == 0
     printed = capsys.readouterr()
     assert re.search(
-        rf"^ready in {tmp_path}; next:\n  .* -m spslam run replica --data {tmp_path}/room$", printed.out, re.M
+        rf"^downloaded to {tmp_path}; next:\n  .* -m spslam run replica --data {tmp_path}/room$", printed.out, re.M
     )
     assert "Rooms.zip: 100% of 0 MB" in printed.err
     assert main(["download", "rooms", "--data", str(tmp_path), "--quiet"]) == 0
     assert capsys.readouterr() == ("", "")
     main(["download", "--data", str(tmp_path)])
-    assert "(there)" in capsys.readouterr().out
+    assert "(downloaded)" in capsys.readouterr().out
 
 
-def test_wrong_names_are_one_line(tmp_path, capsys):
+def test_a_wrong_name_is_a_one_line_error(tmp_path, capsys):
     assert main(["download", "scannet", "--data", str(tmp_path)]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("spslam: scannet can't be downloaded without a form")
+    assert error.startswith("spslam: scannet can't be downloaded without signing")
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())

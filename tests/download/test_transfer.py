@@ -1,4 +1,4 @@
-"""Fetching over a line that is cut, from servers that change their mind."""
+"""Downloads over interrupted connections, and of files that change on the server."""
 
 import hashlib
 import shutil
@@ -31,45 +31,48 @@ def check_whole(folder):
     assert [path.name for path in folder.iterdir()] == ["room.zip"]
 
 
-def test_a_whole_file(site, tmp_path):
-    told = []
-    assert get(site, tmp_path, sha256=DIGEST.upper(), progress=lambda done, total: told.append((done, total))) == DIGEST
+def test_a_complete_download(site, tmp_path):
+    reported = []
+    assert (
+        get(site, tmp_path, sha256=DIGEST.upper(), progress=lambda done, total: reported.append((done, total)))
+        == DIGEST
+    )
     check_whole(tmp_path)
-    assert told[-1] == (len(CONTENT), len(CONTENT))
-    assert site.asked == [None]
+    assert reported[-1] == (len(CONTENT), len(CONTENT))
+    assert site.requested == [None]
 
 
-def test_a_cut_line_is_taken_up_where_it_stopped(site, tmp_path):
+def test_an_interrupted_connection_is_resumed_where_it_stopped(site, tmp_path):
     site.cuts = [100_000, 50_000, 1]
     get(site, tmp_path, sha256=DIGEST)
     check_whole(tmp_path)
-    assert site.asked == [None, 100_000, 150_000, 150_001]
+    assert site.requested == [None, 100_000, 150_000, 150_001]
 
 
-def test_a_later_call_goes_on(site, tmp_path):
+def test_a_later_call_resumes(site, tmp_path):
     site.cuts = [120_000] + [0] * ATTEMPTS
-    with pytest.raises(DatasetError, match=r"room.zip: can't be fetched: .*; 120000 bytes are kept, the same command"):
+    with pytest.raises(DatasetError, match=r"room.zip: can't be downloaded: .*; 120000 bytes are kept and the same"):
         get(site, tmp_path)
     assert not (tmp_path / "room.zip").exists()
-    site.cuts, site.asked = [], []
+    site.cuts, site.requested = [], []
     get(site, tmp_path, sha256=DIGEST)
     check_whole(tmp_path)
-    assert site.asked == [120_000]
+    assert site.requested == [120_000]
 
 
-def test_what_is_whole_but_for_its_name_is_not_fetched_again(site, tmp_path):
+def test_a_complete_part_file_is_not_downloaded_again(site, tmp_path):
     site.cuts = [120_000] + [0] * ATTEMPTS
     with pytest.raises(DatasetError):
         get(site, tmp_path)
     (tmp_path / "room.zip.part").write_bytes(CONTENT)
-    site.asked = []
+    site.requested = []
     get(site, tmp_path, sha256=DIGEST)
     check_whole(tmp_path)
-    assert site.asked == []
+    assert site.requested == []
 
 
 @pytest.mark.parametrize("change", [{"ranges": False}, {"etag": '"2"'}, {"etag": None}])
-def test_another_version_or_no_ranges_start_anew(site, tmp_path, change):
+def test_another_version_or_no_range_support_starts_from_the_beginning(site, tmp_path, change):
     site.cuts = [120_000] + [0] * ATTEMPTS
     with pytest.raises(DatasetError):
         get(site, tmp_path)
@@ -80,49 +83,49 @@ def test_another_version_or_no_ranges_start_anew(site, tmp_path, change):
     check_whole(tmp_path)
 
 
-def test_without_a_version_nothing_is_taken_up(site, tmp_path):
+def test_without_a_version_nothing_is_resumed(site, tmp_path):
     site.etag, site.cuts = None, [100_000]
     get(site, tmp_path, sha256=DIGEST)
     check_whole(tmp_path)
-    assert site.asked == [None, None]
+    assert site.requested == [None, None]
 
 
-def test_a_note_of_something_else_is_not_trusted(site, tmp_path):
+def test_a_record_of_another_download_is_ignored(site, tmp_path):
     (tmp_path / "room.zip.part").write_bytes(b"x" * 1000)
-    for note in ("no json", '{"url": "http://elsewhere", "version": "1", "total": 1000}', '{"wrong": 1}'):
-        (tmp_path / "room.zip.part.json").write_text(note)
+    for record in ("no json", '{"url": "http://elsewhere", "version": "1", "total": 1000}', '{"wrong": 1}'):
+        (tmp_path / "room.zip.part.json").write_text(record)
         get(site, tmp_path, sha256=DIGEST)
         check_whole(tmp_path)
         (tmp_path / "room.zip.part").write_bytes(b"x" * 1000)
 
 
-def test_a_wrong_checksum_removes_what_was_fetched(site, tmp_path):
-    with pytest.raises(DatasetError, match=rf"room.zip: SHA-256 must be {'0' * 64}, got {DIGEST}; what was fetched is"):
+def test_a_wrong_checksum_removes_the_download(site, tmp_path):
+    with pytest.raises(DatasetError, match=rf"room.zip: SHA-256 must be {'0' * 64}, got {DIGEST}; the downloaded"):
         get(site, tmp_path, sha256="0" * 64)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_busy_server_is_asked_again_and_a_refusal_is_not(site, tmp_path):
+def test_a_busy_server_is_tried_again_and_a_refusal_is_not(site, tmp_path):
     site.faults = [503, 429]
     get(site, tmp_path, sha256=DIGEST)
     check_whole(tmp_path)
-    site.asked = []
-    with pytest.raises(DatasetError, match="absent.zip: the server answers 404"):
+    site.requested = []
+    with pytest.raises(DatasetError, match="absent.zip: the server responds 404"):
         fetch(site.url("absent.zip"), tmp_path / "absent.zip", **NO_PAUSE)
-    assert len(site.asked) == 1
+    assert len(site.requested) == 1
     site.faults = [503] * ATTEMPTS
-    with pytest.raises(DatasetError, match="can't be fetched: 503 .*; 0 bytes are kept"):
+    with pytest.raises(DatasetError, match="can't be downloaded: 503 .*; 0 bytes are kept"):
         fetch(site.url("room.zip"), tmp_path / "other.zip", **NO_PAUSE)
 
 
-def test_no_server_and_no_address(tmp_path):
-    with pytest.raises(DatasetError, match="can't be fetched: .*refused"):
+def test_no_server_and_another_protocol(tmp_path):
+    with pytest.raises(DatasetError, match="can't be downloaded: .*refused"):
         fetch("http://127.0.0.1:9/room.zip", tmp_path / "room.zip", **NO_PAUSE)
-    with pytest.raises(DatasetError, match="file:///etc/passwd: must be an address with http or https"):
+    with pytest.raises(DatasetError, match="file:///etc/passwd: must be a URL with http or https"):
         fetch("file:///etc/passwd", tmp_path / "room.zip")
 
 
-def test_a_disk_too_small_is_told_before(site, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_before_the_download(site, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, transfer.SPARE_BYTES))
     with pytest.raises(DatasetError, match="the download needs 0.0 GB, but only 0.1 GB are free"):
         get(site, tmp_path)

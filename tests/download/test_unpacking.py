@@ -1,4 +1,4 @@
-"""Archives, good and bad."""
+"""Unpacking of valid, damaged and unsafe archives."""
 
 import io
 import stat
@@ -40,16 +40,16 @@ def write(folder, name, content):
     return folder / name
 
 
-FILES = {"room/results/frame000000.jpg": b"picture", "room/traj.txt": b"1 0 0", "room_mesh.ply": b"ply"}
+FILES = {"room/results/frame000000.jpg": b"image", "room/traj.txt": b"1 0 0", "room_mesh.ply": b"ply"}
 
 
 @pytest.mark.parametrize(("name", "pack"), [("a.zip", zipped), ("a.tgz", tarred)])
-def test_an_archive(tmp_path, name, pack):
+def test_a_valid_archive(tmp_path, name, pack):
     unpack(write(tmp_path, name, pack(FILES)), tmp_path / "out")
     assert tree(tmp_path / "out") == FILES
 
 
-def test_archives_within_an_archive(tmp_path):
+def test_nested_archives(tmp_path):
     inner = {"seq-01/frame-000000.color.png": b"a", "seq-01/frame-000000.pose.txt": b"b"}
     content = zipped({"chess/seq-01.zip": zipped(inner), "chess/TestSplit.txt": b"sequence1"})
     unpack(write(tmp_path, "chess.zip", content), tmp_path / "out")
@@ -62,17 +62,17 @@ ESCAPES = ["../evil.txt", "room/../../evil.txt", "/tmp/evil.txt", "..\\evil.txt"
 
 @pytest.mark.parametrize("escape", ESCAPES)
 @pytest.mark.parametrize(("name", "pack"), [("a.zip", zipped), ("a.tgz", tarred)])
-def test_names_that_lead_out_are_refused_before_anything_is_written(tmp_path, name, pack, escape):
+def test_paths_outside_the_folder_are_refused_before_anything_is_written(tmp_path, name, pack, escape):
     archive = write(tmp_path, name, pack({**FILES, escape: b"evil"}))
-    with pytest.raises(DatasetError, match=f"{name}: must stay in the folder that it is unpacked in, but holds "):
+    with pytest.raises(DatasetError, match=f"{name}: must not contain paths outside the folder it is unpacked in, "):
         unpack(archive, tmp_path / "out")
     assert tree(tmp_path / "out") == {}
     assert not list(tmp_path.rglob("evil.txt"))
 
 
-def test_names_that_lead_out_of_an_inner_archive_are_refused(tmp_path):
+def test_paths_outside_the_folder_are_refused_in_nested_archives(tmp_path):
     content = zipped({"chess/seq-01.zip": zipped({"../../../evil.txt": b"evil"})})
-    with pytest.raises(DatasetError, match="seq-01.zip: must stay in the folder"):
+    with pytest.raises(DatasetError, match="seq-01.zip: must not contain paths outside the folder"):
         unpack(write(tmp_path, "a.zip", content), tmp_path / "out")
     assert not list(tmp_path.rglob("evil.txt"))
 
@@ -83,21 +83,21 @@ def test_links_are_refused(tmp_path):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr(link, "/etc")
-    with pytest.raises(DatasetError, match="must hold files and folders alone, but room/link is a link"):
+    with pytest.raises(DatasetError, match="must contain only files and folders, but room/link is a link"):
         unpack(write(tmp_path, "a.zip", buffer.getvalue()), tmp_path / "out")
     for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE):
         member = tarfile.TarInfo("room/link")
         member.type, member.linkname = kind, "/etc"
-        with pytest.raises(DatasetError, match="must hold files and folders alone, but room/link is a link"):
+        with pytest.raises(DatasetError, match="must contain only files and folders, but room/link is a link"):
             unpack(write(tmp_path, "a.tgz", tarred(FILES, member)), tmp_path / "out")
     assert tree(tmp_path / "out") == {}
 
 
-def test_a_link_that_stood_there_before_is_not_followed(tmp_path):
+def test_an_existing_link_out_of_the_folder_is_not_followed(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "room").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DatasetError, match="must stay in the folder"):
+    with pytest.raises(DatasetError, match="must not contain paths outside the folder"):
         unpack(write(tmp_path, "a.zip", zipped(FILES)), tmp_path / "out")
     assert not list((tmp_path / "elsewhere").iterdir())
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from spslam.evaluation.depth import depth_l1
+from spslam.evaluation.depth_metrics import depth_l1
 
 
 def test_depth_l1_is_the_mean_of_the_views_means():

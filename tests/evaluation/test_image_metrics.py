@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from spslam.evaluation.images import psnr_db, ssim
+from spslam.evaluation.image_metrics import psnr_db, ssim
 
 # Both compute in double precision.
 TOLERANCE = 1e-9

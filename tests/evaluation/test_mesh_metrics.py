@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from spslam.camera import Camera
 from spslam.datasets.generated import GeneratedDataset
-from spslam.evaluation.mesh import evaluate_surface, observed_mask, observed_samples, surface_metrics
+from spslam.evaluation.mesh_metrics import evaluate_surface, observed_mask, observed_samples, surface_metrics
 from spslam.evaluation.surface import TriangleSurface
 from spslam.geometry import pose_from
 

@@ -8,8 +8,8 @@ import torch
 
 from spslam.camera import Camera
 from spslam.datasets.generated import GeneratedDataset
-from spslam.evaluation.depth import depth_l1
-from spslam.evaluation.mesh import observed_mask
+from spslam.evaluation.depth_metrics import depth_l1
+from spslam.evaluation.mesh_metrics import observed_mask
 from spslam.evaluation.renders import novel_depth, novel_poses, render_view
 from spslam.evaluation.run_output import Mesh
 from spslam.geometry import pose_from

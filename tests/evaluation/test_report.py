@@ -12,7 +12,7 @@ import trimesh
 from spslam.camera import Camera
 from spslam.errors import OutputError
 from spslam.evaluation.charts import nice_ticks
-from spslam.evaluation.report import write_report
+from spslam.evaluation.html_report import write_report
 from spslam.geometry import pose_from
 from spslam.trajectory import Trajectory
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from spslam.datasets.seven_scenes import open_seven_scenes
 from spslam.datasets.tum import open_tum
-from spslam.evaluation.trajectory import absolute_errors, align, ate, rpe
+from spslam.evaluation.trajectory_metrics import absolute_errors, align, ate, rpe
 from spslam.geometry import pose_from
 from tests.datasets.layouts import shared_data
 

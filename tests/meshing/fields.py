@@ -1,4 +1,4 @@
-"""Analytic signed distances (m, negative inside solids) that meshes are tested on."""
+"""Analytic signed distance fields (m, negative inside solids) for the tests of meshes."""
 
 import itertools
 
@@ -13,7 +13,7 @@ def _known(distance):
 
 
 def room(points):
-    """A closed room with a ball floating in it."""
+    """A closed room with a ball in it."""
     outside = points.abs() - torch.tensor(ROOM_HALF_M, device=points.device)
     walls = -(outside.clamp(min=0).norm(dim=1) + outside.amax(1).clamp(max=0))
     ball = (points - torch.tensor(BALL_CENTER_M, device=points.device)).norm(dim=1) - BALL_RADIUS_M
@@ -25,7 +25,7 @@ def sphere(radius_m):
 
 
 def plane(normal, offset_m):
-    """n . p = offset; n need not be a unit vector."""
+    """The plane n . p = offset; n may have any length."""
     return lambda points: _known(points @ torch.tensor(normal, device=points.device) - offset_m)
 
 
@@ -36,7 +36,7 @@ def cells_within(half_extent, device="cpu"):
 
 
 def cells_near(field, half_extents_m, cell_size_m, reach_m, device="cpu"):
-    """The cells of a box whose middle is within `reach_m` of the surface."""
+    """The cells of a box whose center lies within `reach_m` of the surface."""
     axes = [torch.arange(-int(h / cell_size_m) - 3, int(h / cell_size_m) + 3) for h in half_extents_m]
     coords = torch.cartesian_prod(*axes).int().to(device)
     distance, _ = field((coords + 0.5) * cell_size_m)

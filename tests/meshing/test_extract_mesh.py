@@ -1,4 +1,4 @@
-"""Meshes of maps whose decoder is made to return an embedding's first channel: any field can be put in."""
+"""Meshes of maps that represent an analytic field: the decoder returns the first channel of the embedding."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from spslam.camera import Camera
 from spslam.meshing import extract_mesh
-from spslam.meshing.cleaning import faced_by_a_camera
+from spslam.meshing.cleaning import front_facing_in_view
 from spslam.scene import Scene, SceneSettings
 from tests.meshing import fields
 
@@ -15,7 +15,7 @@ CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 
 
 def _first_channel_decoder():
-    """tanh of input 3, the first channel behind the position: relu(x) - relu(-x) through both hidden layers."""
+    """tanh of input 3, the first channel after the position: relu(x) - relu(-x) through both hidden layers."""
     first, second, third = torch.zeros(32, 11), torch.zeros(32, 32), torch.zeros(1, 32)
     first[0, 3], first[1, 3] = 1, -1
     second[0, 0] = second[1, 1] = 1
@@ -25,7 +25,7 @@ def _first_channel_decoder():
 
 
 def _scene(field, half_extents_m, device, reach_m=0.1, weights=None):
-    """A map of an analytic distance around its surface; `weights` maps vertices (m) to fusion weights."""
+    """A map of an analytic signed distance near its surface; `weights` maps vertices (m) to fusion weights."""
     settings = SceneSettings(VOXEL_M, TRUNCATION_M, plane_cell_m=0.04, position_scale=0.25, max_voxels=10**7)
     scene = Scene(settings, seed=0, geometry_decoder=_first_channel_decoder(), device=device)
     scene.volume.insert(fields.cells_near(field, half_extents_m, VOXEL_M, reach_m, device))
@@ -39,7 +39,7 @@ def _scene(field, half_extents_m, device, reach_m=0.1, weights=None):
 
 
 def _looking(eye, target):
-    """T_world_camera of a camera at `eye` with `target` in the middle of its view."""
+    """T_world_camera of a camera at `eye` with `target` at the image center."""
     forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     right = np.cross(forward, [0.3, 0.2, 0.93])
     right /= np.linalg.norm(right)
@@ -50,7 +50,7 @@ def _looking(eye, target):
 
 
 def _slab(points):
-    """A plate 6 cm thick: two sheets, at z = -3 and z = 3 cm."""
+    """A slab 6 cm thick, whose surfaces are at z = -3 and z = 3 cm."""
     return points[:, 2].abs() - 0.03, torch.ones(len(points), dtype=torch.bool, device=points.device)
 
 
@@ -58,7 +58,7 @@ def test_sphere(device):
     scene = _scene(fields.sphere(0.5), (0.6, 0.6, 0.6), device)
     mesh = extract_mesh(scene, 0.01)
     radius = np.linalg.norm(mesh.vertices, axis=1)
-    # Trilinear interpolation of a distance over 4 cm: a chord of 7 cm on a radius of 50.
+    # Error of trilinear interpolation over 4 cm: sagitta of a 7 cm chord at a radius of 50 cm.
     assert np.abs(radius - 0.5).max() < 2e-3
     assert (np.einsum("ij,ij->i", mesh.normals, mesh.vertices) > 0.99 * radius).all()
     colors = scene.color(torch.from_numpy(mesh.vertices).to(device)).cpu().numpy() * 255
@@ -75,7 +75,7 @@ def test_same_map_same_mesh(device):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
-def test_surface_without_support_beside_supported_is_dropped(device):
+def test_surface_with_low_support_next_to_high_support_is_removed(device):
     def weights(points):
         return torch.where(points[:, 2] > 0, 10.0, 0.2)
 
@@ -88,12 +88,12 @@ def test_surface_without_support_beside_supported_is_dropped(device):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.003])
-def test_evenly_weak_support_is_kept(weight, device):
+def test_uniformly_low_support_is_kept(weight, device):
     scene = _scene(_slab, (0.3, 0.3, 0.1), device, weights=lambda points: weight)
     assert len(extract_mesh(scene, 0.02).faces) == len(extract_mesh(scene, 0.02, min_support=0).faces) > 0
 
 
-def test_only_sheets_that_a_camera_faces_are_kept(device):
+def test_only_surface_seen_from_the_front_is_kept(device):
     scene = _scene(_slab, (0.4, 0.4, 0.1), device)
     poses = np.stack([_looking((0.1, 0, 1.5), (0, 0, 0)), _looking((-0.3, 0.2, 1.2), (0, 0, 0))])
     mesh = extract_mesh(scene, 0.02, camera=CAMERA, poses=poses)
@@ -101,7 +101,7 @@ def test_only_sheets_that_a_camera_faces_are_kept(device):
     assert mesh.vertices[:, 2].min() > 0.02
 
 
-def test_surface_out_of_view_is_dropped(device):
+def test_surface_out_of_view_is_removed(device):
     scene = _scene(_slab, (1.0, 0.2, 0.1), device)
     pose = _looking((0.5, 0, 0.6), (0.5, 0, 0))
     mesh = extract_mesh(scene, 0.02, camera=CAMERA, poses=np.stack([pose, np.full((4, 4), np.nan)]))
@@ -109,13 +109,13 @@ def test_surface_out_of_view_is_dropped(device):
     assert mesh.vertices[:, 0].min() > 0
 
 
-def test_small_loose_parts_are_dropped(device):
+def test_small_components_are_removed(device):
     def balls(points):
         shifted = points - torch.tensor([0.5, 0, 0], device=points.device)
         return torch.minimum(points.norm(dim=1) - 0.2, shifted.norm(dim=1) - 0.03), points[:, 0] == points[:, 0]
 
     scene = _scene(balls, (0.6, 0.4, 0.4), device)
-    # On voxels of its own size the small ball is left with 50 cm2, at every resolution.
+    # The ball is as small as a voxel: the map represents 50 cm^2 of it, at every resolution.
     for resolution_m in (0.01, 0.02):
         assert extract_mesh(scene, resolution_m, min_part_m2=0.004).vertices[:, 0].max() > 0.45
         assert extract_mesh(scene, resolution_m, min_part_m2=0.006).vertices[:, 0].max() < 0.25
@@ -135,7 +135,7 @@ def test_empty_map(device):
         (dict(resolution_m=0.01, poses=np.eye(4)[None]), "extract_mesh: camera and poses must be given together"),
         (
             dict(resolution_m=0.02, camera=CAMERA, poses=np.full((2, 4, 4), np.nan)),
-            "faced_by_a_camera: poses must hold a finite one, got none",
+            "front_facing_in_view: poses must have at least one finite pose, got none",
         ),
     ],
 )
@@ -145,11 +145,11 @@ def test_errors(arguments, message):
         extract_mesh(scene, **arguments)
 
 
-def test_facing_looks_at_the_whole_path():
+def test_front_facing_test_samples_the_whole_trajectory():
     vertices = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]], np.float32)
     faces = np.array([[0, 1, 2]])
     behind, front = _looking((0, 0, -1), (0, 0, 0)), _looking((0, 0, 1), (0, 0, 0))
     up = np.tile(np.float32([0, 0, 1]), (3, 1))
-    assert faced_by_a_camera(vertices, up, faces, CAMERA, np.stack([behind] * 100 + [front])).all()
-    assert not faced_by_a_camera(vertices, up, faces, CAMERA, np.stack([behind] * 100)).any()
-    assert faced_by_a_camera(vertices, -up, faces, CAMERA, behind[None]).all()
+    assert front_facing_in_view(vertices, up, faces, CAMERA, np.stack([behind] * 100 + [front])).all()
+    assert not front_facing_in_view(vertices, up, faces, CAMERA, np.stack([behind] * 100)).any()
+    assert front_facing_in_view(vertices, -up, faces, CAMERA, behind[None]).all()

@@ -1,4 +1,4 @@
-"""The mesh as arrays, and its files."""
+"""Triangle meshes, and their files."""
 
 import os
 
@@ -8,7 +8,7 @@ import trimesh
 
 from spslam.errors import OutputError
 from spslam.meshing import TriangleMesh, save_mesh
-from spslam.meshing.cleaning import in_large_part
+from spslam.meshing.cleaning import in_large_component
 from spslam.meshing.mesh import compact, face_normals, vertex_normals
 
 
@@ -24,7 +24,7 @@ def _empty():
     return TriangleMesh(*(np.zeros((0, 3), dtype) for dtype in (np.float32, np.int32, np.uint8, np.float32)))
 
 
-def test_vertex_normals_of_a_sphere_are_its_radii():
+def test_vertex_normals_of_a_sphere_are_radial():
     mesh = _sphere(4)
     assert np.abs(mesh.normals - mesh.vertices).max() < 1e-2
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, rtol=1e-6)
@@ -36,13 +36,13 @@ def test_vertex_normals_agree_with_trimesh_weighted_by_area():
     faces = rng.integers(0, 50, (80, 3)).astype(np.int32)
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])]
     shape = trimesh.Trimesh(vertices, faces, process=False)
-    want = np.zeros((50, 3))
+    expected = np.zeros((50, 3))
     for normal, area, corners in zip(shape.face_normals, shape.area_faces, faces, strict=True):
         for corner in corners:
-            want[corner] += normal * area
-    used = np.linalg.norm(want, axis=1) > 0
-    want[used] /= np.linalg.norm(want[used], axis=1, keepdims=True)
-    np.testing.assert_allclose(vertex_normals(vertices, faces), want, atol=1e-5)
+            expected[corner] += normal * area
+    used = np.linalg.norm(expected, axis=1) > 0
+    expected[used] /= np.linalg.norm(expected[used], axis=1, keepdims=True)
+    np.testing.assert_allclose(vertex_normals(vertices, faces), expected, atol=1e-5)
 
 
 def test_degenerate_faces_have_no_normal():
@@ -59,16 +59,16 @@ def test_compact_drops_unused_vertices():
     assert len(no_faces) == len(none_used) == 0
 
 
-def test_small_parts():
+def test_small_components():
     small, large = _sphere(1), _sphere(2)
     vertices = np.concatenate((0.1 * small.vertices, large.vertices))
     faces = np.concatenate((small.faces, large.faces + len(small.vertices)))
     is_large = np.arange(len(faces)) >= len(small.faces)
     area_m2 = np.linalg.norm(face_normals(vertices, small.faces), axis=1).sum() / 2
-    np.testing.assert_array_equal(in_large_part(vertices, faces, 1.001 * area_m2), is_large)
-    assert in_large_part(vertices, faces, 0.999 * area_m2).all()
-    assert in_large_part(vertices, faces, 0).all()
-    assert in_large_part(vertices, faces[:0], 1.0).shape == (0,)
+    np.testing.assert_array_equal(in_large_component(vertices, faces, 1.001 * area_m2), is_large)
+    assert in_large_component(vertices, faces, 0.999 * area_m2).all()
+    assert in_large_component(vertices, faces, 0).all()
+    assert in_large_component(vertices, faces[:0], 1.0).shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_mesh_errors(field, array, message):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb", "obj", "PLY"])
-def test_files_hold_the_mesh(suffix, tmp_path):
+def test_files_contain_the_mesh(suffix, tmp_path):
     mesh = _sphere()
     path = tmp_path / f"mesh.{suffix}"
     save_mesh(mesh, path)
@@ -103,7 +103,7 @@ def test_files_hold_the_mesh(suffix, tmp_path):
     assert os.listdir(tmp_path) == [path.name]
 
 
-def test_ply_holds_the_normals(tmp_path):
+def test_ply_contains_the_normals(tmp_path):
     mesh = _sphere()
     save_mesh(mesh, tmp_path / "mesh.ply")
     header, body = (tmp_path / "mesh.ply").read_bytes().split(b"end_header\n", 1)
@@ -112,7 +112,7 @@ def test_ply_holds_the_normals(tmp_path):
     np.testing.assert_array_equal(np.frombuffer(body, vertex, len(mesh.vertices))["normal"], mesh.normals)
 
 
-def test_glb_holds_the_normals(tmp_path):
+def test_glb_contains_the_normals(tmp_path):
     mesh = _sphere()
     save_mesh(mesh, tmp_path / "mesh.glb")
     assert b'"NORMAL":' in (tmp_path / "mesh.glb").read_bytes()
@@ -135,9 +135,9 @@ def test_empty_mesh(tmp_path):
     assert os.listdir(tmp_path) == ["mesh.ply"]
 
 
-@pytest.mark.parametrize("name,shown", [("mesh.stl", r"not as \.stl"), ("mesh", "not as a file without suffix")])
+@pytest.mark.parametrize("name,shown", [("mesh.stl", r"got \.stl"), ("mesh", "got a file without suffix")])
 def test_unknown_suffix(name, shown, tmp_path):
-    with pytest.raises(OutputError, match=rf"a mesh is written as \.ply, \.glb, \.obj, {shown}"):
+    with pytest.raises(OutputError, match=rf"a mesh must be written as \.ply, \.glb, \.obj, {shown}"):
         save_mesh(_sphere(), tmp_path / name)
     assert os.listdir(tmp_path) == []
 

@@ -11,7 +11,7 @@ from spslam.meshing.render import NEAREST_M, rasterize, render_mesh
 
 CAMERA = Camera(80, 60, 70.0, 65.0, 41.0, 28.5)
 HALF_SIZE = np.array([3.0, 2.0, 2.5])
-# float32 inverse depth, evaluated from a corner of the triangle's box.
+# float32 inverse depth, evaluated as an offset from a corner of the triangle's bounding box.
 DEPTH_TOLERANCE = 1e-4
 
 
@@ -23,13 +23,13 @@ def box(half_size=HALF_SIZE, center=(0, 0, 0)):
     return corners * half_size + center, np.array(faces)
 
 
-def turned(angle, position):
+def rotated(angle, position):
     c, s = np.cos(angle), np.sin(angle)
     return pose_from(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array(position, dtype=float))
 
 
 def cast_inside(pose):
-    """Depth of the box's walls from inside it."""
+    """Analytic depth of the walls of the box, seen from inside."""
     directions = CAMERA.ray_directions().astype(np.float64) @ pose[:3, :3].T
     with np.errstate(divide="ignore"):
         walls = (np.sign(directions) * HALF_SIZE - pose[:3, 3]) / directions
@@ -37,16 +37,16 @@ def cast_inside(pose):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.1, 2.5, -2.0])
-def test_depth_from_inside_a_box_is_exact(angle):
-    # The walls' triangles reach behind the camera, so this tests the clipping as well.
+def test_depth_from_inside_a_box_is_accurate(angle):
+    # Triangles of the walls extend behind the camera, so this tests clipping too.
     vertices, faces = box()
-    pose = turned(angle, (0.7, -0.4, 0.9))
+    pose = rotated(angle, (0.7, -0.4, 0.9))
     raster = rasterize(vertices, faces, CAMERA, pose)
     np.testing.assert_allclose(raster.depth, cast_inside(pose), rtol=DEPTH_TOLERANCE)
     assert (raster.face_ids >= 0).all()
 
 
-def test_nearest_face_wins_whatever_the_order():
+def test_the_nearest_face_is_visible_in_any_order():
     vertices, faces = np.concatenate([box()[0], box((0.2, 0.2, 0.2), (0, 0, 1.5))[0]]), box()[1]
     both = np.concatenate([faces, faces + 8])
     pose = np.eye(4)
@@ -58,7 +58,7 @@ def test_nearest_face_wins_whatever_the_order():
     assert first.depth[0, 0] == pytest.approx(2.5, rel=DEPTH_TOLERANCE)
 
 
-def test_culling_looks_into_a_box_from_outside():
+def test_back_face_culling_shows_the_inside_of_a_box():
     vertices, faces = box((1, 1, 1), (0, 0, 4))
     inward = faces[:, ::-1]
     near, far = 3.0, 5.0
@@ -68,25 +68,25 @@ def test_culling_looks_into_a_box_from_outside():
     assert rasterize(vertices, inward, CAMERA, np.eye(4)).depth[28, 41] == pytest.approx(near, rel=DEPTH_TOLERANCE)
 
 
-def test_colors_are_interpolated_in_space_not_in_the_image():
-    # A floor-like triangle pair going away from the camera: red grows with z.
+def test_color_interpolation_is_perspective_correct():
+    # Two triangles of a floor, whose red increases with z.
     vertices = np.array([[-9, 1, 1], [9, 1, 1], [9, 1, 9], [-9, 1, 9]], dtype=float)
     colors = np.array([[0, 100, 0], [0, 100, 0], [200, 100, 0], [200, 100, 0]], dtype=np.uint8)
-    picture, depth = render_mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), colors, CAMERA, np.eye(4))
+    image, depth = render_mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), colors, CAMERA, np.eye(4))
     hit = (depth > 1.1) & (depth < 8.9)
-    ratio = picture[hit][:, 0] / picture[hit][:, 1].astype(float)
+    ratio = image[hit][:, 0] / image[hit][:, 1].astype(float)
     np.testing.assert_allclose(ratio, 2 * (depth[hit] - 1) / 8, atol=0.04)  # of 8-bit colors
 
 
 @pytest.mark.parametrize("colors", [None, np.zeros((0, 3), np.uint8)])
-def test_empty_mesh_gives_an_empty_picture(colors):
-    picture, depth = render_mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), colors, CAMERA, np.eye(4))
-    assert picture.shape == (60, 80, 3)
-    assert (picture == 255).all()
+def test_an_empty_mesh_gives_a_white_image(colors):
+    image, depth = render_mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), colors, CAMERA, np.eye(4))
+    assert image.shape == (60, 80, 3)
+    assert (image == 255).all()
     assert not depth.any()
 
 
-def test_faces_behind_beside_or_without_area_are_left_out():
+def test_faces_behind_the_camera_out_of_view_or_without_area_are_skipped():
     vertices = np.array(
         [[0, 0, -1], [1, 0, -1], [0, 1, -1], [99, 0, 1], [98, 0, 1], [99, 1, 1], [0, 0, 1]], dtype=float
     )
@@ -94,19 +94,19 @@ def test_faces_behind_beside_or_without_area_are_left_out():
     assert not rasterize(vertices, faces, CAMERA, np.eye(4)).depth.any()
 
 
-def test_camera_on_a_face_sees_no_nonsense():
+def test_depth_is_valid_for_a_camera_on_a_face():
     vertices, faces = box((1, 1, 1))
-    raster = rasterize(vertices, faces, CAMERA, turned(0.2, (0, 0, -1)))
+    raster = rasterize(vertices, faces, CAMERA, rotated(0.2, (0, 0, -1)))
     assert np.isfinite(raster.depth).all()
     assert raster.depth[raster.face_ids >= 0].min() >= NEAREST_M
 
 
 def test_supersampling_keeps_size_and_depth():
     vertices, faces = box()
-    picture, depth = render_mesh(vertices, faces, None, CAMERA, turned(0.4, (0, 0, 0)), supersampling=2)
-    assert picture.shape == (60, 80, 3)
-    assert picture.dtype == np.uint8
-    np.testing.assert_allclose(depth, cast_inside(turned(0.4, (0, 0, 0))), atol=0.05)  # half a pixel aside
+    image, depth = render_mesh(vertices, faces, None, CAMERA, rotated(0.4, (0, 0, 0)), supersampling=2)
+    assert image.shape == (60, 80, 3)
+    assert image.dtype == np.uint8
+    np.testing.assert_allclose(depth, cast_inside(rotated(0.4, (0, 0, 0))), atol=0.05)  # half a pixel of offset
 
 
 def test_a_million_faces_take_seconds():

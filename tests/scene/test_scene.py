@@ -1,4 +1,4 @@
-"""The map's one file: the same bytes, the same map, and one line for every damage."""
+"""Saving and loading maps: exactness, reproducible bytes, and errors for damaged files."""
 
 import pytest
 import safetensors.torch
@@ -21,7 +21,7 @@ def scene(generator):
     return scene
 
 
-def test_a_loaded_map_is_the_same(scene, tmp_path, generator):
+def test_a_loaded_map_equals_the_saved_one(scene, tmp_path, generator):
     scene.save(tmp_path / "map.safetensors")
     loaded = Scene.load(tmp_path / "map.safetensors")
     assert loaded.settings == SETTINGS
@@ -42,20 +42,20 @@ def test_the_same_map_gives_the_same_bytes(scene, tmp_path):
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes() == (tmp_path / "three").read_bytes()
 
 
-def test_spare_capacity_is_not_in_the_file(scene, tmp_path):
+def test_unused_capacity_is_not_saved(scene, tmp_path):
     scene.save(tmp_path / "map")
     tensors = sum(tensor.numel() * tensor.element_size() for tensor in scene.state_dict().values())
     assert tensors < (tmp_path / "map").stat().st_size < tensors + 2000
 
 
-def test_an_empty_map_is_a_map(tmp_path):
+def test_an_empty_map_can_be_saved_and_loaded(tmp_path):
     Scene(SETTINGS, seed=0).save(tmp_path / "map")
     loaded = Scene.load(tmp_path / "map")
     assert loaded.volume.num_voxels == 0
     assert not loaded.sdf(torch.zeros(2, 3))[1].any()
 
 
-def test_a_loaded_map_grows_on(scene, tmp_path):
+def test_a_loaded_map_can_grow(scene, tmp_path):
     scene.save(tmp_path / "map")
     loaded = Scene.load(tmp_path / "map")
     new = torch.tensor([[100, 1, 2], [100, 1, 3]], dtype=torch.int32)
@@ -64,7 +64,7 @@ def test_a_loaded_map_grows_on(scene, tmp_path):
         loaded.planes.cover(torch.full((1, 3), 1000.0))
 
 
-def test_loading_copies(scene):
+def test_load_state_dict_copies(scene):
     other = Scene(SETTINGS, seed=3)
     other.load_state_dict(scene.state_dict())
     before = scene.geometry_decoder.clone()
@@ -99,16 +99,16 @@ def damage(path, change):
         (lambda t: t["volume.voxel_coords"].zero_(), "must be distinct"),
     ],
 )
-def test_a_damaged_map_is_one_line(scene, tmp_path, change, message):
+def test_a_damaged_map_gives_a_one_line_error(scene, tmp_path, change, message):
     path = tmp_path / "map.safetensors"
     scene.save(path)
     damage(path, change)
-    with pytest.raises(SpslamError, match=f"map.safetensors: a damaged map .*{message}") as error:
+    with pytest.raises(SpslamError, match=f"map.safetensors: damaged map .*{message}") as error:
         Scene.load(path)
     assert "\n" not in str(error.value)
 
 
-def test_what_is_no_map_is_one_line(scene, tmp_path):
+def test_a_file_that_is_not_a_map_gives_a_one_line_error(scene, tmp_path):
     path = tmp_path / "map.safetensors"
     with pytest.raises(SpslamError, match="no such map file"):
         Scene.load(path)
@@ -124,6 +124,6 @@ def test_what_is_no_map_is_one_line(scene, tmp_path):
         Scene.load(path)
 
 
-def test_a_folder_that_is_missing_is_one_line(scene, tmp_path):
+def test_a_missing_folder_is_an_output_error(scene, tmp_path):
     with pytest.raises(OutputError, match="can't be written"):
         scene.save(tmp_path / "none" / "map.safetensors")

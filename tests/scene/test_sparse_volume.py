@@ -1,4 +1,4 @@
-"""The sparse volume: growth, fusion, lookup, restoration."""
+"""The sparse volume: allocation, fusion, lookup and restoring."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def test_growth_keeps_ids_embeddings_and_weights(device, generator):
     assert volume.corner_ids.tolist() == reference.corner_rows()
 
 
-def test_views_stay_in_place_until_the_capacity_changes(device, generator):
+def test_views_keep_their_memory_until_the_capacity_changes(device, generator):
     volume = SparseVolume(0.04, device=device, capacity=1024)
     volume.insert(random_coords(100, 5, generator, device))
     where = volume.embeddings.data_ptr()
@@ -55,7 +55,7 @@ def test_fuse_is_a_weighted_mean(device):
     assert volume.weights.tolist() == [1.5, 2.0]
 
 
-def test_lookup_says_which_points_are_inside(device, generator):
+def test_lookup_returns_which_points_are_inside(device, generator):
     volume = SparseVolume(0.1, device=device)
     volume.insert(random_coords(500, 4, generator, device))
     reference = DictVolume()
@@ -96,7 +96,7 @@ def test_restore_keeps_the_ids_of_a_grown_volume(device, generator):
     assert torch.equal(copy.insert(more), volume.insert(more))
 
 
-def test_restore_refuses_what_does_not_fit(device):
+def test_restore_refuses_inconsistent_tensors(device):
     volume = SparseVolume(0.04, device=device, max_voxels=2)
     twice = torch.zeros(2, 3, dtype=torch.int32)
     with pytest.raises(ValueError, match=r"voxel_coords must be distinct, got a repeated row"):
@@ -107,7 +107,7 @@ def test_restore_refuses_what_does_not_fit(device):
         volume.restore(torch.zeros(3, 3, dtype=torch.int32), torch.zeros(3, 8), torch.zeros(3))
 
 
-def test_the_limit_is_one_clear_line_and_leaves_the_volume_alone(device, generator):
+def test_exceeding_the_limit_gives_a_one_line_error_and_no_change(device, generator):
     volume = SparseVolume(0.04, device=device, max_voxels=10)
     line = torch.arange(10, dtype=torch.int32, device=device)[:, None].expand(10, 3)
     volume.insert(line)
@@ -143,13 +143,13 @@ def test_resize_rows(generator):
         ({"voxel_size_m": 0.04, "capacity": 0}, "capacity must be at least 1, got 0"),
     ],
 )
-def test_wrong_sizes_are_named(arguments, message):
+def test_wrong_sizes_are_refused(arguments, message):
     with pytest.raises(ValueError, match=f"SparseVolume: {message}"):
         SparseVolume(**arguments)
 
 
-def test_a_failed_insertion_leaves_a_volume_that_works(device, generator):
-    """Room may have been made by then: all rows must have it."""
+def test_the_volume_is_usable_after_a_failed_insertion(device, generator):
+    """The capacity may have grown before the failure: all buffers must have the same number of rows."""
     volume = SparseVolume(0.04, device=device, capacity=4)
     coords = random_coords(300, 6, generator, device)
     with pytest.raises(RuntimeError, match="rows outside"):

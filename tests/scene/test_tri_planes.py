@@ -1,4 +1,4 @@
-"""Planes that grow: what they hold stays, and how they grew does not show."""
+"""Growth of the planes: it keeps texels, and the result does not depend on the order of growth."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ def _points(*rows):
     return torch.tensor(rows, dtype=torch.float32)
 
 
-def test_covers_what_it_is_asked_to(device):
+def test_cover_contains_all_points(device):
     planes = TriPlanes(CELL, device=device)
     points = torch.rand(500, 3, device=device) * torch.tensor([4.0, 2.0, 3.0], device=device) - 1
     planes.cover(points)
@@ -25,7 +25,7 @@ def test_covers_what_it_is_asked_to(device):
     assert planes.cover(points) is None
 
 
-def test_growth_keeps_what_was_there(device):
+def test_growth_keeps_existing_texels(device):
     planes = TriPlanes(CELL, device=device)
     points = (torch.rand(200, 3) * 2).to(device)
     planes.cover(points)
@@ -33,22 +33,22 @@ def test_growth_keeps_what_was_there(device):
     before, old_rows = planes.interpolate(points), planes.texels.clone()
     moved = planes.cover(_points([-5, 7, 3], [4, -6, -5]).to(device))
     assert torch.equal(planes.texels[moved], old_rows)
-    # The new origin shifts positions of tens of texels, which float32 holds to 4e-6.
+    # The new origin shifts positions by tens of texels, where float32 has a resolution of 4e-6.
     assert torch.allclose(planes.interpolate(points), before, atol=1e-4)
 
 
-def test_initial_values_do_not_depend_on_the_steps_of_growth(device):
+def test_initial_values_do_not_depend_on_the_order_of_growth(device):
     at_once, in_steps = TriPlanes(CELL, seed=5, device=device), TriPlanes(CELL, seed=5, device=device)
     at_once.cover(_points([-6, -6, -6], [6, 6, 6]).to(device))
     for reach in (1.0, 3.0, 5.7):
         in_steps.cover(_points([-reach] * 3, [reach] * 3).to(device))
     points = (torch.rand(300, 3) * 12 - 6).to(device)
     assert torch.allclose(at_once.interpolate(points), in_steps.interpolate(points), atol=1e-5)
-    # 11,000 texels x 32 normal numbers: five standard errors.
+    # Tolerance: five standard errors of 11,000 x 32 normal numbers.
     assert abs(float(at_once.texels.std()) - INITIAL_STD) < 7e-5 and abs(float(at_once.texels.mean())) < 9e-5
 
 
-def test_seeds_differ():
+def test_seeds_give_different_texels():
     tables = []
     for seed in (1, 2):
         planes = TriPlanes(CELL, seed=seed)
@@ -57,7 +57,7 @@ def test_seeds_differ():
     assert not torch.equal(*tables)
 
 
-def test_nothing_finite_grows_nothing():
+def test_points_that_are_not_finite_do_not_grow_the_planes():
     planes = TriPlanes(CELL)
     assert planes.cover(torch.full((3, 3), float("nan"))) is None
     assert planes.cover(torch.zeros(0, 3)) is None

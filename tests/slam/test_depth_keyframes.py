@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from spslam.camera import Camera
-from spslam.evaluation.trajectory import ate
+from spslam.evaluation.trajectory_metrics import ate
 from spslam.slam.depth_keyframes import DepthKeyframeStore, depth_image_step
 from spslam.slam.pixels import sample_frame
 from spslam.slam.system import SlamSystem

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from spslam.evaluation.trajectory import ate
+from spslam.evaluation.trajectory_metrics import ate
 from spslam.scene import Scene
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from spslam.evaluation.trajectory import ate
+from spslam.evaluation.trajectory_metrics import ate
 from spslam.run.frame_feed import FrameFeed
 from spslam.slam.checkpoint import take_snapshot
 from spslam.slam.system import SlamSystem

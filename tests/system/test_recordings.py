@@ -5,7 +5,7 @@ import pytest
 
 from spslam.config import load_config
 from spslam.datasets import open_dataset
-from spslam.evaluation.trajectory import ate
+from spslam.evaluation.trajectory_metrics import ate
 from spslam.slam.system import SlamSystem
 from tests.datasets.layouts import shared_data
 

@@ -26,7 +26,7 @@ def png_uri(image: np.ndarray, max_width: int = 480) -> str:
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
 
 
-def depth_picture(depth: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
+def colorize_depth(depth: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
     """Depth [H,W] in colors from near (yellow) to far (violet), uint8 RGB; white where there is none."""
     share = np.clip((depth - near_m) / max(far_m - near_m, 1e-6), 0, 1)
     picture = cv2.applyColorMap((255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
@@ -49,7 +49,7 @@ def outward_faces(mesh: Mesh, camera: Camera, pose: np.ndarray) -> np.ndarray:
     return mesh.faces if (front & any_side).sum() >= (turned & any_side).sum() else mesh.faces[:, ::-1]
 
 
-def overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def render_overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """The mesh from above with near walls left out, and the camera's path: uint8 [H,W,3].
 
     Parameters

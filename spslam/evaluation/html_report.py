@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.evaluation import charts, pictures
+from spslam.evaluation import charts, report_images
 from spslam.evaluation.report_style import STYLE
 from spslam.evaluation.run_output import Mesh, Preview, RunOutput
-from spslam.evaluation.trajectory import align
+from spslam.evaluation.trajectory_metrics import align
 from spslam.io import atomic_write
 from spslam.meshing.render import render_mesh
 
@@ -101,7 +101,7 @@ def _map_sections(run: RunOutput) -> list[str]:
         return []
     if run.camera is None:
         return [_section("Map", _overview(run, mesh, mesh.faces))]
-    faces = pictures.outward_faces(mesh, run.camera, run.trajectory.poses[0])
+    faces = report_images.outward_faces(mesh, run.camera, run.trajectory.poses[0])
     sections = [_section("Map", _overview(run, mesh, faces))]
     views = [_view(run, mesh, run.camera, preview) for preview in _spread(previews, VIEWS)]
     if views:
@@ -111,7 +111,7 @@ def _map_sections(run: RunOutput) -> list[str]:
 
 
 def _overview(run: RunOutput, mesh: Mesh, faces: np.ndarray) -> str:
-    picture = pictures.overview(mesh, faces, run.trajectory.poses)
+    picture = report_images.render_overview(mesh, faces, run.trajectory.poses)
     caption = "The mesh from above, walls towards the viewer left out, and the camera's path; "
     caption += f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
     return _figure(picture, 1200, caption, "map")
@@ -126,15 +126,15 @@ def _view(run: RunOutput, mesh: Mesh, camera: Camera, preview: Preview) -> str:
     """A row: input and rendered color, input depth where it was kept, rendered depth."""
     pose = run.trajectory.poses[preview.row]
     color, depth = render_mesh(mesh.vertices, mesh.faces, mesh.colors, camera, pose, supersampling=2)
-    limits = pictures.depth_limits(depth if preview.depth is None else preview.depth)
+    limits = report_images.depth_limits(depth if preview.depth is None else preview.depth)
     images = [
         _figure(preview.color, 480, f"frame {preview.row}, input"),
         _figure(color, 480, "mesh"),
     ]
     if preview.depth is not None:
-        images.append(_figure(pictures.depth_picture(preview.depth, *limits), 480, "input depth"))
+        images.append(_figure(report_images.colorize_depth(preview.depth, *limits), 480, "input depth"))
     scale = f"mesh depth, {limits[0]:.1f} m yellow to {limits[1]:.1f} m violet"
-    images.append(_figure(pictures.depth_picture(depth, *limits), 480, scale))
+    images.append(_figure(report_images.colorize_depth(depth, *limits), 480, scale))
     return f'<div class="row">{"".join(images)}</div>'
 
 
@@ -143,10 +143,10 @@ def _trajectory(run: RunOutput) -> str:
         return ""
     estimate, ground_truth = _aligned_positions(run)
     # Drawn in the estimate's axes as seen from above; with truth the two share them after alignment.
-    axes = pictures.top_axes(run.trajectory.poses)
+    axes = report_images.top_axes(run.trajectory.poses)
     origin = estimate[0]
     plan_ground_truth = None if ground_truth is None else (ground_truth - origin) @ axes
-    chart = charts.path_chart((estimate - origin) @ axes, plan_ground_truth, run.trajectory.lost)
+    chart = charts.trajectory_chart((estimate - origin) @ axes, plan_ground_truth, run.trajectory.lost)
     length = np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum()
     return _section("Trajectory", chart, f"seen from above; {length:.2f} m long")
 
@@ -156,7 +156,9 @@ def _errors(run: RunOutput) -> str:
     if ground_truth is None:
         return ""
     estimate = np.where(run.trajectory.lost[:, None], np.nan, estimate)
-    difference = 100 * (estimate - ground_truth) @ np.column_stack([pictures.top_axes(run.trajectory.poses), _up(run)])
+    difference = (
+        100 * (estimate - ground_truth) @ np.column_stack([report_images.top_axes(run.trajectory.poses), _up(run)])
+    )
     series = [charts.Series(name, name[0], column) for name, column in zip(_AXES, difference.T, strict=True)]
     series.append(charts.Series("distance", "total", np.linalg.norm(difference, axis=1)))
     chart = charts.line_chart(series, "cm", run.trajectory.lost)
@@ -167,7 +169,7 @@ _AXES = ("right", "forward", "up")
 
 
 def _up(run: RunOutput) -> np.ndarray:
-    axes = pictures.top_axes(run.trajectory.poses)
+    axes = report_images.top_axes(run.trajectory.poses)
     return np.cross(axes[:, 0], axes[:, 1])
 
 
@@ -278,6 +280,6 @@ def _section(title: str, body: str, note: str = "") -> str:
 
 
 def _figure(image: np.ndarray, max_width: int, caption: str, kind: str = "view") -> str:
-    source = pictures.png_uri(image, max_width)
+    source = report_images.png_uri(image, max_width)
     text = html.escape(caption)
     return f'<figure class="{kind}"><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'
