@@ -56,8 +56,8 @@ def layer_of(header):
 
 def part_of(path):
     """`scene` for spslam/scene/x.py, `camera` for spslam/camera.py, `` for spslam/__init__.py."""
-    first = path.relative_to(ROOT / "spslam").parts[0]
-    return "" if first == "__init__.py" else first.removesuffix(".py")
+    first = path.relative_to(ROOT / "spslam").parts[0].removesuffix(".py")
+    return {"__init__": "", "__main__": "cli"}.get(first, first)
 
 
 def imported(path):
