@@ -34,8 +34,12 @@ def execute(args: argparse.Namespace) -> None:
     if args.resume and args.output is None:
         raise UsageError("--resume needs the interrupted run's folder as --output")
     output = args.output or default_output(args.config)
+    folder = RunFolder(output)
+    was_finished = args.resume and folder.metrics.is_file() and not folder.checkpoint.is_file()
     metrics = run(make_request(config, output, args.frames, args.resume, not args.no_mesh), args.quiet)
     if not args.quiet:
+        if was_finished:
+            print("this run had finished before; nothing was left to do")
         print_summary(metrics, output)
 
 

@@ -1,6 +1,5 @@
 """Asynchronous writing of checkpoints."""
 
-import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -33,14 +32,14 @@ class CheckpointWriter:
         """Whether the last checkpoint is still being written."""
         return self._thread is not None and self._thread.is_alive()
 
-    def write(self, state: SlamState, config: Config, source: dict[str, Any], log_descriptor: int) -> None:
+    def write(self, state: SlamState, config: Config, source: dict[str, Any], sync_log: Callable[[], None]) -> None:
         """Writes the current state. The log is flushed to disk before, so that it has the frames of every checkpoint.
 
         Args:
             state: after a complete frame.
             config: of the run.
             source: returned by `load_checkpoint`.
-            log_descriptor: file descriptor of the log, which has the lines of all processed frames.
+            sync_log: brings the log, which has the rows of all processed frames, to the disk.
 
         Raises:
             OutputError: this or the last checkpoint can't be written; the file of the one before is left unchanged.
@@ -48,11 +47,11 @@ class CheckpointWriter:
         self.wait()
         snapshot = take_snapshot(state, config, source, copy=self.threaded)
         if not self.threaded:
-            _write(self.path, snapshot, log_descriptor)
+            _write(self.path, snapshot, sync_log)
             return
         device = state.scene.device
         taken = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
-        write = _on_own_stream(device, taken, lambda: _write(self.path, snapshot, log_descriptor))
+        write = _on_own_stream(device, taken, lambda: _write(self.path, snapshot, sync_log))
         self._thread = threading.Thread(target=self._keep_error, args=(write,), name="spslam-checkpoint")
         self._thread.start()
 
@@ -76,9 +75,9 @@ class CheckpointWriter:
             self._error = error
 
 
-def _write(path: Path, snapshot: Snapshot, log_descriptor: int) -> None:
+def _write(path: Path, snapshot: Snapshot, sync_log: Callable[[], None]) -> None:
     # The log must have the frames of every checkpoint, also after a power failure.
-    os.fsync(log_descriptor)
+    sync_log()
     write_snapshot(path, snapshot)
 
 

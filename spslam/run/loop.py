@@ -1,15 +1,14 @@
 """The frame loop of a run: frames go to the SLAM system, reports to the log, the state to checkpoints."""
 
 import contextlib
-import json
 from collections import deque
 from collections.abc import Callable
-from typing import IO
 
 from spslam.errors import DatasetError
 from spslam.run.checkpoint_writer import CheckpointWriter
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.interruption import Interruption
+from spslam.run.output_folder import RunLog
 from spslam.run.session import RunSession
 from spslam.slam.frame_report import FrameReport, PendingReport
 from spslam.slam.prepared_frame import PreparedFrame
@@ -43,7 +42,7 @@ class RunLoop:
         self.session.clock.start_loop()
         threaded = self.system.device.type == "cuda"
         with (
-            self.session.folder.open_log() as log,
+            RunLog(self.session.folder.log) as log,
             Interruption() as interruption,
             contextlib.closing(CheckpointWriter(self.session.folder.checkpoint, threaded)) as writer,
         ):
@@ -55,7 +54,7 @@ class RunLoop:
                     self._flush_reports(log, wait=True)
                 raise
 
-    def _process(self, log: IO[str], writer: CheckpointWriter, interruption: Interruption) -> None:
+    def _process(self, log: RunLog, writer: CheckpointWriter, interruption: Interruption) -> None:
         every = self.system.config.run.checkpoint_every
         done = last_saved = self.session.start
         for done, item in enumerate(self.feed, self.session.start + 1):
@@ -81,23 +80,23 @@ class RunLoop:
             return None
         return self.system.submit(item)
 
-    def _flush_reports(self, log: IO[str], wait: bool = False) -> None:
+    def _flush_reports(self, log: RunLog, wait: bool = False) -> None:
         """Logs the frames that the device has finished; with `wait`, waits for all of them."""
         while self._pending and (wait or self._pending[0][1] is None or self._pending[0][1].is_done()):
             done, pending = self._pending.popleft()
             report = pending.result() if pending else None
             if report:
-                log.write(json.dumps(report.log_row()) + "\n")
+                log.append(report.log_row())
             if self.progress:
                 self.progress(done, self.session.total, report)
 
     def _update_clock(self, done: int) -> None:
         self.session.clock.update(done - self.session.start, self.feed.decode_seconds)
 
-    def _save(self, position: int, log: IO[str], writer: CheckpointWriter) -> None:
+    def _save(self, position: int, log: RunLog, writer: CheckpointWriter) -> None:
         self._flush_reports(log, wait=True)
         source = {"data": self.session.identity, "next": position, "clock": self.session.clock.to_dict()}
-        writer.write(self.system.state, self.system.config, source, log.fileno())
+        writer.write(self.system.state, self.system.config, source, log.sync)
 
 
 def _is_checkpoint_due(every: int, last_saved: int, done: int) -> bool:

@@ -1,9 +1,15 @@
 """Creating, appending to and reading back a run's output folder."""
 
+import contextlib
+import errno
+import fcntl
 import json
+import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from types import TracebackType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,27 +18,91 @@ from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.html_report import write_report
-from spslam.io import atomic_write
+from spslam.io import atomic_write, writing
 from spslam.meshing import extract_mesh, save_mesh
 from spslam.run_folder import RunFolder
 from spslam.scene import Scene
 from spslam.trajectory import Trajectory
 
+# What locking says where the file system has no locks.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF)
+
+
+class RunLog(contextlib.AbstractContextManager):
+    """log.jsonl, open to append rows; each is written out at once.
+
+    Raises:
+        OutputError: the file can't be written.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        with writing(path):
+            self._file = path.open("a", encoding="utf-8", buffering=1)
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Adds a row."""
+        with writing(self.path):
+            self._file.write(json.dumps(row) + "\n")
+
+    def sync(self) -> None:
+        """Returns when all rows are on the disk."""
+        with writing(self.path):
+            os.fsync(self._file.fileno())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is None:
+            with writing(self.path):
+                self._file.close()
+        else:
+            with contextlib.suppress(OSError):  # of a row that could not be written, which was reported already
+                self._file.close()
+
 
 class OutputFolder(RunFolder):
     """The output folder of the run in progress."""
 
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Makes the folder where there is none, and keeps other runs out of it; the lock ends with the process.
+
+        Raises:
+            OutputError: the path is a file, the folder can't be made, or another run is writing into it.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError(f"{self.path}: is a file, not a folder for results")
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.path, os.O_RDONLY)
+        except OSError as error:
+            raise OutputError(f"{self.path}: can't be made: {error.strerror or error}") from None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise OutputError(
+                f"{self.path}: another run is writing into it; wait for its end, or use another --output"
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(descriptor)
+                raise OutputError(f"{self.path}: can't be locked: {error.strerror or error}") from None
+        try:
+            yield
+        finally:
+            os.close(descriptor)
+
     def create(self, resume: bool) -> None:
-        """Creates the folder for a new run.
+        """Prepares the locked folder for a new run.
 
         Args:
             resume: also accept a folder whose run ended before its first checkpoint; its files are removed.
 
         Raises:
-            OutputError: the path is a file, or the folder has other content.
+            OutputError: the folder has other content.
         """
-        if self.path.exists() and not self.path.is_dir():
-            raise OutputError(f"{self.path}: is a file, not a folder for results")
         if self.metrics.exists():
             raise OutputError(f"{self.path}: holds a finished run; use another --output")
         if self.checkpoint.exists():
@@ -43,7 +113,6 @@ class OutputFolder(RunFolder):
                 "start it over with --resume, or use another --output"
             )
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
             self.remove_temporaries()
             if any(self.path.iterdir()) and not self.config.exists():
                 raise OutputError(f"{self.path}: is not empty; use another --output")
@@ -52,17 +121,15 @@ class OutputFolder(RunFolder):
                 if earlier != self.config:
                     earlier.unlink(missing_ok=True)
         except OSError as error:
-            raise OutputError(f"{self.path}: can't be made: {error.strerror or error}") from None
+            raise OutputError(f"{self.path}: can't be emptied: {error.strerror or error}") from None
 
     def remove_temporaries(self) -> None:
         """Removes the temporary files of a killed run (see `spslam.io.atomic_write`)."""
         for path in self.files():
             for temporary in self.path.glob(f".{path.stem}.*.tmp{path.suffix}"):
                 temporary.unlink(missing_ok=True)
-
-    def open_log(self) -> IO[str]:
-        """Opens the log to append lines; each line is written out at once."""
-        return self.log.open("a", encoding="utf-8", buffering=1)
+        for temporary in self.previews.glob(".*.tmp.*"):
+            temporary.unlink(missing_ok=True)
 
     def read_log(self) -> list[dict[str, Any]]:
         """The lines of the log."""
@@ -82,7 +149,7 @@ class OutputFolder(RunFolder):
 
     def record_skipped(self, position: int, error: DatasetError) -> None:
         """Logs a frame that could not be read."""
-        with self.skipped.open("a", encoding="utf-8") as file:
+        with writing(self.skipped), self.skipped.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"position": position, "error": str(error)}) + "\n")
 
     def read_skipped(self) -> list[dict[str, Any]]:
@@ -116,7 +183,8 @@ class OutputFolder(RunFolder):
             ground_truth: float64 [len(dataset), 4, 4], NaN where unknown; None if there is none.
             count: number of frames, spread evenly over the run.
         """
-        self.previews.mkdir(exist_ok=True)
+        with writing(self.previews):
+            self.previews.mkdir(exist_ok=True)
         atomic_write(self.preview_camera, json.dumps(vars(dataset.camera)) + "\n")
         if ground_truth is not None:
             known = np.isfinite(ground_truth).all((1, 2))

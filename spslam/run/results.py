@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError
 from spslam.evaluation.trajectory_metrics import ate, rpe
@@ -30,7 +31,7 @@ def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest,
         What is written to metrics.json.
 
     Raises:
-        SpslamError: there is no frame, or a file can't be written.
+        SpslamError: there is no frame, no frame has a known pose, or a file can't be written.
     """
     config, folder, clock = request.config, session.folder, session.clock
     frames, skipped = system.state.frames, folder.read_skipped()
@@ -38,10 +39,13 @@ def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest,
         raise DatasetError(f"{dataset.name}: no frame could be read; the first: {skipped[0]['error']}")
     trajectory, ground_truth, log = system.trajectory(), dataset.poses(), folder.read_log()
     lost = trajectory.lost
+    if lost.all():
+        raise DatasetError(_nothing_known(dataset, config))
     trajectory.save_tum(folder.trajectory)
     system.state.scene.save(folder.map)
     metrics = {
         **provenance(config, system.device),
+        "data": session.identity,
         "frames": len(frames),
         **_speed(clock),
         **_timings(log, clock),
@@ -64,6 +68,16 @@ def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest,
     folder.write_report()
     folder.checkpoint.unlink(missing_ok=True)
     return metrics
+
+
+def _nothing_known(dataset: RgbdDataset, config: Config) -> str:
+    depth = config.dataset
+    return (
+        f"{dataset.name}: no frame has a known pose: none shows a surface between dataset.min_depth_m "
+        f"({depth.min_depth_m:g} m) and dataset.max_depth_m ({depth.max_depth_m:g} m) in at least "
+        f"tracking.min_valid_depth_share ({config.tracking.min_valid_depth_share:g}) of its pixels; "
+        "`spslam check-data` shows what the depth images hold"
+    )
 
 
 def _max_error_probability(log: list[dict[str, Any]]) -> dict[str, float]:

@@ -3,6 +3,7 @@
 import contextlib
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,9 +17,10 @@ from spslam.datasets.base import RgbdDataset
 from spslam.run.device import explained_failures, resolve_device
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.loop import Progress, RunLoop
+from spslam.run.output_folder import OutputFolder
 from spslam.run.request import RunRequest
 from spslam.run.results import write_results
-from spslam.run.session import open_session
+from spslam.run.session import finished_metrics, open_session
 from spslam.run.warm_up import warm_up
 from spslam.slam.system import SlamSystem
 
@@ -27,6 +29,8 @@ __all__ = ["Progress", "RunRequest", "run_sequence"]
 
 def run_sequence(request: RunRequest, progress: Progress | None = None) -> dict[str, Any]:
     """Runs SLAM over a sequence and writes trajectory, map, mesh, metrics, log and report.
+
+    A request that resumes a finished run returns its metrics and changes nothing.
 
     Args:
         request: options, data and output folder.
@@ -76,8 +80,17 @@ def _kernel_threads_limited(device: torch.device) -> Iterator[None]:
 
 
 def _run(request: RunRequest, device: torch.device, progress: Progress | None) -> dict[str, Any]:
-    started, config = time.perf_counter(), request.config
-    dataset = open_sequence(config.dataset, request.data_dir, request.frames)
+    started = time.perf_counter()
+    dataset = open_sequence(request.config.dataset, request.data_dir, request.frames)
+    with OutputFolder(Path(request.output_dir)).locked():
+        finished = finished_metrics(request, dataset)
+        return _process(request, dataset, device, progress, started) if finished is None else finished
+
+
+def _process(
+    request: RunRequest, dataset: RgbdDataset, device: torch.device, progress: Progress | None, started: float
+) -> dict[str, Any]:
+    config = request.config
     system = SlamSystem(config, dataset.camera, _first_pose(config, dataset), device)
     session = open_session(request, dataset, system)
     with FrameFeed(dataset, config, device, session.start) as feed:

@@ -1,19 +1,20 @@
 """A run from its start, or from its last checkpoint: where it begins and what it continues."""
 
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spslam.config import dump_config
+from spslam.config import dump_config, load_config
 from spslam.datasets.base import RgbdDataset
-from spslam.errors import OutputError
+from spslam.errors import ConfigError, OutputError
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
 from spslam.run.output_folder import OutputFolder
 from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest
-from spslam.slam.checkpoint import load_checkpoint
+from spslam.slam.checkpoint import fingerprint, load_checkpoint
 from spslam.slam.system import SlamSystem
 
 
@@ -47,7 +48,7 @@ def open_session(request: RunRequest, dataset: RgbdDataset, system: SlamSystem) 
     Raises:
         OutputError: the folder can't be used, or its checkpoint belongs to another run.
     """
-    folder, identity = OutputFolder(Path(request.output_dir)), _identity(dataset, request.data_dir)
+    folder, identity = OutputFolder(Path(request.output_dir)), identity_of(dataset, request.data_dir)
     if request.resume and folder.checkpoint.exists():
         saved = load_checkpoint(folder.checkpoint, system.state, system.config)
         if saved["data"] != identity:
@@ -60,7 +61,28 @@ def open_session(request: RunRequest, dataset: RgbdDataset, system: SlamSystem) 
     return RunSession(folder, identity, len(dataset), 0, RunClock())
 
 
-def _identity(dataset: RgbdDataset, data_dir: Path | None) -> dict[str, Any]:
+def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any] | None:
+    """metrics.json of the finished run that the request would resume; None where there is something left to do.
+
+    Raises:
+        OutputError: the folder holds a finished run of other options, data or frames.
+    """
+    folder = OutputFolder(Path(request.output_dir))
+    if not request.resume or folder.checkpoint.exists() or not folder.metrics.exists():
+        return None
+    try:
+        metrics = json.loads(folder.metrics.read_text(encoding="utf-8"))
+        same = fingerprint(load_config(folder.config)) == fingerprint(request.config)
+        same = same and metrics["data"] == identity_of(dataset, request.data_dir)
+    except (OSError, ValueError, KeyError, TypeError, ConfigError):
+        same = False
+    if not same:
+        raise OutputError(f"{folder.path}: holds a finished run of other options, data or frames; use another --output")
+    return metrics
+
+
+def identity_of(dataset: RgbdDataset, data_dir: Path | None) -> dict[str, Any]:
+    """JSON object that tells the frames of one run from those of another."""
     return {
         "folder": str(Path(data_dir).resolve()) if data_dir else "",
         "frames": len(dataset),

@@ -66,9 +66,11 @@ def test_kept_configuration_is_the_one_that_ran(finished):
 def test_finished_run_is_not_overwritten(finished):
     folder, _ = finished
     before = (folder / "out" / "trajectory.txt").read_bytes()
-    for extra in ([], ["--resume"]):
-        result = spslam("run", "demo", *SMALL, "--frames", "0:8", "--output", "out", *extra, cwd=folder)
-        assert_refused(result, "holds a finished run; use another --output")
+    again = ["run", "demo", *SMALL, "--frames", "0:8", "--output", "out"]
+    assert_refused(spslam(*again, cwd=folder), "holds a finished run; use another --output")
+    resumed = spslam(*again, "--resume", cwd=folder)
+    assert resumed.returncode == 0, resumed.stderr
+    assert resumed.stdout.startswith("this run had finished before; nothing was left to do\n")
     assert (folder / "out" / "trajectory.txt").read_bytes() == before
 
 

@@ -13,13 +13,8 @@ from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
 
 SETTINGS = ("mapping.every=2", "mapping.first_iterations=10", "mapping.reset_moments=false")
+sync_nothing = bool  # a call that returns
 SOURCE = {"next": 4, "data": {}, "clock": {}}
-
-
-@pytest.fixture
-def log(tmp_path):
-    with (tmp_path / "log").open("w") as file:
-        yield file.fileno()
 
 
 @pytest.fixture
@@ -36,13 +31,13 @@ def go_on(system):
         system.process(Recorded(8)[i])
 
 
-def test_thread_writes_the_state_at_the_time_of_the_call(monkeypatch, tmp_path, system, log):
+def test_thread_writes_the_state_at_the_time_of_the_call(monkeypatch, tmp_path, system):
     """The thread is delayed until four more frames have been processed."""
-    CheckpointWriter(tmp_path / "in_place", threaded=False).write(system.state, system.config, SOURCE, log)
+    CheckpointWriter(tmp_path / "in_place", threaded=False).write(system.state, system.config, SOURCE, sync_nothing)
     may_write, write = threading.Event(), checkpoint_writer.write_snapshot
     monkeypatch.setattr(checkpoint_writer, "write_snapshot", lambda *args: may_write.wait(60) and write(*args))
     writer = CheckpointWriter(tmp_path / "beside", threaded=True)
-    writer.write(system.state, system.config, SOURCE, log)
+    writer.write(system.state, system.config, SOURCE, sync_nothing)
     assert writer.is_busy
     go_on(system)
     may_write.set()
@@ -51,9 +46,9 @@ def test_thread_writes_the_state_at_the_time_of_the_call(monkeypatch, tmp_path, 
     assert (tmp_path / "beside").read_bytes() == (tmp_path / "in_place").read_bytes()
 
 
-def test_restored_state_continues_identically(tmp_path, system, log, device):
+def test_restored_state_continues_identically(tmp_path, system, device):
     writer = CheckpointWriter(tmp_path / "checkpoint", threaded=True)
-    writer.write(system.state, system.config, SOURCE, log)
+    writer.write(system.state, system.config, SOURCE, sync_nothing)
     go_on(system)
     writer.wait()
     resumed = SlamSystem(system.config, system.camera, device=device)
@@ -64,9 +59,9 @@ def test_restored_state_continues_identically(tmp_path, system, log, device):
     assert torch.equal(system.state.frames.poses, resumed.state.frames.poses)
 
 
-def test_error_on_the_thread_is_raised(tmp_path, system, log):
+def test_error_on_the_thread_is_raised(tmp_path, system):
     writer = CheckpointWriter(tmp_path / "absent" / "checkpoint", threaded=True)
-    writer.write(system.state, system.config, SOURCE, log)
+    writer.write(system.state, system.config, SOURCE, sync_nothing)
     with pytest.raises(OutputError, match="absent/checkpoint: can't be written: No such file or directory"):
         writer.wait()
     writer.close()

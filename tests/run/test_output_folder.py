@@ -1,0 +1,105 @@
+"""The output folder of a run: one run at a time, what a finished one is resumed to, what a killed one leaves."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from spslam.errors import DatasetError, OutputError
+from spslam.run.output_folder import OutputFolder, RunLog
+from tests.cli.command import ROOT
+from tests.system.sequences import Recorded, run_on
+
+# Holds the lock of a folder until its standard input ends.
+HOLDER = """
+import sys
+from pathlib import Path
+from spslam.run.output_folder import OutputFolder
+with OutputFolder(Path(sys.argv[1])).locked():
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def busy(tmp_path):
+    """A folder that another process is writing into, and that process."""
+    folder = tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder)], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "locked\n"
+    yield folder, process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_two_runs_do_not_share_a_folder(monkeypatch, busy, resume):
+    folder, process = busy
+    with pytest.raises(OutputError, match="another run is writing into it; wait for its end, or use another --output"):
+        run_on(monkeypatch, Recorded(2), folder, resume=resume)
+    assert list(folder.iterdir()) == []
+    process.kill()  # the lock goes with the process
+    process.wait()
+    assert run_on(monkeypatch, Recorded(2), folder, resume=resume)["frames"] == 2
+
+
+def test_a_file_is_no_folder(tmp_path):
+    (tmp_path / "out").touch()
+    with (
+        pytest.raises(OutputError, match="out: is a file, not a folder for results"),
+        OutputFolder(tmp_path / "out").locked(),
+    ):
+        pass
+
+
+def test_resuming_a_finished_run_returns_its_metrics(monkeypatch, tmp_path):
+    metrics = run_on(monkeypatch, Recorded(3), tmp_path / "out")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
+    again = run_on(monkeypatch, Recorded(3), tmp_path / "out", resume=True)
+    assert again == json.loads(json.dumps(metrics))
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
+
+
+def test_a_finished_run_of_other_options_or_frames_is_not_resumed(monkeypatch, tmp_path):
+    run_on(monkeypatch, Recorded(3), tmp_path / "out")
+    other = "holds a finished run of other options, data or frames; use another --output"
+    with pytest.raises(OutputError, match=other):
+        run_on(monkeypatch, Recorded(4), tmp_path / "out", resume=True)
+    with pytest.raises(OutputError, match=other):
+        run_on(monkeypatch, Recorded(3), tmp_path / "out", "seed=1", resume=True)
+    (tmp_path / "out" / "metrics.json").write_text("{")
+    with pytest.raises(OutputError, match=other):
+        run_on(monkeypatch, Recorded(3), tmp_path / "out", resume=True)
+
+
+@pytest.mark.parametrize("depth", [0.0, float("nan")])
+def test_a_run_without_a_known_pose_is_an_error(monkeypatch, tmp_path, depth):
+    def blank(frame):
+        frame.depth[:] = depth
+
+    with pytest.raises(
+        DatasetError, match=r"no frame has a known pose: none shows a surface between dataset\.min_depth"
+    ):
+        run_on(monkeypatch, Recorded(3, change=blank), tmp_path / "out")
+    assert not (tmp_path / "out" / "metrics.json").exists()
+    assert not (tmp_path / "out" / "map.safetensors").exists()
+
+
+def test_temporary_files_of_a_killed_run_are_removed(tmp_path):
+    folder = OutputFolder(tmp_path)
+    folder.previews.mkdir()
+    names = [".report.12.tmp.html", ".mesh.12.tmp.ply", ".log.12.tmp.jsonl", "previews/.frame-000000.12.tmp.png"]
+    for name in [*names, "notes.tmp.txt"]:
+        (tmp_path / name).touch()
+    folder.remove_temporaries()
+    assert [path.name for path in tmp_path.rglob("*") if ".tmp." in path.name] == ["notes.tmp.txt"]
+
+
+def test_a_log_that_cannot_be_written_is_named():
+    log = RunLog(Path("/dev/full"))
+    with pytest.raises(OutputError, match="/dev/full: can't be written: No space left on device"), log:
+        log.append({"frame": 0})
