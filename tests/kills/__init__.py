@@ -1,0 +1,1 @@
+"""Kills runs at random moments: `python -m tests.kills` for many, a few in the tests."""
