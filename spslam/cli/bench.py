@@ -19,7 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a data set's; --list names all")
     parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the data sets")
     parser.add_argument(
-        "--folders", metavar="FILE", type=Path, help="YAML file with the folders of sequences: see docs/datasets.md"
+        "--folders",
+        metavar="FILE",
+        type=Path,
+        help="YAML file of folders, SUITE: {SEQUENCE: FOLDER}, where the data has other names",
     )
     parser.add_argument("--output", metavar="DIR", type=Path, help="folder of results; runs/bench-SUITE if not given")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto takes the GPUs, if any")
