@@ -17,12 +17,20 @@ from spslam.prior.validation import first_zero_crossing, validate
 SMALL = PretrainSettings(steps=20, patches_per_kind=2, views=PatchSettings(rays=48))
 
 
-@pytest.fixture
-def trained(tmp_path, monkeypatch):
-    monkeypatch.setattr(pretraining, "_LOG_EVERY", 5)
-    monkeypatch.setattr(pretraining, "_VALIDATE_EVERY", 20)
-    pretrain(tmp_path / "one.safetensors", SMALL, workers=1)
-    return tmp_path / "one.safetensors"
+@pytest.fixture(scope="module", autouse=True)
+def often():
+    """A log and a validation within the few steps of these tests."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(pretraining, "_LOG_EVERY", 5)
+        monkeypatch.setattr(pretraining, "_VALIDATE_EVERY", 20)
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, often):
+    output = tmp_path_factory.mktemp("trained") / "one.safetensors"
+    pretrain(output, SMALL, workers=1)
+    return output
 
 
 def interrupted_after(steps):
