@@ -1,1 +1,1 @@
-"""What a run is judged by: trajectories, surfaces, depth and color images."""
+"""Evaluation of runs against ground truth: trajectory, mesh, depth and color images; the HTML report."""

@@ -1,4 +1,4 @@
-"""Charts as inline SVG, in the colors of the report's style sheet."""
+"""Charts as inline SVG, colored by the style sheet of the report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ _MAX_POINTS = 2000
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a chart. ``kind`` names its color in the style sheet; NaN values break the line."""
+    """One line of a chart.
+
+    Attributes:
+        name: label in the legend.
+        kind: CSS class, which sets the color.
+        values: [F]; NaN values interrupt the line.
+        dots: draw dots instead of a line.
+    """
 
     name: str
     kind: str
@@ -24,14 +31,16 @@ class Series:
 
 
 def line_chart(series: Sequence[Series], unit: str, marks: np.ndarray | None = None, from_zero: bool = True) -> str:
-    """Values over frame numbers.
+    """Draws values over frame numbers.
 
-    Parameters
-    ----------
-    series : of one length F.
-    unit : of the values, written beside the top label.
-    marks : bool [F], frames to mark along the axis (lost ones).
-    from_zero : start the value axis at 0.
+    Args:
+        series: lines of the same length F.
+        unit: unit of the values, shown at the top label.
+        marks: bool [F], frames to mark with a vertical line, such as lost frames.
+        from_zero: start the value axis at 0.
+
+    Returns:
+        SVG with a legend; empty without a finite value.
     """
     finite = np.concatenate([line.values[np.isfinite(line.values)] for line in series] or [np.zeros(0)])
     if not len(finite):
@@ -56,13 +65,15 @@ def line_chart(series: Sequence[Series], unit: str, marks: np.ndarray | None = N
 
 
 def trajectory_chart(estimate: np.ndarray, ground_truth: np.ndarray | None, lost: np.ndarray) -> str:
-    """A path seen from above, meters, both axes of one scale.
+    """Draws a trajectory in the horizontal plane, in meters, with equal scale on both axes.
 
-    Parameters
-    ----------
-    estimate : [F,2].
-    truth : [F,2] in the same axes, NaN where unknown, or None.
-    lost : bool [F]; the estimate's line has a gap there.
+    Args:
+        estimate: [F, 2].
+        ground_truth: [F, 2] in the same axes, NaN where unknown, or None.
+        lost: bool [F]; the estimated trajectory has a gap there.
+
+    Returns:
+        SVG with a legend; empty without a position.
     """
     known = (
         estimate
@@ -83,8 +94,8 @@ def trajectory_chart(estimate: np.ndarray, ground_truth: np.ndarray | None, lost
     parts = [_grid(low, high, scale, height)]
     if ground_truth is not None:
         parts.append(f'<path class="line ground-truth" d="{_path(place(ground_truth))}"/>')
-    known_path = np.where(lost[:, None], np.nan, estimate)
-    parts.append(f'<path class="line estimate" d="{_path(place(known_path))}"/>')
+    tracked = np.where(lost[:, None], np.nan, estimate)
+    parts.append(f'<path class="line estimate" d="{_path(place(tracked))}"/>')
     parts += [f'<circle class="dot lost" cx="{u:.1f}" cy="{v:.1f}" r="3"/>' for u, v in place(estimate[lost])]
     (u, v), (end_u, end_v) = place(estimate[0]), place(estimate[-1])
     parts.append(f'<circle class="dot estimate" cx="{u:.1f}" cy="{v:.1f}" r="5"><title>start</title></circle>')
@@ -96,7 +107,15 @@ def trajectory_chart(estimate: np.ndarray, ground_truth: np.ndarray | None, lost
 
 
 def stacked_bar(shares: Sequence[tuple[str, str, float]], unit: str) -> str:
-    """Parts of a whole: (name, kind, amount) in order; amounts of 0 are left out."""
+    """Draws parts of a total as a stacked bar.
+
+    Args:
+        shares: (name, CSS class, amount) in order; amounts of 0 are left out.
+        unit: unit of the amounts.
+
+    Returns:
+        SVG with a legend; empty if the total is 0.
+    """
     shares = [(name, kind, amount) for name, kind, amount in shares if amount > 0]
     total = sum(amount for _, _, amount in shares)
     if not total:
@@ -115,7 +134,7 @@ def stacked_bar(shares: Sequence[tuple[str, str, float]], unit: str) -> str:
 
 
 def nice_ticks(low: float, high: float, count: int = 5) -> np.ndarray:
-    """About ``count`` round numbers that span [low, high]."""
+    """About `count` round numbers that cover [low, high]."""
     step = max(high - low, 1e-12) / count
     magnitude = 10.0 ** np.floor(np.log10(step))
     step = magnitude * next(factor for factor in (1, 2, 2.5, 5, 10) if factor * magnitude >= step * 0.999)
@@ -162,7 +181,7 @@ def _frame_axis(count: int, x) -> str:
 
 
 def _grid(low: np.ndarray, high: np.ndarray, scale: float, height: float) -> str:
-    """A grid of round meters with a scale bar."""
+    """A grid at round distances in meters, with a scale bar."""
     step = nice_ticks(0, float((high - low).max()), 6)[1]
     width = (high[0] - low[0]) * scale
     verticals = (np.arange(np.ceil(low[0] / step), np.floor(high[0] / step) + 1) * step - low[0]) * scale

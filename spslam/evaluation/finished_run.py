@@ -1,4 +1,4 @@
-"""A finished run against the truth: its trajectory, its mesh where the camera saw the surface, its map's pictures."""
+"""Evaluates a finished run against ground truth: trajectory, mesh and rendered views of the map."""
 
 from __future__ import annotations
 
@@ -20,17 +20,22 @@ from spslam.geometry import umeyama
 from spslam.io import atomic_write
 from spslam.scene import Scene
 
-# Frames that decide what was observed; more of a sequence's neighbors add nothing but time.
+# Frames used to determine which surface was observed; more of them add time, but hardly any surface.
 _CULLING_FRAMES = 100
-# Views whose depth, and frames whose color, is compared; and the width of the former.
+# Number of novel views for depth L1 and of frames for PSNR and SSIM, and the image width of the novel views.
 NOVEL_VIEWS, COLOR_VIEWS = 32, 16
 _NOVEL_WIDTH_PX = 160
 
 
 def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, float]:
-    """ATE and RPE as metrics.json names them; empty where no true pose is known.
+    """ATE and RPE by their names in metrics.json.
 
-    With ``with_scale`` also ATE after alignment by a similarity, under names of its own.
+    Args:
+        run: the run.
+        with_scale: also compute ATE after alignment with scale, as `ate_scaled_*`.
+
+    Returns:
+        Metrics as in `spslam.evaluation.trajectory_metrics`; empty without ground-truth poses.
     """
     ground_truth = run.known_ground_truth
     if ground_truth is None:
@@ -42,24 +47,25 @@ def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, fl
 def surface_figures(
     run: RunOutput, dataset: RgbdDataset, ground_truth: Surface, samples: int = SAMPLES, novel_views: int = NOVEL_VIEWS
 ) -> dict[str, float]:
-    """Accuracy, completeness, F1 and depth from novel views of the run's mesh, as metrics.json names them.
+    """Accuracy, completeness, F1 and depth L1 of the mesh of a run, by their names in metrics.json.
 
-    The mesh is carried into the truth's world by the rigid motion that best carries estimated onto true views (camera
-    centers and points a meter away from them: the centers of a straight path alone leave a rotation open); surface that
-    no frame observed is left out on both sides.
+    The mesh is aligned with the ground truth by the rigid transform that best aligns the estimated camera poses with
+    the ground-truth poses. It uses the camera centers and points one meter along each camera axis, because the centers
+    of a straight trajectory alone do not determine the rotation. Surface that no frame observed is excluded from both
+    meshes.
 
-    Parameters
-    ----------
-    run : with a mesh.
-    dataset : the one that the run was over, or that it took its frames from; its depth says what was observed.
-    truth : the true surface.
-    samples : points compared each way, 100,000 as in the paper.
-    novel_views : views whose depth is compared; 0 leaves those figures out.
+    Args:
+        run: a run with a mesh.
+        dataset: the dataset of the run, or one that contains its frames; its depth determines what was observed.
+        ground_truth: the ground-truth surface.
+        samples: points sampled on each surface, 100,000 as in the paper.
+        novel_views: number of views for depth L1; 0 leaves it out.
 
-    Raises
-    ------
-    OutputError
-        When the run has no mesh, or none of its frames is in the dataset.
+    Returns:
+        Metrics as in `spslam.evaluation.mesh_metrics` and `spslam.evaluation.depth_metrics`.
+
+    Raises:
+        OutputError: the run has no mesh, or none of its frames is in the dataset.
     """
     mesh = _require_mesh(run)
     known = run.known_ground_truth
@@ -83,31 +89,27 @@ def surface_figures(
 
 
 def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
-    """How like the input the map looks from where its frames were taken, as metrics.json names it.
+    """PSNR and SSIM of the rendered map against the input images, by their names in metrics.json.
 
-    The map is drawn from the estimated poses of frames spread evenly over the run.
+    The map is rendered from the estimated poses of frames evenly spaced over the run.
 
-    Parameters
-    ----------
-    run : with a mesh and a map.
-    dataset : the one that the run was over, or that it took its frames from.
+    Args:
+        run: a run with a mesh and a map.
+        dataset: the dataset of the run, or one that contains its frames.
 
-    Returns
-    -------
-    ``psnr_db`` and ``ssim`` : means over the views, each over the pixels where the map has surface.
-    ``view_coverage`` : percent of all pixels where it has.
-    Empty when no frame can be read or none shows surface.
+    Returns:
+        `psnr_db` and `ssim`: means over the views, each over the pixels where the map has surface.
+        `view_coverage`: percentage of all pixels where it has.
+        Empty if no frame can be read or no view shows surface.
 
-    Raises
-    ------
-    OutputError
-        When the run has no mesh or no map, or none of its frames is in the dataset.
+    Raises:
+        OutputError: the run has no mesh or no map, or none of its frames is in the dataset.
     """
     mesh, map_file = _require_mesh(run), run.folder.map
     if not map_file.is_file():
-        raise OutputError(f"{run.folder.path}: has no {map_file.name} to draw")
+        raise OutputError(f"{run.folder.path}: has no {map_file.name} to render")
     scene = Scene.load(map_file)
-    likeness, coverage = [], []
+    scores, coverage = [], []
     for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS, known_only=True), strict=True):
         try:
             frame = dataset[int(index)]
@@ -117,17 +119,17 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
         shown = depth > 0
         coverage.append(100 * float(shown.mean()))
         if shown.any():
-            likeness.append((psnr_db(color, frame.color, shown), ssim(color, frame.color, shown)))
-    if not likeness:
+            scores.append((psnr_db(color, frame.color, shown), ssim(color, frame.color, shown)))
+    if not scores:
         return {}
-    ratios, similarities = np.array(likeness).T
+    ratios, similarities = np.array(scores).T
     figures = {"psnr_db": float(ratios.mean()), "view_coverage": float(np.mean(coverage))}
-    # A view that shows specks of surface only has no whole window to compare.
+    # SSIM is NaN for a view whose surface is too fragmented to contain a whole window.
     return figures | ({} if np.isnan(similarities).all() else {"ssim": float(np.nanmean(similarities))})
 
 
 def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
-    """Write metrics.json with further figures; returns all of them."""
+    """Adds metrics to metrics.json and returns all of them."""
     metrics = {**run.metrics, **figures}
     atomic_write(run.folder.metrics, json.dumps(metrics, indent=1) + "\n")
     return metrics
@@ -136,20 +138,20 @@ def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
 def _require_mesh(run: RunOutput) -> Mesh:
     mesh = run.mesh()
     if mesh is None:
-        raise OutputError(f"{run.folder.path}: has no mesh to evaluate; spslam mesh {run.folder.path} makes one")
+        raise OutputError(f"{run.folder.path}: has no mesh to evaluate; `spslam mesh {run.folder.path}` extracts one")
     return mesh
 
 
 def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
     known = np.isfinite(reference).all(axis=(1, 2))
-    # Columns: the camera's center, and the points a meter along its axes.
+    # Columns: the camera center, and the points one meter along each camera axis.
     corners = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]], dtype=np.float64).T
     points = ((poses[known] @ corners)[:, :3].transpose(0, 2, 1).reshape(-1, 3) for poses in (estimated, reference))
     return Alignment(*umeyama(*points))
 
 
 def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int, known_only: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the run's trajectory, spread evenly, and the dataset's numbers of those frames."""
+    """Evenly spaced rows of the run's trajectory, and the indices of these frames in the dataset."""
     indices = match_times(dataset.timestamps(), run.trajectory.timestamps)
     rows = np.flatnonzero((indices >= 0) & ~(run.trajectory.lost & known_only))
     if not len(rows):
@@ -159,7 +161,7 @@ def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int, known_only: boo
 
 
 def _read_depths(dataset: RgbdDataset, rows: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Depth images of frames, and the rows of those that can be read."""
+    """The rows whose frames can be read, and their depth images."""
     readable, depths = [], []
     for row, index in zip(rows, indices, strict=True):
         try:

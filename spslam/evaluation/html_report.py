@@ -1,4 +1,4 @@
-"""report.html: one file that shows a run, made from the other files in its output folder."""
+"""Writes report.html, a self-contained page about one run, from the files in its output folder."""
 
 from __future__ import annotations
 
@@ -18,34 +18,36 @@ from spslam.io import atomic_write
 from spslam.meshing.render import render_mesh
 
 VIEWS = 3
-# The figures at the top: name, key of metrics.json, form.
+# The metrics at the top: label, key in metrics.json, format.
 _TILES = (
     ("frames", "frames", "{:,}"),
-    ("frames a second", "fps", "{:.1f}"),
+    ("frames per second", "fps", "{:.1f}"),
     ("ATE RMSE", "ate_rmse_cm", "{:.2f} cm"),
     ("F1 at 5 cm", "f1_5cm", "{:.1f} %"),
     ("lost frames", "lost_frames", "{}"),
-    ("tracking, a frame", "tracking_fps", "{:.0f} /s"),
+    ("tracking", "tracking_fps", "{:.0f} frames/s"),
     ("model", "model_mb", "{:.1f} MB"),
     ("memory", "peak_rss_mb", "{:,.0f} MB"),
 )
 
 
 def write_report(output_dir: str | os.PathLike) -> Path:
-    """Write ``report.html`` of a finished run; returns its path.
+    """Writes `report.html` of a finished run.
 
-    Parameters
-    ----------
-    output_dir : the run's output folder. ``trajectory.txt`` and ``metrics.json`` must be there; ``mesh.ply``,
-        ``log.jsonl``, ``config.yaml`` and ``previews/`` (``camera.json``, ``ground_truth.txt``, ``frame-NNNNNN.png`` and
-        ``depth-NNNNNN.png`` in 16-bit millimeters, numbered by row of the trajectory) add their parts where they are.
+    The page is self-contained: styles and images are embedded, charts are SVG, there is no script.
 
-    The file needs nothing from outside it: styles and pictures are inside, charts are SVG, there is no script.
+    Args:
+        output_dir: output folder of the run. `trajectory.txt` and `metrics.json` are required. `mesh.ply`,
+            `log.jsonl`, `config.yaml` and `previews/` are optional: without one of them its sections are left out.
+            `previews/` has `camera.json`, `ground_truth.txt`, `frame-NNNNNN.png` and `depth-NNNNNN.png` in 16-bit
+            millimeters, numbered by row of the trajectory.
 
-    Raises
-    ------
-    OutputError
-        When the folder is no finished run's, a file in it is damaged, or the report can't be written.
+    Returns:
+        Path of the report.
+
+    Raises:
+        OutputError: the folder is not the output folder of a finished run, a file in it is damaged, or the report
+            cannot be written.
     """
     run = RunOutput.read(Path(output_dir))
     sections = [_header(run), _tiles(run.metrics), *_map_sections(run)]
@@ -105,16 +107,16 @@ def _map_sections(run: RunOutput) -> list[str]:
     sections = [_section("Map", _overview(run, mesh, faces))]
     views = [_view(run, mesh, run.camera, preview) for preview in _spread(previews, VIEWS)]
     if views:
-        note = "Input beside the mesh as seen from the estimated pose"
+        note = "Input images, and the mesh rendered from the estimated poses"
         sections.append(_section("Views", "".join(views), note))
     return sections
 
 
 def _overview(run: RunOutput, mesh: Mesh, faces: np.ndarray) -> str:
-    picture = report_images.render_overview(mesh, faces, run.trajectory.poses)
-    caption = "The mesh from above, walls towards the viewer left out, and the camera's path; "
+    image = report_images.render_overview(mesh, faces, run.trajectory.poses)
+    caption = "The mesh from above, without the walls nearest to the viewer, and the camera trajectory; "
     caption += f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
-    return _figure(picture, 1200, caption, "map")
+    return _figure(image, 1200, caption, "map")
 
 
 def _spread(previews: list[Preview], count: int) -> list[Preview]:
@@ -123,7 +125,7 @@ def _spread(previews: list[Preview], count: int) -> list[Preview]:
 
 
 def _view(run: RunOutput, mesh: Mesh, camera: Camera, preview: Preview) -> str:
-    """A row: input and rendered color, input depth where it was kept, rendered depth."""
+    """A row of images: input and rendered color, input depth if it was kept, rendered depth."""
     pose = run.trajectory.poses[preview.row]
     color, depth = render_mesh(mesh.vertices, mesh.faces, mesh.colors, camera, pose, supersampling=2)
     limits = report_images.depth_limits(depth if preview.depth is None else preview.depth)
@@ -133,7 +135,7 @@ def _view(run: RunOutput, mesh: Mesh, camera: Camera, preview: Preview) -> str:
     ]
     if preview.depth is not None:
         images.append(_figure(report_images.colorize_depth(preview.depth, *limits), 480, "input depth"))
-    scale = f"mesh depth, {limits[0]:.1f} m yellow to {limits[1]:.1f} m violet"
+    scale = f"mesh depth, yellow {limits[0]:.1f} m to violet {limits[1]:.1f} m"
     images.append(_figure(report_images.colorize_depth(depth, *limits), 480, scale))
     return f'<div class="row">{"".join(images)}</div>'
 
@@ -142,13 +144,13 @@ def _trajectory(run: RunOutput) -> str:
     if not len(run.trajectory):
         return ""
     estimate, ground_truth = _aligned_positions(run)
-    # Drawn in the estimate's axes as seen from above; with truth the two share them after alignment.
+    # Top view in the world frame of the estimate, to which the ground truth is aligned.
     axes = report_images.top_axes(run.trajectory.poses)
     origin = estimate[0]
-    plan_ground_truth = None if ground_truth is None else (ground_truth - origin) @ axes
-    chart = charts.trajectory_chart((estimate - origin) @ axes, plan_ground_truth, run.trajectory.lost)
+    top_ground_truth = None if ground_truth is None else (ground_truth - origin) @ axes
+    chart = charts.trajectory_chart((estimate - origin) @ axes, top_ground_truth, run.trajectory.lost)
     length = np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum()
-    return _section("Trajectory", chart, f"seen from above; {length:.2f} m long")
+    return _section("Trajectory", chart, f"top view; {length:.2f} m long")
 
 
 def _errors(run: RunOutput) -> str:
@@ -162,7 +164,9 @@ def _errors(run: RunOutput) -> str:
     series = [charts.Series(name, name[0], column) for name, column in zip(_AXES, difference.T, strict=True)]
     series.append(charts.Series("distance", "total", np.linalg.norm(difference, axis=1)))
     chart = charts.line_chart(series, "cm", run.trajectory.lost)
-    return _section("Error over time", chart, "position after rigid alignment, along the first camera's axes")
+    return _section(
+        "Error over time", chart, "position error after rigid alignment, along the axes of the first camera"
+    )
 
 
 _AXES = ("right", "forward", "up")
@@ -174,7 +178,7 @@ def _up(run: RunOutput) -> np.ndarray:
 
 
 def _aligned_positions(run: RunOutput) -> tuple[np.ndarray, np.ndarray | None]:
-    """Estimated positions [F,3], and the true ones carried into the estimate's world; None if none is known."""
+    """Estimated positions [F, 3], and ground-truth positions aligned with them; None without ground truth."""
     estimate = run.trajectory.poses[:, :3, 3]
     if run.ground_truth is None or run.known_ground_truth is None:
         return estimate, None
@@ -193,7 +197,7 @@ def _time(run: RunOutput) -> str:
             ("tracking", "tracking", float(np.nansum(tracking))),
             ("encoding and fusion", "encoding", float(np.nansum(encoding))),
             ("mapping", "mapping", float(np.nansum(mapping))),
-            ("reading and the rest", "rest", rest),
+            ("reading and other work", "rest", rest),
             ("mesh", "mesh", float(run.metrics.get("mesh_s", 0.0))),
         ],
         "s",
@@ -201,15 +205,17 @@ def _time(run: RunOutput) -> str:
     mapped = encoding + mapping
     mapped[mapped == 0] = np.nan
     tracking[tracking == 0] = np.nan
-    # The first frame's long mapping would flatten the rest.
+    # The first frame is mapped much longer, and would set the scale of the chart.
     mapped[0] = np.nan
     series = [
-        charts.Series("tracking, each frame", "tracking", 1000 * tracking),
-        charts.Series("mapping, where a frame is mapped", "mapping", 1000 * mapped, dots=True),
+        charts.Series("tracking, per frame", "tracking", 1000 * tracking),
+        charts.Series("mapping, per mapped frame", "mapping", 1000 * mapped, dots=True),
     ]
-    note = f"images are decoded ahead on other threads, {run.metrics.get('decode_ms', 0):.1f} ms a frame"
+    note = f"images are decoded ahead on other threads, {run.metrics.get('decode_ms', 0):.1f} ms/frame"
     first = (
-        f"first mapping {run.metrics['first_mapping_s']:.2f} s, not drawn; " if "first_mapping_s" in run.metrics else ""
+        f"the first mapping took {run.metrics['first_mapping_s']:.2f} s and is not shown; "
+        if "first_mapping_s" in run.metrics
+        else ""
     )
     return _section("Time", bar + charts.line_chart(series, "ms", run.trajectory.lost), first + note)
 
@@ -219,9 +225,9 @@ def _tracking(run: RunOutput) -> str:
     if not np.isfinite(residual).any():
         return ""
     lost = run.trajectory.lost if len(run.trajectory) == len(residual) else None
-    body = charts.line_chart([charts.Series("distance from the map", "tracking", residual)], "cm", lost)
+    body = charts.line_chart([charts.Series("residual", "tracking", residual)], "cm", lost)
     body += charts.line_chart([charts.Series("pixels on mapped surface", "encoding", inlier_share)], "%", lost)
-    return _section("Tracking", body, "how far each frame's depth is from the map, and how much of it is mapped")
+    return _section("Tracking", body, "mean distance between the depth image and the map, and how much of it is mapped")
 
 
 def _column(run: RunOutput, key: str) -> np.ndarray:
@@ -229,7 +235,7 @@ def _column(run: RunOutput, key: str) -> np.ndarray:
     return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
-# Columns of the paper's Table I: title, keys of metrics.json, form.
+# Columns of the paper's Table I: title, keys in metrics.json, format.
 _PAPER_COLUMNS = (
     ("Comp. (%)", ("completeness_5cm",), "{:.2f}"),
     ("Accu. (%)", ("accuracy_5cm",), "{:.2f}"),
@@ -253,13 +259,13 @@ def _paper_table(metrics: dict[str, Any]) -> str:
         return ""
     heads = "".join(f"<th>{html.escape(title)}</th>" for title, _ in known)
     cells = "".join(f"<td>{text}</td>" for _, text in known)
-    note = "the columns of SP-SLAM's Table I; surface at 5 cm, time an iteration times iterations, model as parameters"
+    note = "the columns of SP-SLAM's Table I: surface at 5 cm, time per iteration × iterations, size of the parameters"
     return _section("As in the paper", f"<table><tr>{heads}</tr><tr>{cells}</tr></table>", note)
 
 
 def _figures(metrics: dict[str, Any]) -> str:
     rows = "".join(f"<tr><th>{html.escape(key)}</th><td>{_format(value)}</td></tr>" for key, value in metrics.items())
-    return _section("All figures", f"<table>{rows}</table>", "as in metrics.json")
+    return _section("All metrics", f"<table>{rows}</table>", "as in metrics.json")
 
 
 def _format(value: Any) -> str:

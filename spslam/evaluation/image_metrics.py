@@ -1,23 +1,33 @@
-"""Rendered color images against true ones."""
+"""PSNR and SSIM: rendered color images against input images."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-# Wang et al. 2004: a Gaussian window of 1.5 px, cut at 5 px, and two constants against division by 0.
+# Wang et al. 2004: a Gaussian window with a standard deviation of 1.5 px and a radius of 5 px; C1 and C2 avoid a
+# division by 0.
 _SIGMA_PX, _RADIUS_PX = 1.5, 5
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
 def psnr_db(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of uint8 images [H,W,3], over the pixels of a mask [H,W] if given.
+    """Peak signal-to-noise ratio in dB, `10 log10(255^2 / MSE)`.
 
-    ``10 log10(255^2 / MSE)``; infinite for equal images, NaN for an empty mask.
+    Args:
+        rendered: uint8 [H, W, 3].
+        reference: uint8 [H, W, 3].
+        mask: bool [H, W], pixels to compare; all by default.
+
+    Returns:
+        Infinity for equal images, NaN for an empty mask.
+
+    Raises:
+        ValueError: images of different shapes.
     """
     if rendered.shape != reference.shape:
         raise ValueError(
-            f"psnr_db: rendered and reference must have one shape, got {rendered.shape} and {reference.shape}"
+            f"psnr_db: rendered and reference must have the same shape, got {rendered.shape} and {reference.shape}"
         )
     squared = (rendered.astype(np.float64) - reference) ** 2
     if mask is not None:
@@ -29,15 +39,26 @@ def psnr_db(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray | None
 
 
 def ssim(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) of uint8 images [H,W,3]: the mean over pixels and channels, at most 1.
+    """Structural similarity (Wang et al. 2004), averaged over pixels and channels.
 
-    ``(2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sx^2 + sy^2 + C2))`` with means, variances and covariance under a
-    Gaussian window of 1.5 px, cut at 5 px. Only pixels whose whole window lies in the image, and in the mask [H,W] if
-    given, count; NaN if there is none.
+    `(2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sx^2 + sy^2 + C2))` with means, variances and covariance under a
+    Gaussian window with a standard deviation of 1.5 px and a radius of 5 px. Only pixels whose whole window lies in the
+    image, and in the mask, are used.
+
+    Args:
+        rendered: uint8 [H, W, 3].
+        reference: uint8 [H, W, 3].
+        mask: bool [H, W], pixels to compare; all by default.
+
+    Returns:
+        At most 1; NaN without a pixel to compare.
+
+    Raises:
+        ValueError: images of different shapes.
     """
     if rendered.shape != reference.shape:
         raise ValueError(
-            f"ssim: rendered and reference must have one shape, got {rendered.shape} and {reference.shape}"
+            f"ssim: rendered and reference must have the same shape, got {rendered.shape} and {reference.shape}"
         )
     allowed = np.ones(rendered.shape[:2], dtype=np.uint8) if mask is None else mask.astype(np.uint8)
     window = np.ones((2 * _RADIUS_PX + 1, 2 * _RADIUS_PX + 1), dtype=np.uint8)

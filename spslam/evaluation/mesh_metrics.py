@@ -1,14 +1,14 @@
-"""How well a reconstructed surface matches the true one, where the camera saw it.
+"""Accuracy, completeness and F1 of a reconstructed surface, on the part of the surface that was observed.
 
-The protocol: points are spread evenly over both surfaces (100,000 each, as in the paper), points that no frame could
-observe are removed from both, and each remaining point's distance to the other surface is taken. A point is observed
-if, in some frame, it projects into the image onto a pixel with measured depth and isn't behind that depth by more than
-a tolerance. This removes surface outside every view (frustum culling) and hidden surface (occlusion culling) alike,
-without asking for faces or normals; a pixel without depth shows nothing.
+Protocol: points are sampled uniformly on both surfaces (100,000 each, as in the paper), points that no frame observed
+are removed from both, and the distance of each remaining point to the other surface is measured. A point is observed
+if, in some frame, it projects onto a pixel with measured depth and is not behind that depth by more than a tolerance.
+This removes both surface outside all views (frustum culling) and occluded surface (occlusion culling), and needs
+neither faces nor normals. A pixel without depth observes nothing.
 
-The paper takes the distance to the nearest of the other surface's 100,000 points. In a room of 70 m2 those lie 2.6 cm
-apart, which at 5 cm doesn't matter (0.02 %) but lets a perfect reconstruction reach an F1 of only 36 % at 1 cm. So the
-distance here is that to the surface itself.
+The paper measures the distance to the nearest of the 100,000 points of the other surface. In a room of 70 m^2 these
+points are 2.6 cm apart. This makes no difference at 5 cm (0.02 %), but at 1 cm even a perfect reconstruction reaches an
+F1 of only 36 %. So the distance here is the distance to the surface itself.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from spslam.geometry import inverse
 
 SAMPLES = 100_000
 THRESHOLDS_CM = (5, 1)
-# A reconstructed point up to this far behind the measured surface is an error to count, not hidden surface.
+# A reconstructed point up to this far behind the measured surface is an error to count, not occluded surface.
 CULLING_TOLERANCE_M = 0.05
 _SAMPLING_ROUNDS = 8
 
@@ -35,19 +35,21 @@ def observed_mask(
     camera: Camera,
     tolerance_m: float = CULLING_TOLERANCE_M,
 ) -> np.ndarray:
-    """Which points some frame could observe.
+    """Tests which points were observed by at least one frame.
 
-    Parameters
-    ----------
-    points : [N,3], world, meters.
-    depths : depth images [H,W] in meters, 0 where unknown; read one at a time, so a generator over a dataset serves.
-    poses : ``T_world_camera`` [F,4,4] of those images; a frame with a non-finite one is left out.
-    camera : of the depth images.
-    tolerance_m : how far behind the measured depth (along the optical axis) a point still counts.
+    Args:
+        points: [N, 3], world, meters.
+        depths: depth images [H, W] in meters, 0 where unknown; read one at a time, so this may be a generator over a
+            dataset.
+        poses: `T_world_camera` [F, 4, 4] of the depth images; a frame with a non-finite pose is skipped.
+        camera: intrinsics of the depth images.
+        tolerance_m: largest distance behind the measured depth, along the optical axis, of an observed point.
 
-    Returns
-    -------
-    bool [N]. Pixels are looked up by rounding. Deterministic; doesn't depend on the order of the frames.
+    Returns:
+        bool [N]. Points are rounded to the nearest pixel. Deterministic; does not depend on the order of the frames.
+
+    Raises:
+        ValueError: points or depth images of another shape.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -59,25 +61,23 @@ def observed_mask(
                 f"observed_mask: depths must have shape {(camera.height, camera.width)}, got {depth.shape}"
             )
         if np.isfinite(pose).all():
-            open_points = np.flatnonzero(~observed)
-            observed[open_points] = _seen(points[open_points], depth, pose, camera, tolerance_m)
+            remaining = np.flatnonzero(~observed)
+            observed[remaining] = _observed_by(points[remaining], depth, pose, camera, tolerance_m)
     return observed
 
 
 def observed_samples(
     surface: Surface, observed: Callable[[np.ndarray], np.ndarray], count: int = SAMPLES
 ) -> np.ndarray:
-    """Points of a surface that are observed, as many as asked for unless hardly any of the surface is.
+    """Samples points on the observed part of a surface.
 
-    Parameters
-    ----------
-    surface : to draw from.
-    observed : gives the mask [n] of points [n,3], as :func:`observed_mask` with its frames bound.
-    count : number of points.
+    Args:
+        surface: surface to sample.
+        observed: maps points [n, 3] to a mask [n], as `observed_mask` with its frames bound.
+        count: number of points.
 
-    Returns
-    -------
-    float64 [M,3], M <= count. Deterministic.
+    Returns:
+        float64 [M, 3], M <= count; fewer than `count` only if very little of the surface is observed. Deterministic.
     """
     kept: list[np.ndarray] = [np.zeros((0, 3))]
     missing = count
@@ -96,13 +96,16 @@ def evaluate_surface(
     observed: Callable[[np.ndarray], np.ndarray],
     count: int = SAMPLES,
 ) -> dict[str, float]:
-    """The metrics of :func:`surface_metrics` by the whole protocol: sample, remove the unobserved, measure.
+    """Runs the whole protocol: sample both surfaces, remove unobserved points, measure distances.
 
-    Parameters
-    ----------
-    reconstructed, reference : surfaces in one world frame.
-    observed : gives the mask [n] of points [n,3], as :func:`observed_mask` with its frames bound.
-    count : points compared, each way.
+    Args:
+        reconstructed: reconstructed surface.
+        reference: ground-truth surface in the same world frame.
+        observed: maps points [n, 3] to a mask [n], as `observed_mask` with its frames bound.
+        count: number of points on each surface.
+
+    Returns:
+        See `surface_metrics`.
     """
     accuracy = reference.distance(observed_samples(reconstructed, observed, count))
     completeness = reconstructed.distance(observed_samples(reference, observed, count))
@@ -112,19 +115,15 @@ def evaluate_surface(
 def surface_metrics(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str, float]:
     """Accuracy, completeness and F1 from distances in meters.
 
-    Parameters
-    ----------
-    accuracy : distances [N] of reconstructed points to the true surface.
-    completeness : distances [M] of true points to the reconstructed surface.
+    Args:
+        accuracy: distances [N] of reconstructed points to the ground-truth surface.
+        completeness: distances [M] of ground-truth points to the reconstructed surface.
 
-    Returns
-    -------
-    ``accuracy_cm``, ``completeness_cm`` : the means.
-    ``accuracy_5cm``, ``completeness_5cm``, ``accuracy_1cm``, ``completeness_1cm`` : percent below 5 and 1 cm.
-    ``f1_5cm``, ``f1_1cm`` : their harmonic mean, percent.
-
-    A side without points, or without a surface to measure to, has nothing right: its percentages are 0 and its mean is
-    left out.
+    Returns:
+        `accuracy_cm`, `completeness_cm`: mean distances.
+        `accuracy_5cm`, `completeness_5cm`, `accuracy_1cm`, `completeness_1cm`: percentage below 5 and 1 cm.
+        `f1_5cm`, `f1_1cm`: harmonic means of the two percentages.
+        Without points, or without a surface to measure to, the percentage is 0 and the mean is left out.
     """
     sides = {"accuracy": np.asarray(accuracy), "completeness": np.asarray(completeness)}
     metrics = {
@@ -133,12 +132,12 @@ def surface_metrics(accuracy: np.ndarray, completeness: np.ndarray) -> dict[str,
         if distances.size and np.isfinite(distances).all()
     }
     for threshold in THRESHOLDS_CM:
-        right = {
+        shares = {
             name: 100 * float(np.mean(distances < threshold / 100)) if distances.size else 0.0
             for name, distances in sides.items()
         }
-        metrics |= {f"{name}_{threshold}cm": percent for name, percent in right.items()}
-        metrics[f"f1_{threshold}cm"] = _harmonic_mean(*right.values())
+        metrics |= {f"{name}_{threshold}cm": percent for name, percent in shares.items()}
+        metrics[f"f1_{threshold}cm"] = _harmonic_mean(*shares.values())
     return metrics
 
 
@@ -146,13 +145,16 @@ def _harmonic_mean(a: float, b: float) -> float:
     return 2 * a * b / (a + b) if a + b else 0.0
 
 
-def _seen(points: np.ndarray, depth: np.ndarray, pose: np.ndarray, camera: Camera, tolerance_m: float) -> np.ndarray:
+def _observed_by(
+    points: np.ndarray, depth: np.ndarray, pose: np.ndarray, camera: Camera, tolerance_m: float
+) -> np.ndarray:
+    """Bool [N]: whether one frame observes each point."""
     world_to_camera = inverse(pose)
     x, y, z = world_to_camera[:3, :3] @ points.T + world_to_camera[:3, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
         columns, rows = np.floor(x / z * camera.fx + (camera.cx + 0.5)), np.floor(y / z * camera.fy + (camera.cy + 0.5))
     inside = np.flatnonzero((z > 0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height))
     measured = depth[rows[inside].astype(np.int64), columns[inside].astype(np.int64)]
-    seen = np.zeros(len(points), dtype=bool)
-    seen[inside] = (measured > 0) & (z[inside] <= measured + tolerance_m)
-    return seen
+    observed = np.zeros(len(points), dtype=bool)
+    observed[inside] = (measured > 0) & (z[inside] <= measured + tolerance_m)
+    return observed

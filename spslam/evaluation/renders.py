@@ -1,4 +1,4 @@
-"""A run's map as pictures: what its own cameras should have seen, and depth from where no camera stood."""
+"""Renders the map of a run: color images at the poses of its frames, and depth from novel views."""
 
 from __future__ import annotations
 
@@ -14,28 +14,27 @@ from spslam.geometry import interpolate_pose, inverse, transform_points
 from spslam.meshing.render import rasterize
 from spslam.scene import Scene
 
-# Novel views: between two views of the sequence, moved and turned about by these standard deviations.
+# Novel views lie between two views of the sequence, perturbed with these standard deviations (m, rad).
 _MOVED_M, _TURNED = 0.1, np.radians(10)
-# A place is free if some frame looked at least this far past it.
+# A position is in free space if some frame measured a depth at least this far behind it.
 _CLEARANCE_M = 0.1
-_CANDIDATES_A_VIEW = 20
-# Of a novel view this share of the pixels must show surface that was observed.
+_CANDIDATES_PER_VIEW = 20
+# Smallest share of the pixels of a novel view that show observed surface.
 _MIN_OBSERVED = 0.5
 
 
 def render_view(scene: Scene, mesh: Mesh, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A map's picture: the mesh says which surface a pixel shows, the map which color it has there.
+    """Renders a map: the visible surface is that of the mesh, its color that of the map.
 
-    Parameters
-    ----------
-    scene : the map.
-    mesh : its surface, in the map's world.
-    camera : whose view it is.
-    T_world_camera : [4,4].
+    Args:
+        scene: the map.
+        mesh: mesh of the map, in the same world frame.
+        camera: intrinsics of the view.
+        T_world_camera: [4, 4], pose of the view.
 
-    Returns
-    -------
-    uint8 [H,W,3] RGB, black where there is no surface, and float32 [H,W] depth in meters, 0 there. Deterministic.
+    Returns:
+        uint8 [H, W, 3] RGB, black where there is no surface, and float32 [H, W] depth in meters, 0 there.
+        Deterministic.
     """
     depth = rasterize(mesh.vertices, mesh.faces, camera, T_world_camera).depth
     shown = depth > 0
@@ -49,21 +48,23 @@ def render_view(scene: Scene, mesh: Mesh, camera: Camera, T_world_camera: np.nda
 def novel_poses(
     poses: np.ndarray, depths: Sequence[np.ndarray], camera: Camera, count: int, seed: int = 0
 ) -> Iterator[np.ndarray]:
-    """Poses in free space from which no frame was taken.
+    """Generates poses in free space that are not poses of the sequence.
 
-    Each lies between two random views of the sequence, moved by some 10 cm and turned by some 10 degrees about a
-    random axis, at a place that a frame looked through.
+    Each is interpolated between two random views of the sequence, then perturbed by some 10 cm and some 10 degrees
+    about a random axis. It is kept if some frame observed that the position is free.
 
-    Parameters
-    ----------
-    poses : [F,4,4] ``T_world_camera``, finite.
-    depths : depth images [H,W] of the same frames, meters, 0 where unknown.
-    camera : of the depth images.
-    count : 20 times as many candidates are tried; those in free space are given.
-    seed : the same seed gives the same poses.
+    Args:
+        poses: [F, 4, 4] `T_world_camera`, finite.
+        depths: depth images [H, W] of the same frames, meters, 0 where unknown.
+        camera: intrinsics of the depth images.
+        count: 20 times as many candidates are tested.
+        seed: the same seed gives the same poses.
+
+    Yields:
+        `T_world_camera` [4, 4] of the candidates in free space.
     """
     generator = np.random.default_rng(seed)
-    for _ in range(_CANDIDATES_A_VIEW * count if len(poses) else 0):
+    for _ in range(_CANDIDATES_PER_VIEW * count if len(poses) else 0):
         first, second = generator.integers(len(poses), size=2)
         share = generator.uniform(0.2, 0.8)
         moved, turned = generator.normal(scale=_MOVED_M, size=3), generator.normal(scale=_TURNED, size=3)
@@ -82,36 +83,35 @@ def novel_depth(
     observed: Callable[[np.ndarray], np.ndarray],
     count: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Depth images of a reconstructed and of the true surface, for :func:`spslam.evaluation.depth_metrics.depth_l1`.
+    """Renders depth of a reconstructed and of the ground-truth mesh, for `spslam.evaluation.depth_metrics.depth_l1`.
 
-    Parameters
-    ----------
-    estimated, reference : vertices [V,3] and faces [L,3], in one world.
-    poses : of the views; ones that show less than half a picture of observed surface are passed over.
-    camera : of the views.
-    observed : gives the mask [n] of points [n,3]; true depth of points outside it is 0 in what is returned.
-    count : most views.
+    Args:
+        estimated: vertices [V, 3] and faces [L, 3] of the reconstruction.
+        reference: vertices and faces of the ground truth, in the same world frame.
+        poses: of the views; a view is skipped if observed surface covers less than half of the image.
+        camera: intrinsics of the views.
+        observed: maps points [n, 3] to a mask [n]; the ground-truth depth of unobserved points is set to 0.
+        count: largest number of views.
 
-    Returns
-    -------
-    Pairs (estimated, reference) of float32 [H,W], meters.
+    Yields:
+        Pairs (estimated, reference) of float32 [H, W], meters.
     """
     for pose in poses:
         if count == 0:
             return
-        true_depth = rasterize(*reference, camera, pose).depth
-        points = transform_points(pose, camera.unproject(true_depth).reshape(-1, 3))
-        shown = np.flatnonzero(true_depth)
-        hidden = shown[~observed(points[shown])]
-        true_depth.reshape(-1)[hidden] = 0
-        if np.mean(true_depth > 0) < _MIN_OBSERVED:
+        reference_depth = rasterize(*reference, camera, pose).depth
+        points = transform_points(pose, camera.unproject(reference_depth).reshape(-1, 3))
+        shown = np.flatnonzero(reference_depth)
+        unobserved = shown[~observed(points[shown])]
+        reference_depth.reshape(-1)[unobserved] = 0
+        if np.mean(reference_depth > 0) < _MIN_OBSERVED:
             continue
-        yield rasterize(*estimated, camera, pose).depth, true_depth
+        yield rasterize(*estimated, camera, pose).depth, reference_depth
         count -= 1
 
 
-def _is_free(place: np.ndarray, poses: np.ndarray, depths: Sequence[np.ndarray], camera: Camera) -> bool:
-    seen_from = np.stack([inverse(pose)[:3] @ np.append(place, 1) for pose in poses])
+def _is_free(position: np.ndarray, poses: np.ndarray, depths: Sequence[np.ndarray], camera: Camera) -> bool:
+    seen_from = np.stack([inverse(pose)[:3] @ np.append(position, 1) for pose in poses])
     pixels = camera.project(seen_from)
     for (u, v), (_, _, z), depth in zip(pixels, seen_from, depths, strict=True):
         if not (-0.5 <= u < camera.width - 0.5 and -0.5 <= v < camera.height - 0.5):  # NaN behind the camera

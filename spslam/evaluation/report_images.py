@@ -1,4 +1,4 @@
-"""Pictures for the report: the mesh from input views and from above, depth in colors."""
+"""Images of the report: the mesh from above with the trajectory, and depth in color."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from spslam.meshing.render import rasterize, render_mesh
 
 _ELEVATION = np.radians(48)
 _OVERVIEW = Camera(1200, 750, 1350.0, 1350.0, 599.5, 374.5)
-_PATH_COLOR = (220, 38, 38)
+_TRAJECTORY_COLOR = (220, 38, 38)
 
 
 def png_uri(image: np.ndarray, max_width: int = 480) -> str:
-    """A PNG as data URI; images [H,W,3] RGB wider than ``max_width`` are reduced to it."""
+    """Encodes an RGB image [H, W, 3] as a PNG data URI; images wider than `max_width` px are downscaled to it."""
     height, width = image.shape[:2]
     if width > max_width:
         image = cv2.resize(image, (max_width, round(height * max_width / width)), interpolation=cv2.INTER_AREA)
@@ -27,35 +27,38 @@ def png_uri(image: np.ndarray, max_width: int = 480) -> str:
 
 
 def colorize_depth(depth: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
-    """Depth [H,W] in colors from near (yellow) to far (violet), uint8 RGB; white where there is none."""
+    """Colors depth [H, W] from near (yellow) to far (violet), uint8 RGB [H, W, 3]; white where there is none."""
     share = np.clip((depth - near_m) / max(far_m - near_m, 1e-6), 0, 1)
-    picture = cv2.applyColorMap((255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
-    picture[depth <= 0] = 255
-    return picture
+    image = cv2.applyColorMap((255 * (1 - share)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
+    image[depth <= 0] = 255
+    return image
 
 
 def depth_limits(*depths: np.ndarray) -> tuple[float, float]:
-    """Percentiles 2 and 98 of the known depths."""
+    """The 2nd and 98th percentile of the known depths; (0, 1) without any."""
     known = np.concatenate([depth[depth > 0] for depth in depths])
     return tuple(np.percentile(known, (2, 98))) if len(known) else (0.0, 1.0)  # type: ignore[return-value]
 
 
 def outward_faces(mesh: Mesh, camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """The mesh's faces, turned all together so that those the camera saw show it their front."""
+    """The faces of a mesh, all flipped if most faces that the camera sees show it their back."""
     small = camera.resized(camera.width // 2, camera.height // 2)
     front = rasterize(mesh.vertices, mesh.faces, small, pose, cull_back=True).face_ids >= 0
     any_side = rasterize(mesh.vertices, mesh.faces, small, pose).face_ids >= 0
-    turned = rasterize(mesh.vertices, mesh.faces[:, ::-1], small, pose, cull_back=True).face_ids >= 0
-    return mesh.faces if (front & any_side).sum() >= (turned & any_side).sum() else mesh.faces[:, ::-1]
+    flipped = rasterize(mesh.vertices, mesh.faces[:, ::-1], small, pose, cull_back=True).face_ids >= 0
+    return mesh.faces if (front & any_side).sum() >= (flipped & any_side).sum() else mesh.faces[:, ::-1]
 
 
 def render_overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """The mesh from above with near walls left out, and the camera's path: uint8 [H,W,3].
+    """Renders the mesh from above, without the walls nearest to the viewer, and the trajectory.
 
-    Parameters
-    ----------
-    mesh, faces : the mesh, its faces with the front towards the space that was seen.
-    poses : [F,4,4] of the path; which way is up is taken from them.
+    Args:
+        mesh: the mesh.
+        faces: its faces, with the front towards the observed space.
+        poses: [F, 4, 4], the trajectory; the up direction is estimated from it.
+
+    Returns:
+        uint8 RGB [H, W, 3], cropped.
     """
     right, up, back = _axes(poses)
     low, high = np.percentile(mesh.vertices, (1, 99), axis=0)
@@ -66,24 +69,24 @@ def render_overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndar
     inside = mesh.vertices[np.all((mesh.vertices >= low) & (mesh.vertices <= high), axis=1)][::7]
     distance = _fitting_distance(np.concatenate([inside, poses[:, :3, 3]]), pose)
     pose[:3, 3] = center + distance * away
-    picture, _ = render_mesh(mesh.vertices, faces, mesh.colors, _OVERVIEW, pose, cull_back=True, supersampling=2)
-    path = _OVERVIEW.project((poses[:, :3, 3] - pose[:3, 3]) @ pose[:3, :3])
-    path = path[np.isfinite(path).all(axis=1)]
-    points = np.rint(16 * np.clip(path, -4000, 4000)).astype(np.int32).reshape(-1, 1, 2)
-    return _cropped(cv2.polylines(picture, [points], False, _PATH_COLOR, 2, cv2.LINE_AA, shift=4))
+    image, _ = render_mesh(mesh.vertices, faces, mesh.colors, _OVERVIEW, pose, cull_back=True, supersampling=2)
+    pixels = _OVERVIEW.project((poses[:, :3, 3] - pose[:3, 3]) @ pose[:3, :3])
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    points = np.rint(16 * np.clip(pixels, -4000, 4000)).astype(np.int32).reshape(-1, 1, 2)
+    return _cropped(cv2.polylines(image, [points], False, _TRAJECTORY_COLOR, 2, cv2.LINE_AA, shift=4))
 
 
 def top_axes(poses: np.ndarray) -> np.ndarray:
-    """[3,2]: two horizontal axes, right and forward as the first camera stands, for a plan seen from above."""
+    """[3, 2]: two horizontal axes, right and forward of the first camera, for a top view."""
     right, _, back = _axes(poses)
     return np.stack([right, -back], axis=1)
 
 
 def _axes(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right, up and backward, unit and orthogonal; up is where the cameras' upper edges point on average."""
+    """Right, up and backward, orthonormal; up is the mean up direction (negative y axis) of the cameras."""
     up = -poses[:, :3, 1].mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else -poses[0, :3, 1]
-    # A camera that looks straight down has its forward axis in the image's y.
+    # Where the first camera looks straight up or down, its own right axis is used.
     right = np.cross(poses[0, :3, 2], up)
     if np.linalg.norm(right) < 1e-3:
         right = poses[0, :3, 0] - (poses[0, :3, 0] @ up) * up
@@ -91,17 +94,17 @@ def _axes(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return right, up, np.cross(right, up)
 
 
-def _cropped(picture: np.ndarray, margin: int = 20) -> np.ndarray:
-    """Without the empty border but for a margin."""
-    rows, columns = (np.flatnonzero((picture != 255).any(axis=(axis, 2))) for axis in (1, 0))
+def _cropped(image: np.ndarray, margin: int = 20) -> np.ndarray:
+    """The image without its white border, except for a margin in px."""
+    rows, columns = (np.flatnonzero((image != 255).any(axis=(axis, 2))) for axis in (1, 0))
     if not len(rows):
-        return picture
+        return image
     top, left = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
-    return np.ascontiguousarray(picture[top : rows[-1] + margin, left : columns[-1] + margin])
+    return np.ascontiguousarray(image[top : rows[-1] + margin, left : columns[-1] + margin])
 
 
 def _fitting_distance(points: np.ndarray, pose: np.ndarray) -> float:
-    """How far back from ``pose`` the overview's camera must stand to hold all points [N,3] in view."""
+    """How far to move the overview camera backward from `pose` so that all points [N, 3] are in view, in meters."""
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     half_width, half_height = 0.46 * _OVERVIEW.width / _OVERVIEW.fx, 0.46 * _OVERVIEW.height / _OVERVIEW.fy
     return float(max((np.abs(x) / half_width - z).max(), (np.abs(y) / half_height - z).max(), 0.1))

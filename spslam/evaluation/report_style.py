@@ -1,10 +1,9 @@
-"""The report's style sheet: one for light and dark screens and for paper."""
+"""The style sheet of the report, for light and dark screens and for print."""
 
 STYLE = """
 :root { --ink: #1b1f24; --faint: #667080; --line: #dfe3e8; --page: #ffffff; --card: #f5f7f9;
   --estimate: #1f6feb; --ground-truth: #9aa3ad; --lost: #d1242f; --tracking: #1f6feb; --encoding: #1a9988;
-  --mapping: #e0822d;
-  --rest: #aab2bd; --mesh: #8957c9; --r: #d1495b; --f: #2a8c6a; --u: #7a5bc4; --total: #1b1f24; }
+  --mapping: #e0822d; --rest: #aab2bd; --mesh: #8957c9; --r: #d1495b; --f: #2a8c6a; --u: #7a5bc4; --total: #1b1f24; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e4e8ed; --faint: #97a1ad; --line: #333b45; --page: #14181d;
   --card: #1d232a; --ground-truth: #7d8793; --total: #e4e8ed; } }
 * { box-sizing: border-box; }

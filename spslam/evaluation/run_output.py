@@ -1,4 +1,4 @@
-"""Reading back what a run left in its output folder."""
+"""Reads the files in the output folder of a run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,19 @@ from spslam.errors import OutputError
 from spslam.run_folder import RunFolder
 from spslam.trajectory import Trajectory
 
-# Files keep a microsecond.
+# Timestamps in files have a resolution of 1 microsecond.
 _SAME_TIME_S = 2e-6
 
 
 @dataclass(frozen=True)
 class Preview:
-    """An input frame kept as pictures: its row in the trajectory, uint8 [H, W, 3] RGB, float32 [H, W] meters or None."""
+    """A saved input frame.
+
+    Attributes:
+        row: its row in the trajectory.
+        color: uint8 [H, W, 3] RGB.
+        depth: float32 [H, W], meters, or None.
+    """
 
     row: int
     color: np.ndarray
@@ -31,7 +37,13 @@ class Preview:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices [V, 3] in meters, faces [L, 3], colors uint8 [V, 3]."""
+    """A mesh as read from a file.
+
+    Attributes:
+        vertices: [V, 3], meters.
+        faces: [L, 3].
+        colors: uint8 [V, 3] RGB.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -40,17 +52,16 @@ class Mesh:
 
 @dataclass(frozen=True)
 class RunOutput:
-    """A finished run's files.
+    """The output of a finished run.
 
-    Attributes
-    ----------
-    folder : their paths.
-    trajectory : estimated, F frames.
-    truth : float64 [F, 4, 4] true poses of the same frames, NaN where unknown; None if none is known.
-    metrics : what metrics.json holds.
-    log : one entry a frame, as in log.jsonl.
-    config : text of config.yaml.
-    camera : None where the run kept no previews.
+    Attributes:
+        folder: paths of its files.
+        trajectory: estimated trajectory, F frames.
+        ground_truth: float64 [F, 4, 4] ground-truth poses of the same frames, NaN where unknown; None without any.
+        metrics: content of metrics.json.
+        log: one entry per frame, as in log.jsonl.
+        config: text of config.yaml.
+        camera: intrinsics; None if the run saved no previews.
     """
 
     folder: RunFolder
@@ -63,12 +74,10 @@ class RunOutput:
 
     @classmethod
     def read(cls, path: Path) -> RunOutput:
-        """Read a run's small files; trajectory.txt and metrics.json must be there.
+        """Reads an output folder, except its mesh and previews; trajectory.txt and metrics.json must exist.
 
-        Raises
-        ------
-        OutputError
-            When the folder is no finished run's, or a file in it is damaged.
+        Raises:
+            OutputError: the folder is not the output folder of a finished run, or a file in it is damaged.
         """
         folder = RunFolder(path)
         for required in (folder.trajectory, folder.metrics):
@@ -87,11 +96,11 @@ class RunOutput:
 
     @property
     def known_ground_truth(self) -> np.ndarray | None:
-        """The true poses [F, 4, 4] of the frames whose pose the run knew, NaN for the others; None if none is known."""
+        """Ground-truth poses [F, 4, 4], NaN for lost frames and where unknown; None without any."""
         return None if self.ground_truth is None else self.trajectory.mask_lost(self.ground_truth)
 
     def previews(self) -> list[Preview]:
-        """The kept input frames, by row; ones that can't be read, or whose pose isn't known, are left out."""
+        """The saved input frames in order; unreadable ones and lost frames are left out."""
         found = (_read_preview(self.folder, row) for row in self.folder.preview_rows() if self._is_known(row))
         return [preview for preview in found if preview is not None]
 
@@ -99,13 +108,17 @@ class RunOutput:
         return row < len(self.trajectory) and not self.trajectory.lost[row]
 
     def mesh(self) -> Mesh | None:
-        """mesh.ply; None where there is none or it is empty. Raises OutputError if it can't be read."""
+        """Reads mesh.ply; None if it does not exist or is empty.
+
+        Raises:
+            OutputError: the file cannot be read.
+        """
         path = self.folder.mesh
         if not path.is_file():
             return None
         try:
             mesh = trimesh.load(path, process=False)
-        except Exception as error:  # trimesh raises whatever the parser stumbles over
+        except Exception as error:  # trimesh raises errors of many types
             raise OutputError(f"{path}: can't be read as a mesh: {error}") from error
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             return None
@@ -114,7 +127,15 @@ class RunOutput:
 
 
 def match_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """For each wanted time the index of the same one in `times`, to the microsecond that files keep; -1 if absent."""
+    """Index in `times` of each wanted timestamp, -1 if it is missing; equal up to the resolution of files.
+
+    Args:
+        times: [N], seconds.
+        wanted: [M], seconds.
+
+    Returns:
+        Integers [M].
+    """
     if not len(times):
         return np.full(len(wanted), -1)
     order = np.argsort(times, kind="stable")
@@ -138,7 +159,7 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
     except ValueError as error:
         raise OutputError(f"{path}: must be JSON: {error}") from error
     if not isinstance(value, dict):
-        raise OutputError(f"{path}: must hold a JSON object, got {type(value).__name__}")
+        raise OutputError(f"{path}: must contain a JSON object, got {type(value).__name__}")
     return value
 
 
@@ -149,7 +170,7 @@ def _read_camera(path: Path) -> Camera | None:
     try:
         return Camera(**values)
     except (TypeError, ValueError) as error:
-        raise OutputError(f"{path}: must hold a camera: {error}") from error
+        raise OutputError(f"{path}: must contain a camera: {error}") from error
 
 
 def _read_ground_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""Triangle meshes as surfaces to sample and to measure distances to."""
+"""Surfaces to sample points on and to measure distances to; triangle meshes as such surfaces."""
 
 from __future__ import annotations
 
@@ -12,35 +12,37 @@ from scipy.spatial import cKDTree
 
 from spslam.errors import DatasetError
 
-# Faces are looked up at sites spread over them, about this far apart; no point of a face is farther from its nearest
-# site than 1.1 times that.
+# Nearest faces are found by sites: points spread over each face at about this spacing. No point of a face is farther
+# from its nearest site than 1.1 times the spacing.
 _SITE_SPACING_M = 0.02
 _REACH = 1.1
 _MOST_SITES_ALONG = 512
-# Sites compared at first, and at last where the nearest face isn't settled.
+# Number of nearest sites compared in each round, until the nearest face is certain.
 _SITES_COMPARED = (8, 32, 128)
 
 
 class Surface(Protocol):
-    """What the metrics need of a surface: evenly spread points and distances, in meters."""
+    """Interface of a surface for the metrics; lengths in meters."""
 
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
-        """Points [count,3] spread evenly by area; the same for the same count and seed."""
+        """Points [count, 3] sampled uniformly by area; the same for the same count and seed."""
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] of points [N,3] to the surface; infinite when it is empty."""
+        """Distances [N] of points [N, 3] to the surface; infinite if it is empty."""
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices [V,3] and faces [L,3] to draw it with."""
+        """Vertices [V, 3] and faces [L, 3] to render it with."""
 
 
 class TriangleSurface:
-    """A mesh; the triangles need no order, orientation or connection.
+    """A triangle mesh in any order, orientation and connectivity.
 
-    Parameters
-    ----------
-    vertices : [V,3], meters, finite.
-    faces : [F,3], indices of vertices.
+    Args:
+        vertices: [V, 3], meters, finite.
+        faces: [F, 3], indices of vertices.
+
+    Raises:
+        ValueError: another shape, or an index out of range.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -62,28 +64,32 @@ class TriangleSurface:
 
     @classmethod
     def load(cls, path: Path) -> TriangleSurface:
-        """The mesh in a file (PLY, OBJ, GLB, ...); raises DatasetError if there is none, or none with faces."""
+        """Reads a mesh file (PLY, OBJ, GLB, ...).
+
+        Raises:
+            DatasetError: the file does not exist, cannot be read, or has no faces.
+        """
         import trimesh
 
         if not path.is_file():
             raise DatasetError(f"{path}: no such mesh file")
         try:
             mesh = trimesh.load(path, process=False, force="mesh")
-        except Exception as error:  # trimesh raises whatever the parser stumbles over
+        except Exception as error:  # trimesh raises errors of many types
             raise DatasetError(f"{path}: can't be read as a mesh: {error}") from error
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             raise DatasetError(f"{path}: must be a mesh with faces, got none")
         return cls(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices [V,3] and faces [L,3], those of no area left out."""
+        """Vertices [V, 3] and faces [L, 3], without faces of zero area."""
         return self._vertices, self._faces
 
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
-        """Points spread evenly by area, float64 [count,3]; [0,3] for a mesh without area.
+        """Samples points uniformly by area, float64 [count, 3]; [0, 3] for a mesh without area.
 
-        Faces are chosen by stratified draws along the sum of areas, so that every part gets its share to within one
-        point; the place in a face is uniform. The same input gives the same points.
+        Faces are drawn by stratified sampling of the cumulative area, so that any run of faces gets its share of the
+        points to within one point. Positions in a face are uniform. The same input gives the same points.
         """
         if count == 0 or not len(self._corners):
             return np.zeros((0, 3))
@@ -96,11 +102,11 @@ class TriangleSurface:
         return (1 - root) * a + root * (1 - share) * b + root * share * c
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] in meters of points [N,3] to the nearest triangle; infinite for a mesh without area.
+        """Distances [N] in meters of points [N, 3] to the nearest triangle; infinite for a mesh without area.
 
-        Faces are found by the sites closest to a point, as many as it takes to be sure that no other face is closer,
-        128 at most. So the distance is exact up to about 10 cm from the surface, and farther off at most a few
-        millimeters too long. Deterministic.
+        The nearest sites of a point give the candidate faces: as many sites as needed to be certain that no other face
+        is nearer, at most 128. So the distance is exact up to about 10 cm from the surface; farther away it may be a
+        few millimeters too large. Deterministic.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         distance = np.full(len(points), np.inf)
@@ -115,7 +121,7 @@ class TriangleSurface:
     def _nearest_among(
         self, points: np.ndarray, distance: np.ndarray, first: int, last: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Distances to the faces of the ``first``-th to ``last``-th closest sites, and whether they are settled."""
+        """Updates distances by the faces of the `first`-th to `last`-th nearest sites; returns which are certain."""
         tree, faces, reach = self._sites
         ranks = np.arange(first + 1, min(last, len(faces)) + 1)
         if not len(points) or not len(ranks):
@@ -130,7 +136,7 @@ class TriangleSurface:
 
     @cached_property
     def _sites(self) -> tuple[cKDTree, np.ndarray, float]:
-        """Sites of all faces in a tree, the face of each, and how far a face's points may lie from its sites."""
+        """A k-d tree of all sites, the face of each, and the largest distance of a point of a face to its sites."""
         frames = _BaseFrames.of(self._corners)
         counts = np.ceil(np.stack((frames.base, frames.height), axis=1) / _SITE_SPACING_M)
         counts = np.clip(counts, 1, _MOST_SITES_ALONG).astype(np.int64)
@@ -144,7 +150,7 @@ class TriangleSurface:
 
 
 def triangle_distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Distance [N] of each point [N,3] to its triangle [N,3,3] (corner, coordinate) of an area above 0."""
+    """Distance [N] of each point [N, 3] to its triangle [N, 3, 3] (corner, coordinate), which must have an area > 0."""
     a, b, c = np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -153,16 +159,24 @@ def triangle_distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     for start, end in ((a, b), (b, c), (c, a)):
         edge, offset = end - start, points - start
         along = np.clip(_dot(offset, edge) / _dot(edge, edge), 0, 1)
-        aside = offset - along[:, None] * edge
-        np.minimum(squared, _dot(aside, aside), out=squared)
+        to_edge = offset - along[:, None] * edge
+        np.minimum(squared, _dot(to_edge, to_edge), out=squared)
         inside &= _dot(np.cross(normal, edge), offset) >= 0
     return np.where(inside, np.abs(_dot(points - a, normal)), np.sqrt(squared))
 
 
 @dataclass(frozen=True)
 class _BaseFrames:
-    """Triangles standing on their longest edge: its start and direction [N,3], its length, the upward direction [N,3],
-    the height, and where along the base the top's foot is; lengths [N]."""
+    """Coordinate frames of triangles with the longest edge as base.
+
+    Attributes:
+        start: [N, 3], start of the base.
+        along: [N, 3], unit direction of the base.
+        base: [N], length of the base.
+        up: [N, 3], unit direction of the height.
+        height: [N].
+        foot: [N], position of the foot of the height along the base.
+    """
 
     start: np.ndarray
     along: np.ndarray
@@ -174,22 +188,22 @@ class _BaseFrames:
     @classmethod
     def of(cls, corners: np.ndarray) -> _BaseFrames:
         lengths = np.linalg.norm(np.roll(corners, 1, axis=1) - np.roll(corners, 2, axis=1), axis=2)
-        turned = (lengths.argmax(axis=1)[:, None] + np.arange(3)) % 3
-        top, start, end = np.moveaxis(np.take_along_axis(corners, turned[:, :, None], axis=1), 1, 0)
+        order = (lengths.argmax(axis=1)[:, None] + np.arange(3)) % 3
+        top, start, end = np.moveaxis(np.take_along_axis(corners, order[:, :, None], axis=1), 1, 0)
         base = lengths.max(axis=1)
         along = (end - start) / base[:, None]
-        # A right angle's foot is kept off the base's end, so that both sides of the roof have a slope.
+        # In a right triangle the foot would be an end of the base; it is moved inside, so that no side is vertical.
         foot = np.clip(_dot(top - start, along), 1e-9 * base, (1 - 1e-9) * base)
         rise = top - start - foot[:, None] * along
         height = np.linalg.norm(rise, axis=1)
         return cls(start, along, base, rise / np.maximum(height, 1e-300)[:, None], height, foot)
 
     def sites(self, faces: np.ndarray, columns: int, rows: int) -> np.ndarray:
-        """Points in each of some faces [M], spread over columns along the base and rows up to the roof."""
+        """Sites in given faces [M], on a grid of columns along the base and rows up to the other two sides."""
         base, height, foot = (values[faces, None] for values in (self.base, self.height, self.foot))
         x = base * (np.arange(columns) + 0.5) / columns
-        roof = height * np.minimum(x / foot, (base - x) / (base - foot))
-        y = roof[:, :, None] * (np.arange(rows) + 0.5) / rows
+        top = height * np.minimum(x / foot, (base - x) / (base - foot))
+        y = top[:, :, None] * (np.arange(rows) + 0.5) / rows
         start, along, up = (vectors[faces, None, None] for vectors in (self.start, self.along, self.up))
         return (start + x[:, :, None, None] * along + y[..., None] * up).reshape(-1, 3)
 

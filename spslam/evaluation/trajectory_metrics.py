@@ -1,4 +1,4 @@
-"""Absolute and relative trajectory error (Sturm et al. 2012), as ``evo`` computes them."""
+"""Absolute trajectory error (ATE) and relative pose error (RPE), Sturm et al. 2012; same results as `evo`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from spslam.geometry import inverse, rotation_angle, umeyama
 
 @dataclass(frozen=True)
 class Alignment:
-    """The motion that carries an estimated trajectory onto the true one: ``x -> scale R x + t``.
+    """The transform that aligns an estimated trajectory with the ground truth: `x -> scale R x + t`.
 
-    Attributes
-    ----------
-    rotation : float64 [3,3].
-    translation : float64 [3], meters.
-    scale : 1 for a rigid alignment.
+    Attributes:
+        rotation: float64 [3, 3].
+        translation: float64 [3], meters.
+        scale: 1 for a rigid alignment.
     """
 
     rotation: np.ndarray
@@ -25,20 +24,23 @@ class Alignment:
     scale: float
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points [...,3] of the estimate's world in the truth's world, float64."""
+        """Transforms points [..., 3] from the world frame of the estimate to that of the ground truth, float64."""
         return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
 
 
 def align(estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False) -> Alignment:
     """The alignment that minimizes the squared distances between camera positions (Umeyama 1991).
 
-    Parameters
-    ----------
-    estimated : [F,4,4] ``T_world_camera``, finite.
-    reference : [F,4,4] true poses of the same frames, NaN where unknown; those frames are left out.
-    with_scale : align by a similarity instead of a rigid motion.
+    Args:
+        estimated: [F, 4, 4] `T_world_camera`, finite.
+        reference: [F, 4, 4] ground-truth poses of the same frames, NaN where unknown; those frames are ignored.
+        with_scale: align by a similarity instead of a rigid transform.
 
-    Returns the identity when no true pose is known.
+    Returns:
+        The alignment; the identity without a ground-truth pose.
+
+    Raises:
+        ValueError: poses of another shape, or an estimated pose that is not finite.
     """
     estimated, reference, known = _checked("align", estimated, reference)
     if not known.any():
@@ -47,21 +49,23 @@ def align(estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False
 
 
 def absolute_errors(estimated: np.ndarray, reference: np.ndarray, alignment: Alignment) -> np.ndarray:
-    """Distance [F] in meters of each aligned camera position from the true one, NaN where that is unknown."""
+    """Distance [F] in meters of each aligned camera position from the ground truth, NaN where it is unknown."""
     estimated, reference, known = _checked("absolute_errors", estimated, reference)
     errors = np.linalg.norm(alignment.apply(estimated[:, :3, 3]) - reference[:, :3, 3], axis=1)
     return np.where(known, errors, np.nan)
 
 
 def ate(estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False) -> dict[str, float]:
-    """Absolute trajectory error over all frames with a true pose, after alignment without scale.
+    """Absolute trajectory error over all frames with a ground-truth pose, after alignment.
 
-    Parameters as for :func:`align`.
+    Args:
+        estimated: see `align`.
+        reference: see `align`.
+        with_scale: align with scale.
 
-    Returns
-    -------
-    ``ate_rmse_cm``, ``ate_median_cm``, ``ate_max_cm``. With ``with_scale`` they are called ``ate_scaled_rmse_cm`` and
-    so on, beside ``ate_scale``, so that the two can't be mistaken for each other. Empty when no true pose is known.
+    Returns:
+        `ate_rmse_cm`, `ate_median_cm`, `ate_max_cm`. With `with_scale` their names are `ate_scaled_rmse_cm` and so on,
+        and there is `ate_scale`, so that the two cannot be confused. Empty without a ground-truth pose.
     """
     alignment = align(estimated, reference, with_scale)
     errors = absolute_errors(estimated, reference, alignment)
@@ -78,14 +82,18 @@ def ate(estimated: np.ndarray, reference: np.ndarray, with_scale: bool = False) 
 
 
 def rpe(estimated: np.ndarray, reference: np.ndarray, delta: int = 1) -> dict[str, float]:
-    """Relative pose error: the drift over every ``delta`` frames, as root mean square.
+    """Relative pose error: the root mean square of the drift over `delta` frames.
 
-    The error of a step from frame i to i + delta is ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)``, P estimated and Q true; steps
-    with an unknown end are left out. No alignment is needed.
+    The error from frame i to j = i + delta is `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`, with P estimated and Q ground truth.
+    Pairs with an unknown pose are ignored. Needs no alignment.
 
-    Returns
-    -------
-    ``rpe_cm`` (length of its translation) and ``rpe_deg`` (angle of its rotation). Empty when there is no step.
+    Args:
+        estimated: see `align`.
+        reference: see `align`.
+        delta: distance of the frames, at least 1.
+
+    Returns:
+        `rpe_cm`, of the length of the translation, and `rpe_deg`, of the angle of the rotation. Empty without a pair.
     """
     estimated, reference, known = _checked("rpe", estimated, reference)
     if delta < 1:
@@ -93,9 +101,9 @@ def rpe(estimated: np.ndarray, reference: np.ndarray, delta: int = 1) -> dict[st
     start = np.flatnonzero(known[:-delta] & known[delta:])
     if not start.size:
         return {}
-    true_steps = inverse(reference[start]) @ reference[start + delta]
+    reference_steps = inverse(reference[start]) @ reference[start + delta]
     steps = inverse(estimated[start]) @ estimated[start + delta]
-    errors = inverse(true_steps) @ steps
+    errors = inverse(reference_steps) @ steps
     lengths, angles = np.linalg.norm(errors[:, :3, 3], axis=1), np.degrees(rotation_angle(errors[:, :3, :3]))
     return {
         "rpe_cm": 100 * float(np.sqrt(np.mean(lengths**2))),

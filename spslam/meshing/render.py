@@ -76,7 +76,7 @@ def rasterize(
     Of faces at the same depth the one with the highest index is visible.
 
     Args:
-        vertices: see `render_mesh`, as all others.
+        vertices: [V, 3], meters, world axes.
         faces: integers [L, 3].
         camera: intrinsics of the view.
         T_world_camera: [4, 4], pose of the view.

@@ -1,4 +1,4 @@
-"""The scene prior: a depth encoder and a geometry decoder, trained together on procedural solids."""
+"""The scene prior: a point encoder and a geometry decoder, trained together on procedurally generated solids."""
 
 from spslam.prior.encoder import Prior, load_prior
 

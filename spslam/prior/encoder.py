@@ -1,4 +1,4 @@
-"""The weights of the scene prior: a depth encoder and the geometry decoder that was trained with it."""
+"""The weights of the scene prior: a point encoder and the geometry decoder that was trained with it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spslam.errors import WeightsError
 _DATA = Path(__file__).parent / "data"
 SHIPPED = _DATA / "prior.safetensors"
 
-# Layer widths; the parameters of each are flat, as `spslam.ops.mlp` takes them.
+# Layer widths; parameters are flat vectors in the layout of `spslam.ops.mlp`.
 ENCODER_WIDTHS = (6, 64, 64, 8)  # position relative to the vertex (3), normal (3) -> feature
 DECODER_WIDTHS = (11, 32, 32, 1)  # scaled position (3), feature (8) -> SDF / truncation before tanh
 _NEIGHBORHOODS = (8, 64)
@@ -32,13 +32,13 @@ _LENGTHS = {"encoder": parameter_count(ENCODER_WIDTHS), "geometry_decoder": para
 
 @dataclass(frozen=True)
 class Prior:
-    """A trained encoder and decoder; neither works without the other.
+    """A trained encoder and the decoder trained with it.
 
     Attributes:
         encoder_params: float32 [5128], see `spslam.ops.encode_points`.
-        decoder_params: float32 [1473], see `spslam.ops.mlp`; inputs are position, feature.
-        neighborhood: vertices around a point that the encoder was trained for, 64 or 8.
-        metadata: provenance, as the file has it.
+        decoder_params: float32 [1473], see `spslam.ops.mlp`; the inputs are position and feature.
+        neighborhood: number of vertices around a point that the encoder was trained for, 64 or 8.
+        metadata: provenance, as in the file.
     """
 
     encoder_params: torch.Tensor
@@ -47,7 +47,7 @@ class Prior:
     metadata: dict
 
     def to(self, device: torch.device) -> Prior:
-        """The same on another device."""
+        """The prior with its tensors on another device."""
         if self.encoder_params.device == device:
             return self
         return replace(
@@ -56,27 +56,27 @@ class Prior:
 
 
 def shipped_weights(neighborhood: int = 64) -> Path:
-    """The shipped file of weights that were trained for a neighborhood of 64 or 8 vertices."""
+    """Path of the shipped weights that were trained for a neighborhood of 64 or 8 vertices."""
     return SHIPPED if neighborhood == 64 else _DATA / f"prior-{neighborhood}.safetensors"
 
 
 def load_prior(path: str | os.PathLike | None = None, neighborhood: int = 64) -> Prior:
-    """Reads a file of weights, as `spslam pretrain` writes it: safetensors with `encoder` and `geometry_decoder`.
+    """Reads a weights file as written by `spslam pretrain`: safetensors with `encoder` and `geometry_decoder`.
 
     Args:
-        path: the file; where None, the one that is shipped for the neighborhood.
-        neighborhood: 64 or 8, only used without a path: a file says by itself what it was trained for.
+        path: the file; None is the shipped file for the neighborhood.
+        neighborhood: 64 or 8; only used without a path, as the file contains the value it was trained for.
 
     Raises:
-        WeightsError: the file is missing, damaged, or not weights of these networks. One line that names it.
+        WeightsError: the file is missing or damaged, or has no weights of these networks. One line that names it.
     """
     path = shipped_weights(neighborhood) if path is None else Path(path)
     if not path.is_file():
-        raise WeightsError(f"{path}: no such file of weights")
+        raise WeightsError(f"{path}: no such weights file")
     try:
         with safe_open(path, framework="pt") as file:
             names = set(file.keys())
-            # Copies: reading on in a mapped file that somebody overwrites would kill the process.
+            # Clones: reading from a memory-mapped file after it was overwritten would crash the process.
             tensors = {name: file.get_tensor(name).clone() for name in _LENGTHS if name in names}
             metadata = json.loads((file.metadata() or {}).get(_METADATA_KEY, "{}"))
     except (SafetensorError, OSError, ValueError) as error:
@@ -88,7 +88,7 @@ def load_prior(path: str | os.PathLike | None = None, neighborhood: int = 64) ->
 
 def _check_tensor(path: Path, name: str, tensor: torch.Tensor | None, length: int) -> None:
     if tensor is None:
-        raise WeightsError(f"{path}: tensor {name} is missing: not weights of a scene prior")
+        raise WeightsError(f"{path}: tensor {name} is missing, so this is not a weights file of a scene prior")
     if tensor.dtype != torch.float32 or tuple(tensor.shape) != (length,):
         dtype = str(tensor.dtype).removeprefix("torch.")
         raise WeightsError(f"{path}: tensor {name} must be float32 [{length}], got {dtype} {list(tensor.shape)}")
@@ -99,5 +99,5 @@ def _check_tensor(path: Path, name: str, tensor: torch.Tensor | None, length: in
 def _neighborhood(path: Path, metadata: object) -> int:
     settings = metadata.get("settings") if isinstance(metadata, dict) else None
     if not isinstance(settings, dict) or settings.get("neighborhood") not in _NEIGHBORHOODS:
-        raise WeightsError(f"{path}: metadata {_METADATA_KEY} must say settings.neighborhood, 8 or 64")
+        raise WeightsError(f"{path}: metadata {_METADATA_KEY} must have settings.neighborhood, 8 or 64")
     return settings["neighborhood"]

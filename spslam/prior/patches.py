@@ -1,6 +1,6 @@
-"""What a depth camera would see of random solids: noisy points with normals, and queries with their true distance.
+"""Simulated depth observations of random solids: noisy points with normals, and queries with exact distances.
 
-All lengths are in voxels. A patch is a window of six voxels a side, seen along parallel rays.
+All lengths are in voxels. A patch is a window of six by six voxels, observed along parallel rays.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ _ON_SURFACE = 0.02
 
 @dataclass(frozen=True)
 class PatchSettings:
-    """How patches are observed.
+    """Settings of the simulated observations.
 
-    Attributes
-    ----------
-    rays : rays a patch, each of which gives a query and, unless thinned out, a point.
-    truncation : half width of the band that queries are drawn from, in voxels.
-    noise : standard deviation along the view ray; None draws one for each patch up to ``max_noise``, small ones more
-        often.
-    max_normal_blur : reach of the differences that normals are measured over, drawn for each patch up to this; a depth
-        image's normals turn gradually at an edge.
-    max_normal_jitter : standard deviation of each component of the normals, drawn for each patch up to this.
+    Attributes:
+        rays: rays per patch; each gives a query and, unless dropped, a point.
+        truncation: queries are drawn within this distance of the surface, in voxels.
+        noise: standard deviation of the noise along the view ray, in voxels; None draws one per patch.
+        max_noise: largest standard deviation drawn; small ones are drawn more often.
+        max_normal_blur: largest step of the finite differences for normals, drawn per patch, in voxels; as in a depth
+            image, normals then change gradually at an edge.
+        max_normal_jitter: largest standard deviation of the noise on each component of the normals, drawn per patch.
     """
 
     rays: int = 128
@@ -46,15 +45,18 @@ class PatchSettings:
 
 @dataclass(frozen=True)
 class Patches:
-    """B observed patches; a vertex lattice of whole numbers goes with each.
+    """B observed patches, each in its own grid of vertices at integer coordinates.
 
-    Attributes
-    ----------
-    points, normals : [B,N,3] what the encoder is given, 0 where ``seen`` [B,N] is False.
-    queries : [B,N,3] places in the band about the surface, 0 where ``valid`` [B,N] is False.
-    sdf : [B,N] true Euclidean signed distance there over the truncation, in [-1, 1].
-    surface, surface_normals : [B,N,3] where the rays meet the surface, and the true normals there.
-    view : [B,1,3] direction of the rays.
+    Attributes:
+        points: [B, N, 3], input of the encoder; 0 where `seen` is false.
+        normals: [B, N, 3], input of the encoder; 0 where `seen` is false.
+        seen: bool [B, N], which rays give a point.
+        queries: [B, N, 3], points near the surface; 0 where `valid` is false.
+        sdf: [B, N], exact signed distance of the queries / truncation, in [-1, 1].
+        valid: bool [B, N], which queries can be used.
+        surface: [B, N, 3], where the rays meet the surface.
+        surface_normals: [B, N, 3], exact normals there.
+        view: [B, 1, 3], direction of the rays.
     """
 
     points: Tensor
@@ -69,11 +71,11 @@ class Patches:
 
     @staticmethod
     def cat(batches: Sequence[Patches]) -> Patches:
-        """Several batches as one."""
+        """Concatenates batches."""
         return Patches(*(torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(Patches)))
 
     def __getitem__(self, rows: slice | Tensor) -> Patches:
-        """Some of the patches."""
+        """A subset of the patches."""
         return Patches(*(getattr(self, f.name)[rows] for f in fields(Patches)))
 
     def __len__(self) -> int:
@@ -81,16 +83,21 @@ class Patches:
 
 
 def observe(kind: str, count: int, generator: Generator, settings: PatchSettings) -> Patches:
-    """Draw ``count`` solids of a kind and look at each from one random side.
+    """Draws `count` solids of a kind and observes each from one random direction.
 
-    A query is valid if its ray reached the surface, its distance is exact, its sign is the one that the ray sees, and
-    its nearest surface faces the camera: the far side of a thin wall is nothing that the view could tell.
-    Deterministic: every draw comes from ``generator``.
+    A query is valid if its ray reached the surface, its distance is exact, its sign is the one that the ray observes,
+    and the surface nearest to it faces the camera, because a view cannot observe the far side of a thin wall.
+
+    Args:
+        kind: see `spslam.prior.shapes.random_solid`.
+        count: number of solids.
+        generator: the only source of randomness; the same state gives the same patches.
+        settings: of the observation.
     """
-    solid = _about_the_origin(random_solid(kind, count, generator), count, generator)
+    solid = _at_origin(random_solid(kind, count, generator), count, generator)
     view = _view_directions(solid, count, generator)
     window, surface, facing, reached = _trace(solid, view, settings.rays, generator)
-    seen = reached & _survives(window, generator)
+    seen = reached & _random_dropout(window, generator)
     points, normals = _measure(solid, surface, view, generator, settings)
     queries, distance, valid = _query(solid, surface, view, generator, settings)
     valid = valid & reached
@@ -108,8 +115,8 @@ def observe(kind: str, count: int, generator: Generator, settings: PatchSettings
 
 
 @dataclass(frozen=True)
-class _Moved(Solid):
-    """A solid seen from another origin [B,1,3]."""
+class _Translated(Solid):
+    """A solid relative to another origin [B, 1, 3]."""
 
     solid: Solid
     origin: Tensor
@@ -124,14 +131,14 @@ class _Moved(Solid):
         return self.solid.normals(points + self.origin, step)
 
 
-def _about_the_origin(solid: Solid, count: int, generator: Generator) -> Solid:
-    """Move a piece of surface to a random place of the voxel about the origin."""
+def _at_origin(solid: Solid, count: int, generator: Generator) -> Solid:
+    """Translates each solid so that a point of its surface is at a random position in the voxel around the origin."""
     anchor = nearest_surface(solid, 0.7 * torch.randn(count, 1, 3, generator=generator))
-    return _Moved(solid, anchor + torch.rand(count, 1, 3, generator=generator) - 0.5)
+    return _Translated(solid, anchor + torch.rand(count, 1, 3, generator=generator) - 0.5)
 
 
 def _view_directions(solid: Solid, count: int, generator: Generator) -> Tensor:
-    """Directions [B,1,3] into the scene, within about 80 degrees of the surface's normal at the origin."""
+    """View directions [B, 1, 3], within about 80 degrees of the inverse surface normal at the origin."""
     normal = solid.normals(torch.zeros(count, 1, 3))
     spread = torch.randn(count, 1, 3, generator=generator).clamp(-2, 2)
     view = normalize(0.55 * spread - normal, dim=-1)
@@ -140,10 +147,11 @@ def _view_directions(solid: Solid, count: int, generator: Generator) -> Tensor:
 
 
 def _trace(solid: Solid, view: Tensor, rays: int, generator: Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sphere-trace parallel rays through random places of the window.
+    """Sphere-traces parallel rays through random positions in the window.
 
-    Returns the places in the window [B,R,2], the points reached [B,R,3], the normals there, and which points are
-    surface seen from outside, well inside the lattice.
+    Returns:
+        Positions in the window [B, R, 2], points reached [B, R, 3], normals there [B, R, 3], and bool [B, R], whether
+        the point is on the surface, observed from outside, and well inside the grid.
     """
     count = view.shape[0]
     window = _WINDOW * (torch.rand(count, rays, 2, generator=generator) - 0.5)
@@ -161,8 +169,8 @@ def _trace(solid: Solid, view: Tensor, rays: int, generator: Generator) -> tuple
     return window, surface, normals, outside & on_surface & faces_camera & (depth > 0)
 
 
-def _survives(window: Tensor, generator: Generator) -> Tensor:
-    """A share of the pixels, drawn for each patch, outside a round hole that every third patch has."""
+def _random_dropout(window: Tensor, generator: Generator) -> Tensor:
+    """Which rays to keep, bool [B, R]: a share drawn per patch, without a round hole in 30 % of the patches."""
     count, pixels = window.shape[:2]
     has_hole = torch.rand(count, 1, generator=generator) < 0.3
     radius = (1.5 * torch.rand(count, 1, generator=generator)).where(has_hole, 0.0)
@@ -175,7 +183,7 @@ def _survives(window: Tensor, generator: Generator) -> Tensor:
 def _measure(
     solid: Solid, surface: Tensor, view: Tensor, generator: Generator, settings: PatchSettings
 ) -> tuple[Tensor, Tensor]:
-    """Points with noise along the rays, and blurred, jittered unit normals."""
+    """Points with noise along the rays, and unit normals with blur and noise."""
     count, pixels = surface.shape[:2]
     noise = torch.rand(count, 1, generator=generator).square() * settings.max_noise
     if settings.noise is not None:
@@ -190,7 +198,7 @@ def _measure(
 def _query(
     solid: Solid, surface: Tensor, view: Tensor, generator: Generator, settings: PatchSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Places before and behind the surface along the rays, half of them close to it, with distance and validity."""
+    """Queries in front of and behind the surface along the rays, half of them close to it; distances and validity."""
     count, rays = surface.shape[:2]
     band = 2 * torch.rand(count, rays, generator=generator) - 1
     close = torch.arange(rays) % 2 == 0

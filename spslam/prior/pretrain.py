@@ -1,9 +1,9 @@
-"""Pretraining of the scene prior: the depth encoder and its geometry decoder together, on procedural solids.
+"""Trains the scene prior: the point encoder and its geometry decoder together, on procedurally generated solids.
 
-The loss is the mean over valid queries of ``|tanh(s) - sdf/tr|``, weighted more near the surface, plus a small multiple
-of the features' length. The networks live in voxel units, so one file serves every voxel size whose truncation is as
-many voxels. The decoder's weights of the position are kept at 0: it then ignores the position exactly, which a decoder
-trained on random positions learns only nearly, and its features come out 6 % less exact for the effort.
+The loss is the mean over valid queries of `|tanh(s) - sdf/tr|`, with higher weights near the surface, plus a penalty on
+the norm of the features. The networks work in voxel units, so one file can be used for every voxel size with the same
+truncation in voxels. The decoder's weights of the position are fixed at 0, so that it ignores the position exactly. A
+decoder trained with random positions ignores it only approximately, and its SDF is 6 % less accurate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from spslam.prior.validation import MM_PER_VOXEL, validate
 
 SCRIPT_VERSION = 1
 _LOG_EVERY, _VALIDATE_EVERY, _CHECKPOINT_EVERY = 100, 1000, 500
-_MEMORY = 0.98
+_ERROR_DECAY = 0.98
 
 Progress = Callable[[int, int, float], None]
 
@@ -38,30 +38,26 @@ def pretrain(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> dict:
-    """Train encoder and decoder and write them as one safetensors file, with their provenance.
+    """Trains encoder and decoder and writes them as one safetensors file, with their provenance.
 
-    Beside ``output`` lie ``<stem>.log.jsonl`` (error and validation along the way) and, until the end,
-    ``<stem>.checkpoint.safetensors``. The same settings give the same bytes on one kind of processor, whether
-    interrupted or not and for any number of workers.
+    Also writes `<stem>.log.jsonl` (training error and validation) and, during the training,
+    `<stem>.checkpoint.safetensors` beside `output`. The same settings give the same bytes on the same type of
+    processor, whether interrupted or not and for any number of workers. On KeyboardInterrupt a checkpoint is written
+    before the exception is raised again.
 
-    Parameters
-    ----------
-    output : the file of weights.
-    settings : PretrainSettings() if not given.
-    resume : go on from the checkpoint beside ``output``; without one, start anew.
-    workers : threads; as many as processors if not given.
-    progress : called with (steps done, steps, running mean error in mm at 4 cm voxels).
+    Args:
+        output: weights file to write.
+        settings: `PretrainSettings()` by default.
+        resume: resume from the checkpoint beside `output`; without a checkpoint, start from the beginning.
+        workers: number of threads; the number of processors by default.
+        progress: called with (completed steps, total steps, running mean error in mm at 4 cm voxels).
 
-    Returns
-    -------
-    The provenance: script version, settings, kinds of solids and the validation figures.
+    Returns:
+        The provenance: script version, settings, kinds of solids and validation metrics.
 
-    Raises
-    ------
-    WeightsError
-        The checkpoint is damaged or belongs to other settings.
-    OutputError
-        A file can't be written. On KeyboardInterrupt a checkpoint is written before the exception goes on.
+    Raises:
+        WeightsError: the checkpoint is damaged or belongs to other settings.
+        OutputError: a file cannot be written.
     """
     settings = settings or PretrainSettings()
     files = training_files(output)
@@ -71,10 +67,10 @@ def pretrain(
     with _one_torch_thread(), TrainingPool(workers or os.cpu_count() or 1, settings) as pool:
         try:
             for batch in pool.batches(state.step):
-                reached = _take_step(state, pool.gradient(state.parameters, batch), settings)
-                _report(reached, settings, log, progress)
-                # Only now: a step whose report was interrupted is repeated.
-                state = reached
+                next_state = _take_step(state, pool.gradient(state.parameters, batch), settings)
+                _report(next_state, settings, log, progress)
+                # Updated after the report, so that a step whose report was interrupted is repeated.
+                state = next_state
                 if state.step % _CHECKPOINT_EVERY == 0:
                     save_state(files.checkpoint, state, asdict(settings))
         except KeyboardInterrupt:
@@ -95,7 +91,7 @@ def pretrain(
 
 @dataclass(frozen=True)
 class TrainingFiles:
-    """Where a training writes."""
+    """Files written by a training."""
 
     weights: Path
     log: Path
@@ -104,14 +100,14 @@ class TrainingFiles:
 
 
 def training_files(output: str | os.PathLike) -> TrainingFiles:
-    """The files that go with a file of weights."""
+    """The files that belong to a weights file."""
     output = Path(output)
     suffixes = (".log.jsonl", ".checkpoint.safetensors", ".png")
     return TrainingFiles(output, *(output.with_suffix(suffix) for suffix in suffixes))
 
 
 class _Log:
-    """One JSON object a line. Lines after ``step`` are of steps about to be repeated, and go."""
+    """A log with one JSON object per line. Lines after `step` are removed, as these steps will be repeated."""
 
     def __init__(self, path: Path, step: int) -> None:
         self._path = path
@@ -125,7 +121,7 @@ class _Log:
 
 @contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """The order of sums within an operation depends on torch's threads; the pool's threads share the work instead."""
+    """Sets torch to one thread, since its number of threads changes the order of sums; the pool has its own threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -137,7 +133,7 @@ def _one_torch_thread() -> Iterator[None]:
 def _take_step(state: TrainingState, batch: BatchGradient, settings: PretrainSettings) -> TrainingState:
     queries = max(batch.queries, 1)
     error = batch.error / queries
-    running = error if state.step == 0 else _MEMORY * state.running_error + (1 - _MEMORY) * error
+    running = error if state.step == 0 else _ERROR_DECAY * state.running_error + (1 - _ERROR_DECAY) * error
     return state.adam_step(batch.gradient / queries, settings.learning_rate_at(state.step), running)
 
 

@@ -1,7 +1,7 @@
-"""Random solids with known signed distance, from which the prior learns what surfaces look like.
+"""Random solids with known signed distance, as training data of the prior.
 
-All lengths are in voxels. A batch holds B solids of one kind, each with its own size, rotation and place, and each
-with a piece of its surface near the origin. Every draw comes from the generator that the caller passes.
+All lengths are in voxels. A batch has B solids of one kind, each with its own size, rotation and position, and with a
+part of its surface near the origin. All random numbers come from the generator that the caller passes.
 """
 
 from __future__ import annotations
@@ -17,23 +17,31 @@ from spslam.prior import signed_distance as sd
 
 Parameters = dict[str, Tensor]
 FINE_STEP = 1e-2
-"""A hundredth of a voxel keeps clear of float32 rounding."""
+"""Step of finite differences, in voxels; large compared with float32 rounding."""
 _ITERATED = (sd.superquadric, sd.wavy_sheet)
 
 
 class Solid(ABC):
-    """A batch of B solids. Negative distance inside; a composition's is a lower bound of the distance's size."""
+    """A batch of B solids. Distances are negative inside; that of a composition is a lower bound of its magnitude."""
 
     @abstractmethod
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Distances at points [B,N,3], as [B,N]."""
+        """Signed distances [B, N] at points [B, N, 3]."""
 
     def march_distance(self, points: Tensor) -> Tensor:
-        """A cheaper distance to step along rays by, equal to the first order near the surface."""
+        """A cheaper distance for sphere tracing, equal to first order near the surface."""
         return self.signed_distance(points)
 
     def normals(self, points: Tensor, step: float | Tensor = FINE_STEP) -> Tensor:
-        """Unit gradients of the signed distance at points [B,N,3], by central differences over ``step`` or [B,1,1]."""
+        """Unit gradients of the signed distance by central differences.
+
+        Args:
+            points: [B, N, 3].
+            step: step of the differences, a number or [B, 1, 1].
+
+        Returns:
+            [B, N, 3].
+        """
         axes = torch.eye(3, dtype=points.dtype)
         shifted = torch.cat([points + step * axis for axis in (*axes, *-axes)], dim=1)
         ahead, behind = self.signed_distance(shifted).reshape(points.shape[0], 2, 3, points.shape[1]).unbind(1)
@@ -42,16 +50,22 @@ class Solid(ABC):
 
 @dataclass(frozen=True)
 class Primitive(Solid):
-    """B solids of one kind, moved so that ``anchor`` (own frame) lies at ``place`` (patch frame).
+    """B solids of one kind, placed so that `anchor` (in the frame of the solid) is at `position` (in the patch frame).
 
-    ``rotation`` [B,3,3] turns own axes to the patch's; ``orientation`` [B,1] is -1 where the inside is out.
+    Attributes:
+        distance: signed distance function, see `spslam.prior.signed_distance`.
+        parameters: its parameters.
+        rotation: [B, 3, 3], from the axes of the solid to those of the patch.
+        anchor: [B, 3].
+        position: [B, 3].
+        orientation: [B, 1], -1 for solids with inside and outside swapped.
     """
 
     distance: Callable[..., Tensor]
     parameters: Parameters
     rotation: Tensor
     anchor: Tensor
-    place: Tensor
+    position: Tensor
     orientation: Tensor
 
     def signed_distance(self, points: Tensor) -> Tensor:
@@ -63,12 +77,12 @@ class Primitive(Solid):
         return self.signed_distance(points)
 
     def _own_frame(self, points: Tensor) -> Tensor:
-        return (points - self.place[:, None]) @ self.rotation + self.anchor[:, None]
+        return (points - self.position[:, None]) @ self.rotation + self.anchor[:, None]
 
 
 @dataclass(frozen=True)
 class Composition(Solid):
-    """Union or intersection of two batches of solids."""
+    """Union or intersection of two batches of solids; `operation` is "union" or "intersection"."""
 
     first: Solid
     second: Solid
@@ -86,7 +100,7 @@ class Composition(Solid):
 
 @dataclass(frozen=True)
 class _Kind:
-    """How the sizes of a kind are drawn, and the share of solids seen from inside."""
+    """A kind of solid: its distance, how its sizes are drawn, and the share of solids observed from inside."""
 
     distance: Callable[..., Tensor]
     draw: Callable[[int, Generator], Parameters] = field(default=lambda count, generator: {})
@@ -152,18 +166,15 @@ HELD_OUT_KINDS = ("torus", "wavy_sheet", "sphere_on_plane")
 
 
 def random_solid(kind: str, count: int, generator: Generator) -> Solid:
-    """A batch of solids of one kind with a piece of surface near the origin, or both parts' for a composition.
+    """Draws a batch of solids of one kind with surface near the origin; for a composition, surface of both parts.
 
-    Parameters
-    ----------
-    kind : one of TRAINING_KINDS or HELD_OUT_KINDS.
-    count : batch size B, at least 1.
-    generator : a CPU generator, the only source of randomness; the same state gives the same solids.
+    Args:
+        kind: one of TRAINING_KINDS or HELD_OUT_KINDS.
+        count: batch size B, at least 1.
+        generator: a CPU generator, the only source of randomness; the same state gives the same solids.
 
-    Raises
-    ------
-    ValueError
-        For another kind.
+    Raises:
+        ValueError: another kind.
     """
     if kind in _COMPOSITIONS:
         operation, first, second = _COMPOSITIONS[kind]
@@ -175,7 +186,7 @@ def random_solid(kind: str, count: int, generator: Generator) -> Solid:
 
 
 def nearest_surface(solid: Solid, points: Tensor, iterations: int = 12) -> Tensor:
-    """Points [B,N,3] walked down the distance field onto the surface."""
+    """Projects points [B, N, 3] onto the surface by steps along the gradient of the distance."""
     for _ in range(iterations):
         points = points - solid.march_distance(points)[..., None] * solid.normals(points)
     return points
@@ -184,7 +195,7 @@ def nearest_surface(solid: Solid, points: Tensor, iterations: int = 12) -> Tenso
 def _random_primitive(kind: str, count: int, generator: Generator, spread: float) -> Primitive:
     entry = _KINDS[kind]
     parameters = entry.draw(count, generator)
-    still = Primitive(
+    unplaced = Primitive(
         entry.distance, parameters, torch.eye(3).expand(count, 3, 3), torch.zeros(count, 3), torch.zeros(count, 3),
         torch.ones(count, 1),
     )  # fmt: skip
@@ -193,21 +204,21 @@ def _random_primitive(kind: str, count: int, generator: Generator, spread: float
         entry.distance,
         parameters,
         _random_rotations(count, generator),
-        nearest_surface(still, start[:, None])[:, 0],
+        nearest_surface(unplaced, start[:, None])[:, 0],
         spread * torch.randn(count, 3, generator=generator),
         torch.where(torch.rand(count, 1, generator=generator) < entry.concave_share, -1.0, 1.0),
     )
 
 
 def _start_points(parameters: Parameters, count: int, generator: Generator) -> Tensor:
-    """Where the walk to the anchor starts: anywhere in a solid with half sizes, so that edges get their share."""
+    """Initial points [B, 3] of the projection to the anchor: uniform in solids with half sizes, to include edges."""
     if "half_size" in parameters:
         return 1.1 * parameters["half_size"] * _between(-1, 1, (count, 3), generator)
     return 4 * torch.randn(count, 3, generator=generator)
 
 
 def _random_rotations(count: int, generator: Generator) -> Tensor:
-    """Uniform rotations [B,3,3], from normalized Gaussian quaternions."""
+    """Uniform rotations [B, 3, 3], from normalized Gaussian quaternions."""
     quaternion = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1)
     w, x, y, z = quaternion.unbind(-1)
     rows = [

@@ -1,8 +1,8 @@
 """Signed distances of batches of solids, each in its own frame: negative inside, in the unit of the coordinates.
 
-Every function takes ``points`` [B,N,3], parameters with the batch first, and returns [B,N]. Planes, spheres,
-cylinders, boxes and tori are exact. Superquadrics and wavy sheets have no closed form: their distance comes from
-iterated foot points, and is that to a local minimum where two sides are about equally near.
+Every function takes `points` [B, N, 3] and parameters with the batch dimension first, and returns [B, N]. Planes,
+spheres, cylinders, boxes and tori are exact. Superquadrics and wavy sheets have no closed form: their foot points are
+found iteratively, and may be a local minimum where two sides are almost equally near.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ def plane(points: Tensor) -> Tensor:
 
 
 def sphere(points: Tensor, radius: Tensor) -> Tensor:
-    """A ball about the origin; ``radius`` [B,1]."""
+    """A ball around the origin; `radius` [B, 1]."""
     return points.norm(dim=-1) - radius
 
 
 def cylinder(points: Tensor, radius: Tensor) -> Tensor:
-    """An endless round cylinder about the z axis; ``radius`` [B,1]."""
+    """An infinite cylinder around the z axis; `radius` [B, 1]."""
     return points[..., :2].norm(dim=-1) - radius
 
 
 def box(points: Tensor, half_size: Tensor) -> Tensor:
-    """A box about the origin along the axes; ``half_size`` [B,3]."""
+    """An axis-aligned box around the origin; `half_size` [B, 3]."""
     outside = points.abs() - half_size[:, None]
     return outside.clamp_min(0).norm(dim=-1) + outside.amax(-1).clamp_max(0)
 
 
 def torus(points: Tensor, radius: Tensor, tube_radius: Tensor) -> Tensor:
-    """A torus about the z axis; ``radius`` of its circle and ``tube_radius``, both [B,1]."""
+    """A torus around the z axis; `radius` of its circle and `tube_radius`, both [B, 1]."""
     from_circle = points[..., :2].norm(dim=-1) - radius
     return torch.hypot(from_circle, points[..., 2]) - tube_radius
 
 
 def superquadric(points: Tensor, half_size: Tensor, exponent: Tensor, iterations: int = 8) -> Tensor:
-    """The solid ``sum |x_i / h_i|^e < 1``; ``half_size`` h [B,3], ``exponent`` e [B,1], at least 2."""
+    """The solid `sum |x_i / h_i|^e < 1`; `half_size` h [B, 3], `exponent` e [B, 1], at least 2."""
     half_size, exponent = half_size[:, None], exponent[:, None]
 
     def gauge(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,7 +58,7 @@ def superquadric(points: Tensor, half_size: Tensor, exponent: Tensor, iterations
 
 
 def wavy_sheet(points: Tensor, amplitude: Tensor, wave_number: Tensor, iterations: int = 8) -> Tensor:
-    """All below ``z = a (sin kx + sin ky)``; ``amplitude`` a and ``wave_number`` k, both [B,1]."""
+    """The region below `z = a (sin kx + sin ky)`; `amplitude` a and `wave_number` k, both [B, 1]."""
     a, k = amplitude, wave_number
 
     def height_above(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,10 +70,10 @@ def wavy_sheet(points: Tensor, amplitude: Tensor, wave_number: Tensor, iteration
 
 
 def _foot_point_distance(points: Tensor, implicit: Implicit, iterations: int) -> Tensor:
-    """Distance to the zero set of a function: project the point on the tangent plane at the last foot, again and again.
+    """Distance to the zero set of a function: iterated projection onto the tangent plane at the last foot point.
 
-    One iteration gives the first-order distance f / |grad f|. Later ones go part of the way: full steps diverge
-    outside an edge whose radius is less than the distance.
+    One iteration gives the first-order distance f / |grad f|. Later iterations are relaxed, because full steps diverge
+    outside an edge with a radius smaller than the distance.
     """
     value, gradient = implicit(points)
     sign, foot, share = value.sign(), points, 1.0

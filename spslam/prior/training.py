@@ -1,7 +1,7 @@
-"""The work of pretraining in tasks for threads: observing solids ahead of time, and gradients of shards of a batch.
+"""Multi-threaded training: observing solids ahead of time, and gradients of the shards of a batch.
 
-A task's size doesn't depend on the machine, each runs on one thread, and results are combined in a fixed order, so that
-the numbers are the same for any number of workers.
+The size of a task does not depend on the machine, each task runs on one thread, and results are combined in a fixed
+order. So results are the same for any number of workers.
 """
 
 from __future__ import annotations
@@ -32,17 +32,23 @@ _ENCODER_LENGTH = parameter_count(ENCODER_WIDTHS)
 
 @dataclass(frozen=True)
 class PretrainSettings:
-    """What decides on the weights.
+    """Settings that determine the trained weights.
 
-    Attributes
-    ----------
-    steps, seed : number of optimization steps, and the seed of everything drawn.
-    patches_per_kind : solids of each kind a step.
-    learning_rate, final_learning_rate : Adam's rate after ``warmup_steps``, and what it falls to along a cosine.
-    surface_emphasis : how much more a query on the surface counts, falling off over half a voxel.
-    feature_penalty : weight of the mean length of the interpolated features.
-    neighborhood, min_pair_weight : as in `spslam.ops.encode_points`.
-    views : how the solids are observed.
+    Attributes:
+        steps: number of optimization steps.
+        seed: seed of all random numbers.
+        patches_per_kind: solids of each kind per step.
+        learning_rate: learning rate of Adam after the warm-up.
+        final_learning_rate: learning rate at the end of the cosine decay.
+        warmup_steps: steps of the linear warm-up.
+        surface_emphasis: additional weight of a query on the surface; decreases over half a voxel.
+        feature_penalty: weight of the mean norm of the interpolated features.
+        neighborhood: see `spslam.ops.encode_points`.
+        min_pair_weight: see `spslam.ops.encode_points`.
+        views: settings of the simulated observations.
+
+    Raises:
+        ValueError: `steps`, `patches_per_kind` or `seed` is out of range.
     """
 
     steps: int = 4000
@@ -65,7 +71,7 @@ class PretrainSettings:
             raise ValueError(f"PretrainSettings: seed must be in [0, 2^31), got {self.seed}")
 
     def learning_rate_at(self, step: int) -> float:
-        """The rate of a step, 0-based: linear warm-up times a half cosine over the steps."""
+        """The learning rate of a 0-based step: linear warm-up times cosine decay."""
         cosine = 0.5 + 0.5 * math.cos(math.pi * step / self.steps)
         warm = min(1.0, (step + 1) / self.warmup_steps)
         return self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * warm * cosine
@@ -79,13 +85,19 @@ def initial_networks(seed: int) -> Tensor:
 
 
 def split_networks(parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """Encoder and decoder parameters, out of their one vector."""
+    """Splits the vector of all parameters into those of the encoder and those of the decoder."""
     return parameters[:_ENCODER_LENGTH], parameters[_ENCODER_LENGTH:]
 
 
 @dataclass(frozen=True)
 class BatchGradient:
-    """Sums over queries: of the gradients, of the absolute errors in truncations; and the number of queries."""
+    """Sums over the queries of a batch.
+
+    Attributes:
+        gradient: [P], gradient of the loss.
+        error: absolute SDF error, in truncations.
+        queries: number of queries.
+    """
 
     gradient: Tensor
     error: float
@@ -93,7 +105,7 @@ class BatchGradient:
 
 
 class TrainingPool:
-    """Threads that observe solids ahead of time and take gradients of one shard of a batch each."""
+    """A thread pool that observes solids ahead of time and computes gradients of the shards of a batch."""
 
     def __init__(self, workers: int, settings: PretrainSettings) -> None:
         workers = max(1, min(workers, settings.patches_per_kind))
@@ -107,20 +119,20 @@ class TrainingPool:
         self._executor.shutdown(cancel_futures=True)
 
     def batches(self, first_step: int) -> Iterator[list[Patches]]:
-        """The batches from ``first_step`` on, each in shards with a patch of every kind."""
+        """Yields the batches from `first_step` on, each divided into shards with one patch of every kind."""
         ahead: deque[list[Future[Patches]]] = deque()
         last_block = (self._settings.steps - 1) // _BLOCK_STEPS
         blocks = iter(range(first_step // _BLOCK_STEPS, last_block + 1))
         for block in range(first_step // _BLOCK_STEPS, last_block + 1):
-            while len(ahead) < 2 and (wanted := next(blocks, None)) is not None:
-                ahead.append(self._observe(wanted))
+            while len(ahead) < 2 and (upcoming := next(blocks, None)) is not None:
+                ahead.append(self._observe(upcoming))
             kinds = [future.result() for future in ahead.popleft()]
             for step in range(block * _BLOCK_STEPS, min((block + 1) * _BLOCK_STEPS, self._settings.steps)):
                 if step >= first_step:
                     yield self._shards(kinds, step % _BLOCK_STEPS)
 
     def gradient(self, parameters: Tensor, shards: list[Patches]) -> BatchGradient:
-        """The gradient of the loss over all shards, added in their order."""
+        """The gradient of the loss over all shards, summed in their order."""
         tasks = [self._executor.submit(_shard_gradient, parameters, shard, self._settings) for shard in shards]
         parts = [task.result() for task in tasks]
         total = parts[0].gradient
@@ -144,7 +156,7 @@ class TrainingPool:
 
 
 def _generator(seed: int, block: int, kind: int) -> Generator:
-    """One of its own for each task. torch seeds from 32 bits; SeedSequence spreads the key over them."""
+    """The generator of a task. torch uses 32 bits of a seed; SeedSequence hashes the key into them."""
     key = np.random.SeedSequence((seed, block, kind)).generate_state(1)[0]
     return Generator().manual_seed(int(key))
 

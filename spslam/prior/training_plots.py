@@ -1,4 +1,4 @@
-"""The course of a pretraining run as a picture; needs matplotlib."""
+"""Plots of a training; needs matplotlib."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ from spslam.io import atomic_write
 
 
 def require_matplotlib() -> None:
-    """Raises SpslamError, naming the extra to install, where matplotlib is missing."""
+    """Raises SpslamError with the extra to install if matplotlib is missing."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise SpslamError("plots need matplotlib: pip install 'spslam[eval]'") from error
 
 
-def plot_training(log: Path, picture: Path) -> None:
-    """Draw the error over the steps, in training and on held-out solids, from a log of `pretrain`."""
+def plot_training(log: Path, image: Path) -> None:
+    """Plots the error over the steps, on training and on held-out solids.
+
+    Args:
+        log: log file of `spslam.prior.pretrain.pretrain`.
+        image: image file to write.
+
+    Raises:
+        SpslamError: matplotlib is missing.
+        OutputError: the image cannot be written.
+    """
     require_matplotlib()
     from matplotlib.figure import Figure
 
@@ -34,4 +43,4 @@ def plot_training(log: Path, picture: Path) -> None:
     axes.set(xlabel="step", ylabel="error, mm at 4 cm voxels", yscale="log")
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
-    atomic_write(picture, lambda path: figure.savefig(path, dpi=120))
+    atomic_write(image, lambda path: figure.savefig(path, dpi=120))

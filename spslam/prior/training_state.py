@@ -1,4 +1,4 @@
-"""The state of a pretraining run, and its file."""
+"""The state of a training, and its checkpoint file."""
 
 from __future__ import annotations
 
@@ -16,13 +16,21 @@ from spslam.io import atomic_write
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8
 _TENSORS = ("parameters", "exp_avg", "exp_avg_sq")
-# One key: safetensors doesn't keep the order of several.
+# A single metadata key: safetensors does not keep the order of several.
 _KEY = "pretraining"
 
 
 @dataclass(frozen=True)
 class TrainingState:
-    """Steps done, parameters [P] with Adam's moments [P], and the running mean error in truncations."""
+    """State of a training.
+
+    Attributes:
+        step: number of completed steps.
+        parameters: float32 [P], see `spslam.prior.training.split_networks`.
+        exp_avg: float32 [P], first moments of Adam.
+        exp_avg_sq: float32 [P], second moments of Adam.
+        running_error: running mean of the absolute SDF error, in truncations.
+    """
 
     step: int
     parameters: Tensor
@@ -32,11 +40,11 @@ class TrainingState:
 
     @classmethod
     def start(cls, parameters: Tensor) -> TrainingState:
-        """Before the first step."""
+        """The state before the first step."""
         return cls(0, parameters, torch.zeros_like(parameters), torch.zeros_like(parameters), 0.0)
 
     def adam_step(self, gradient: Tensor, learning_rate: float, running_error: float) -> TrainingState:
-        """The state after one step of Adam."""
+        """The state after one Adam step."""
         step = self.step + 1
         exp_avg = _BETA1 * self.exp_avg + (1 - _BETA1) * gradient
         exp_avg_sq = _BETA2 * self.exp_avg_sq + (1 - _BETA2) * gradient.square()
@@ -46,14 +54,22 @@ class TrainingState:
 
 
 def save_state(path: Path, state: TrainingState, settings: dict) -> None:
-    """Write a checkpoint, at once or not at all; raises OutputError."""
+    """Writes a checkpoint, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     header = {"settings": settings, "step": state.step, "running_error": state.running_error}
     tensors = {name: getattr(state, name) for name in _TENSORS}
     atomic_write(path, save(tensors, metadata={_KEY: json.dumps(header, sort_keys=True)}))
 
 
 def load_state(path: Path, settings: dict) -> TrainingState:
-    """Read a checkpoint of these settings; raises WeightsError, naming the first option that differs."""
+    """Reads a checkpoint of a training with the same settings.
+
+    Raises:
+        WeightsError: the file is no checkpoint, or an option differs; names the first one.
+    """
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {})[_KEY])
@@ -65,6 +81,6 @@ def load_state(path: Path, settings: dict) -> TrainingState:
         if header["settings"].get(name) != value:
             raise WeightsError(
                 f"{path}: must be resumed with {name} = {header['settings'].get(name)}, got {value}; "
-                "remove the file to start anew"
+                "remove the file to start from the beginning"
             )
     return TrainingState(step, running_error=running_error, **tensors)

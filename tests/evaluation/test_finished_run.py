@@ -1,4 +1,4 @@
-"""A run's output against the truth, on a run that is right by construction."""
+"""Evaluation of a finished run, on a run whose output is exact by construction."""
 
 import json
 import shutil
@@ -63,7 +63,7 @@ def output(tmp_path, perfect):
     return shutil.copytree(perfect, tmp_path / "out")
 
 
-def test_perfect_run_has_perfect_figures(output, room):
+def test_a_perfect_run_has_perfect_metrics(output, room):
     run = RunOutput.read(output)
     figures = trajectory_figures(run)
     assert figures["ate_rmse_cm"] < 1e-4
@@ -85,7 +85,7 @@ def test_figures_are_the_same_every_time(output, room):
 
 
 class WithoutSomeFrames(Subset):
-    """A data set of which two frames can't be read."""
+    """A dataset with two unreadable frames."""
 
     def read(self, index):
         if index in (2, 6):
@@ -93,17 +93,17 @@ class WithoutSomeFrames(Subset):
         return super().read(index)
 
 
-def test_frames_that_cannot_be_read_are_left_out_of_the_evaluation(output, room):
+def test_unreadable_frames_are_skipped(output, room):
     broken = WithoutSomeFrames(room)
     assert surface_figures(RunOutput.read(output), broken, room.room, **QUICK)["f1_5cm"] > 99.9
 
 
-def test_pictures_need_a_map_and_a_mesh(output, room):
-    with pytest.raises(OutputError, match="has no map.safetensors to draw"):
+def test_rendered_views_need_a_map_and_a_mesh(output, room):
+    with pytest.raises(OutputError, match="has no map.safetensors to render"):
         view_figures(RunOutput.read(output), room)
     Scene(SceneSettings(0.04, 0.08, 0.04, 0.25, 1000), seed=0).save(output / "map.safetensors")
     figures = view_figures(RunOutput.read(output), room)
-    # The surface is the room's, the colors of an empty map are nothing like it.
+    # The mesh is that of the room, but the map has no colors.
     assert figures["view_coverage"] > 99.9
     assert 3 < figures["psnr_db"] < 20
     assert figures["ssim"] < 0.9
@@ -112,13 +112,13 @@ def test_pictures_need_a_map_and_a_mesh(output, room):
         view_figures(RunOutput.read(output), room)
 
 
-def test_alignment_with_scale_is_named(output):
+def test_metrics_with_scale_have_their_own_names(output):
     figures = trajectory_figures(RunOutput.read(output), with_scale=True)
     assert figures["ate_scale"] == pytest.approx(1, abs=1e-6)
     assert {"ate_rmse_cm", "ate_scaled_rmse_cm"} <= figures.keys()
 
 
-def test_straight_path_leaves_no_rotation_open(output, room):
+def test_a_straight_trajectory_determines_the_rotation(output, room):
     run = RunOutput.read(output)
     line = run.trajectory.poses[:1].repeat(6, axis=0)
     line[:, :3, 3] += np.outer(np.arange(6), [0.02, 0, 0])
@@ -127,7 +127,7 @@ def test_straight_path_leaves_no_rotation_open(output, room):
     assert surface_figures(RunOutput.read(output), room, room.room, **QUICK)["accuracy_cm"] < 0.1
 
 
-def test_shifted_mesh_is_found_out(output, room):
+def test_a_shifted_mesh_has_worse_metrics(output, room):
     mesh = trimesh.load(output / "mesh.ply", process=False)
     mesh.apply_translation([0.08, 0, 0])
     mesh.export(output / "mesh.ply")
@@ -136,24 +136,24 @@ def test_shifted_mesh_is_found_out(output, room):
     assert figures["accuracy_cm"] > 1
 
 
-def test_no_truth_gives_no_trajectory_figures(output):
+def test_no_ground_truth_gives_no_trajectory_metrics(output):
     (output / "previews" / "ground_truth.txt").unlink()
     assert trajectory_figures(RunOutput.read(output)) == {}
 
 
-def test_run_over_other_data_is_refused(output, room):
+def test_a_run_over_other_data_is_refused(output, room):
     Trajectory(np.array([1e3]), np.eye(4)[None]).save_tum(output / "trajectory.txt")
     with pytest.raises(OutputError, match="must be a run over generated, but has none of its frames"):
         surface_figures(RunOutput.read(output), room, room.room)
 
 
-def test_run_without_mesh_is_refused(output, room):
+def test_a_run_without_mesh_is_refused(output, room):
     (output / "mesh.ply").unlink()
-    with pytest.raises(OutputError, match="has no mesh to evaluate; spslam mesh"):
+    with pytest.raises(OutputError, match="has no mesh to evaluate; `spslam mesh"):
         surface_figures(RunOutput.read(output), room, room.room)
 
 
-def test_figures_are_added_to_the_others(output):
+def test_metrics_are_added_to_the_existing_ones(output):
     run = RunOutput.read(output)
     assert add_metrics(run, {"f1_5cm": 98.0}) == {"frames": 6, "f1_5cm": 98.0}
     assert json.loads((output / "metrics.json").read_text()) == {"frames": 6, "f1_5cm": 98.0}
@@ -169,5 +169,5 @@ def test_figures_are_added_to_the_others(output):
         ([1.0, 2.0], [], []),
     ],
 )
-def test_times_are_matched_to_the_microsecond(times, wanted, rows):
+def test_timestamps_are_matched_to_the_microsecond(times, wanted, rows):
     assert match_times(np.array(times), np.array(wanted)).tolist() == rows

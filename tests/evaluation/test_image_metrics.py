@@ -9,13 +9,13 @@ TOLERANCE = 1e-9
 
 
 def images(seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """A smooth picture, and the same with noise."""
+    """A smooth image, and the same with noise."""
     generator = np.random.default_rng(seed)
     rows, columns = np.mgrid[:40, :60] / 10
-    picture = np.stack([np.sin(rows + k) * np.cos(columns * (k + 1)) for k in range(3)], axis=-1)
-    picture = 127 + 100 * picture
-    noisy = picture + noise * generator.standard_normal(picture.shape)
-    return tuple(np.clip(image, 0, 255).round().astype(np.uint8) for image in (picture, noisy))
+    smooth = np.stack([np.sin(rows + k) * np.cos(columns * (k + 1)) for k in range(3)], axis=-1)
+    smooth = 127 + 100 * smooth
+    noisy = smooth + noise * generator.standard_normal(smooth.shape)
+    return tuple(np.clip(image, 0, 255).round().astype(np.uint8) for image in (smooth, noisy))
 
 
 def test_psnr_agrees_with_scikit_image():
@@ -26,7 +26,7 @@ def test_psnr_agrees_with_scikit_image():
     assert psnr_db(a, b, mask) == pytest.approx(peak_signal_noise_ratio(a[mask], b[mask]))
     assert psnr_db(a, a) == float("inf")
     assert np.isnan(psnr_db(a, b, np.zeros((20, 30), bool)))
-    with pytest.raises(ValueError, match="psnr_db: rendered and reference must have one shape"):
+    with pytest.raises(ValueError, match="psnr_db: rendered and reference must have the same shape"):
         psnr_db(a, b[:10])
 
 
@@ -41,7 +41,7 @@ def test_ssim_agrees_with_scikit_image(noise):
     assert ssim(a, a) == pytest.approx(1, abs=TOLERANCE)
 
 
-def test_ssim_in_a_mask_counts_pixels_whose_window_is_in_it():
+def test_ssim_with_a_mask_uses_pixels_whose_window_is_inside():
     a, b = images(4, 20.0)
     mask = np.zeros((40, 60), dtype=bool)
     mask[8:33, 10:45] = True
@@ -52,5 +52,5 @@ def test_ssim_in_a_mask_counts_pixels_whose_window_is_in_it():
     assert ssim(a, changed, mask) == pytest.approx(ssim(a, b, mask), abs=TOLERANCE)
     assert np.isnan(ssim(a, b, np.zeros_like(mask)))
     assert np.isnan(ssim(a[:9], b[:9]))
-    with pytest.raises(ValueError, match="ssim: rendered and reference must have one shape"):
+    with pytest.raises(ValueError, match="ssim: rendered and reference must have the same shape"):
         ssim(a, b[:10])

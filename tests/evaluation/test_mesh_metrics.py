@@ -12,7 +12,7 @@ from spslam.geometry import pose_from
 
 
 def square(width: float = 1.0, height: float = 0.0) -> TriangleSurface:
-    """A horizontal rectangle of one meter by a width, at a height."""
+    """A horizontal rectangle, `width` by 1 m, at a height."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * [width, 1, 1] + [0, 0, height]
     return TriangleSurface(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -37,7 +37,7 @@ def test_metrics_agree_with_brute_force():
     assert found == pytest.approx(brute_force_metrics(accuracy.tolist(), completeness[:300].tolist()))
 
 
-def test_metrics_of_points_agree_with_brute_force_over_pairs():
+def test_metrics_of_triangles_agree_with_brute_force_over_points():
     generator = np.random.default_rng(0)
     corners = generator.uniform(size=(2, 40, 3)) * 0.2
     first, second = (TriangleSurface(vertices, np.arange(39).reshape(13, 3)) for vertices in corners)
@@ -46,7 +46,7 @@ def test_metrics_of_points_agree_with_brute_force_over_pairs():
     dense_a, dense_b = first.sample_surface(20000, seed=1), second.sample_surface(20000, seed=1)
     accuracy = np.linalg.norm(a[:, None] - dense_b[None], axis=2).min(axis=1)
     completeness = np.linalg.norm(b[:, None] - dense_a[None], axis=2).min(axis=1)
-    # The dense points lie 1 mm apart.
+    # The dense points are 1 mm apart.
     assert metrics["accuracy_cm"] == pytest.approx(100 * accuracy.mean(), abs=0.05)
     assert metrics["completeness_cm"] == pytest.approx(100 * completeness.mean(), abs=0.05)
 
@@ -57,7 +57,7 @@ def test_metrics_of_shifted_and_partial_surfaces():
     assert (shifted["f1_5cm"], shifted["f1_1cm"]) == (100, 0)
     half = evaluate_surface(square(width=0.5), square(), everywhere, 20000)
     assert half["accuracy_1cm"] == 100
-    # The half and what lies 5 or 1 cm beyond; 20,000 points tell a share to 0.35 %, three times that is allowed.
+    # Half of the square plus 5 or 1 cm. The standard error with 20,000 points is 0.35 %; the tolerance is 3 times that.
     assert half["completeness_5cm"] == pytest.approx(55, abs=1)
     assert half["completeness_1cm"] == pytest.approx(51, abs=1)
     assert half["f1_5cm"] == pytest.approx(2 * 100 * 55 / 155, abs=1)
@@ -105,7 +105,7 @@ def test_observed_mask_agrees_with_brute_force():
     np.testing.assert_array_equal(mask, observed_mask(points, depths[::-1], poses[::-1], camera, 0.1))
 
 
-def test_observed_mask_of_nothing_and_errors():
+def test_observed_mask_of_empty_and_wrong_input():
     camera = Camera(4, 3, 4, 4, 1.5, 1)
     assert observed_mask(np.zeros((0, 3)), [np.ones((3, 4))], [np.eye(4)], camera).shape == (0,)
     assert not observed_mask(np.array([[0, 0, 1.0]]), [], [], camera).any()
@@ -115,7 +115,7 @@ def test_observed_mask_of_nothing_and_errors():
         observed_mask(np.zeros(3), [], [], camera)
 
 
-def test_the_room_against_itself_where_it_was_seen():
+def test_the_room_against_itself_where_it_was_observed():
     dataset = GeneratedDataset(frames=60, width=80, height=60)
     frames = [dataset[index] for index in range(0, 60, 10)]
     depths, poses = [frame.depth for frame in frames], [frame.pose for frame in frames]
@@ -126,13 +126,13 @@ def test_the_room_against_itself_where_it_was_seen():
     assert metrics["accuracy_cm"] < 0.05
     whole = dataset.room.sample_surface(20000)
     assert 0.1 < observed(whole).mean() < 0.6
-    # A wall's outer side and a point outside every view aren't observed, one in free space is.
+    # A point in free space is observed; points outside the view or behind a wall are not.
     inside = dataset.camera.unproject(frames[0].depth)[30, 40] * 0.5
     points = (frames[0].pose @ np.array([[*inside, 1], [0, 0, -1, 1], [*(inside * 3), 1]]).T).T[:, :3]
     assert observed_mask(points, depths[:1], poses[:1], dataset.camera).tolist() == [True, False, False]
 
 
-def test_observed_samples_of_a_surface_that_is_hardly_seen():
+def test_observed_samples_of_a_surface_with_a_small_observed_part():
     points = observed_samples(square(), lambda p: p[:, 0] < 0.01, 1000)
     assert 40 < len(points) < 120
     assert (points[:, 0] < 0.01).all()

@@ -1,4 +1,4 @@
-"""Views of a map, against the generated room, whose pictures from anywhere are known."""
+"""Rendered views of a map, against the generated room, which can be rendered exactly."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ from spslam.geometry import pose_from
 from spslam.scene import Scene, SceneSettings
 
 CAMERA = Camera(80, 60, 69.0, 69.0, 39.5, 29.5)
-# The room's mesh is within half a millimeter of the room; a pixel at a depth edge may fall on the other side of it.
+# The mesh is within 0.5 mm of the exact room; at depth edges a pixel may show another surface.
 MESH_ERROR_M = 2e-3
 
 
@@ -27,7 +27,7 @@ def room():
     return dataset, [frame.depth for frame in frames], np.array([frame.pose for frame in frames])
 
 
-def test_novel_poses_are_new_free_and_repeatable(room):
+def test_novel_poses_are_new_in_free_space_and_reproducible(room):
     dataset, depths, poses = room
     found = list(novel_poses(poses, depths, dataset.camera, 2))
     assert 5 < len(found) <= 40
@@ -39,14 +39,14 @@ def test_novel_poses_are_new_free_and_repeatable(room):
     assert not np.array_equal(found[0], next(novel_poses(poses, depths, dataset.camera, 2, seed=1)))
 
 
-def test_places_that_no_frame_looked_through_are_not_free(room):
+def test_unobserved_positions_are_not_free(room):
     dataset, depths, poses = room
-    blind = [np.zeros_like(depth) for depth in depths]
-    assert not list(novel_poses(poses, blind, dataset.camera, 5))
+    no_depth = [np.zeros_like(depth) for depth in depths]
+    assert not list(novel_poses(poses, no_depth, dataset.camera, 5))
     assert not list(novel_poses(poses[:0], [], dataset.camera, 5))
 
 
-def test_depth_from_novel_views_of_the_room_itself(room):
+def test_novel_depth_of_the_ground_truth_and_of_a_scaled_mesh(room):
     dataset, depths, poses = room
     observed = partial(observed_mask, depths=depths, poses=poses, camera=dataset.camera)
     vertices, faces = dataset.room.triangles()
@@ -62,7 +62,7 @@ def test_depth_from_novel_views_of_the_room_itself(room):
     np.testing.assert_allclose(estimated[both], 0.98 * true[both], rtol=1e-5)
 
 
-def test_true_depth_of_what_was_not_observed_is_left_out(room):
+def test_ground_truth_depth_of_unobserved_surface_is_removed(room):
     dataset, depths, poses = room
     surface = dataset.room.triangles()
     exact = dataset.room.render(CAMERA, poses[0])[1]
@@ -77,7 +77,7 @@ def test_true_depth_of_what_was_not_observed_is_left_out(room):
     assert not list(novel_depth(surface, surface, iter(poses[:1]), CAMERA, lambda points: points[:, 0] > 99, 1))
 
 
-def test_a_view_of_a_map_has_its_surface_and_its_colors():
+def test_a_rendered_view_has_the_surface_of_the_mesh_and_the_colors_of_the_map():
     scene = Scene(SceneSettings(0.04, 0.08, 0.04, 0.25, 1000), seed=0)
     vertices = np.array([[-1.0, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]])
     mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((4, 3), np.uint8))

@@ -15,7 +15,7 @@ def ellipsoid(subdivisions):
 
 
 def brute_force_distance(points, vertices, faces):
-    """Over every triangle, by trimesh."""
+    """Distance by trimesh, over all triangles."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     return trimesh.proximity.closest_point_naive(mesh, points)[1]
 
@@ -46,7 +46,7 @@ def test_distance_agrees_with_brute_force(subdivisions):
     np.testing.assert_allclose(found[near], expected[near], atol=EXACT_M)
     excess = found[~near] - expected[~near]
     assert excess.min() > -EXACT_M
-    assert excess.max() < 5e-3  # far off not every face is compared
+    assert excess.max() < 5e-3  # far from the surface not all faces are compared
 
 
 def test_distance_to_uneven_triangles():
@@ -55,7 +55,7 @@ def test_distance_to_uneven_triangles():
     faces = np.array([generator.choice(60, 3, replace=False) for _ in range(40)])
     points = generator.uniform(size=(150, 3)) * [2, 1, 0.1]
     expected = brute_force_distance(points, vertices, faces)
-    # Forty large triangles through each other, seen from no farther than 10 cm: hard for a search by sites, yet exact.
+    # Forty large intersecting triangles and points within 10 cm: hard for a search by sites, yet exact.
     np.testing.assert_allclose(TriangleSurface(vertices, faces).distance(points), expected, atol=EXACT_M)
 
 
@@ -69,18 +69,18 @@ def test_distance_to_slivers():
     np.testing.assert_allclose(TriangleSurface(vertices, faces).distance(points), expected, atol=EXACT_M)
 
 
-def test_samples_lie_on_the_faces_evenly():
+def test_samples_are_uniform_on_the_faces():
     vertices, faces = ellipsoid(2)
     points = TriangleSurface(vertices, faces).sample_surface(50000)
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
     normals /= areas[:, None]
-    # A convex body: the face that a point lies on is the one whose plane is farthest out.
+    # The body is convex: a point lies on the face with the largest signed plane distance.
     height = points @ normals.T - np.einsum("fi,fi->f", normals, corners[:, 0])
     assert np.abs(height.max(axis=1)).max() < 1e-12
     counted = np.bincount(height.argmax(axis=1), minlength=len(faces))
-    assert np.abs(counted - 50000 * areas / areas.sum()).max() < 2.01  # strata
+    assert np.abs(counted - 50000 * areas / areas.sum()).max() < 2.01  # stratified sampling
 
 
 def test_sampling_is_deterministic():
@@ -107,7 +107,7 @@ def test_errors():
 
 
 @pytest.mark.parametrize("size", [0.01, 0.05, 0.5])
-def test_no_point_of_a_face_is_beyond_the_sites_reach(size):
+def test_every_point_of_a_face_is_within_reach_of_a_site(size):
     generator = np.random.default_rng(3)
     for flatness in (1.0, 0.1, 0.001):
         for corners in generator.uniform(size=(20, 3, 3)) * [size, size * flatness, 0]:

@@ -24,7 +24,7 @@ def random_walk(count: int, seed: int) -> np.ndarray:
 
 
 def disturbed(poses: np.ndarray, seed: int, scale: float = 1.0) -> np.ndarray:
-    """Noise on every pose, and the whole in another world frame."""
+    """Poses with noise, in another world frame."""
     generator = np.random.default_rng(seed)
     noise = pose_from(
         Rotation.from_rotvec(generator.normal(scale=0.01, size=(len(poses), 3))).as_matrix(),
@@ -37,10 +37,10 @@ def disturbed(poses: np.ndarray, seed: int, scale: float = 1.0) -> np.ndarray:
 
 
 def evo_ate(estimated, reference, with_scale):
-    path, ground_truth = PosePath3D(poses_se3=list(estimated)), PosePath3D(poses_se3=list(reference))
-    path.align(ground_truth, correct_scale=with_scale)
+    trajectory, ground_truth = PosePath3D(poses_se3=list(estimated)), PosePath3D(poses_se3=list(reference))
+    trajectory.align(ground_truth, correct_scale=with_scale)
     metric = metrics.APE(metrics.PoseRelation.translation_part)
-    metric.process_data((ground_truth, path))
+    metric.process_data((ground_truth, trajectory))
     return {name: 100 * value for name, value in metric.get_all_statistics().items()}
 
 
@@ -79,7 +79,7 @@ def test_real_trajectories_agree_with_evo():
         check_against_evo(disturbed(dataset.poses(), seed=3), dataset.poses())
 
 
-def test_alignment_undoes_the_world_and_the_scale():
+def test_alignment_removes_the_world_transform_and_the_scale():
     reference = random_walk(50, 1)
     world = pose_from(Rotation.random(random_state=2).as_matrix(), [3.0, 1.0, -1.0])
     estimated = world @ reference
@@ -94,7 +94,7 @@ def test_alignment_undoes_the_world_and_the_scale():
     np.testing.assert_allclose(alignment.apply(estimated[:, :3, 3]), reference[:, :3, 3], atol=1e-12)
 
 
-def test_frames_without_truth_are_left_out():
+def test_frames_without_ground_truth_are_ignored():
     reference = random_walk(40, 4)
     estimated = disturbed(reference, 5)
     gaps = reference.copy()
@@ -103,13 +103,13 @@ def test_frames_without_truth_are_left_out():
     assert ate(estimated, gaps) == pytest.approx(ate(estimated[kept], reference[kept]))
     errors = absolute_errors(estimated, gaps, align(estimated, gaps))
     assert np.isnan(errors).tolist() == (~kept).tolist()
-    # Steps across a gap don't exist: 1-9, then 12-38.
+    # Frames 1-9 and 12-38 have ground truth; there are no pairs across the gap.
     parts = [rpe(estimated[part], reference[part])["rpe_cm"] for part in (slice(1, 10), slice(12, 39))]
     expected = np.sqrt((8 * parts[0] ** 2 + 26 * parts[1] ** 2) / 34)
     assert rpe(estimated, gaps)["rpe_cm"] == pytest.approx(expected)
 
 
-def test_nothing_to_measure():
+def test_no_frames_give_no_metrics():
     poses = random_walk(3, 0)
     unknown = np.full((3, 4, 4), np.nan)
     assert ate(poses, unknown) == {}

@@ -1,4 +1,4 @@
-"""Surfaces sampled from their parametric forms: an independent truth for the signed distances."""
+"""Surfaces sampled from their parametric forms: an independent reference for the signed distances."""
 
 import math
 
@@ -41,7 +41,7 @@ def torus(radius, tube_radius):
 
 
 def superquadric(half_size, exponent):
-    # Directions through a box's faces crowd less at the edges than angles do.
+    # Directions through a grid on the faces of a box are more uniform at the edges than a grid of angles.
     directions = box((1.0, 1.0, 1.0)) * torch.tensor(half_size, dtype=torch.float64)
     scaled = directions.abs() / torch.tensor(half_size, dtype=torch.float64)
     return directions / scaled.pow(exponent).sum(1, keepdim=True).pow(1 / exponent)
@@ -53,5 +53,5 @@ def wavy_sheet(amplitude, wave_number, reach=6.0):
 
 
 def nearest_distance(points, surface):
-    """Distance of each point [N,3] to the nearest of the surface's samples."""
+    """Distance of each point [N, 3] to the nearest sample of the surface."""
     return torch.cat([torch.cdist(chunk, surface).amin(1) for chunk in points.split(64)])

@@ -1,4 +1,4 @@
-"""The file of the prior's weights."""
+"""Loading the weights file of the prior."""
 
 import json
 
@@ -20,7 +20,7 @@ def write(path, tensors=GOOD, metadata=SETTINGS):
     return path
 
 
-def test_the_shipped_prior_fits_the_networks():
+def test_the_shipped_prior_has_the_shapes_of_the_networks():
     prior = load_prior()
     assert prior.encoder_params.shape == (ops.ENCODER_PARAMETERS,) == (parameter_count(ENCODER_WIDTHS),)
     inputs, hidden, outputs = DECODER_WIDTHS[0], DECODER_WIDTHS[1], DECODER_WIDTHS[3]
@@ -29,13 +29,13 @@ def test_the_shipped_prior_fits_the_networks():
     assert {"script_version", "settings", "training_kinds"} <= prior.metadata.keys()
 
 
-def test_the_shipped_decoder_starts_without_the_position():
+def test_the_shipped_decoder_ignores_the_position():
     first = load_prior().decoder_params[: 32 * 11].view(32, 11)
     assert not first[:, :3].any()
     assert first[:, 3:].any()
 
 
-def test_a_users_file_is_read(tmp_path):
+def test_a_weights_file_of_a_user_is_loaded(tmp_path):
     prior = load_prior(write(tmp_path / "own.safetensors"))
     assert prior.encoder_params.shape == (5128,)
     assert prior.neighborhood == 64
@@ -51,8 +51,8 @@ def refused(path, message):
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    refused(tmp_path / "none.safetensors", "no such file of weights")
-    refused(tmp_path, "no such file of weights")
+    refused(tmp_path / "none.safetensors", "no such weights file")
+    refused(tmp_path, "no such weights file")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.99])
@@ -90,8 +90,8 @@ def test_a_missing_tensor_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("metadata", [None, {}, [], {"settings": 3}, {"settings": {"neighborhood": 27}}])
-def test_provenance_must_say_the_neighborhood(tmp_path, metadata):
-    message = "metadata prior must say settings.neighborhood, 8 or 64"
+def test_provenance_must_have_the_neighborhood(tmp_path, metadata):
+    message = "metadata prior must have settings.neighborhood, 8 or 64"
     refused(write(tmp_path / "w.safetensors", metadata=metadata), message)
 
 

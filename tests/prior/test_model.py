@@ -1,4 +1,4 @@
-"""The training's networks compute what the ops compute in use."""
+"""The networks of the training compute the same as the ops."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ from spslam.prior.model import (
 )
 from spslam.prior.patches import PatchSettings, observe
 
-# float32 sums of up to some hundred pairs in another order.
+# float32 sums of up to some hundred pairs, in another order.
 ROUNDING = 2e-5
 
 
@@ -40,37 +40,37 @@ def cloud(generator, count=700, dtype=torch.float32):
 
 @pytest.mark.parametrize("neighborhood", [8, 64])
 @pytest.mark.parametrize("min_pair_weight", [0.0, 1e-3, 0.02])
-def test_encoding_is_that_of_the_op(neighborhood, min_pair_weight, encoder, generator):
+def test_encoding_equals_that_of_the_op(neighborhood, min_pair_weight, encoder, generator):
     points, normals = cloud(generator)
     corners, features, weights = encode(points, normals, encoder, neighborhood, min_pair_weight)
-    got = ops.encode_points(points, normals, encoder, 1.0, neighborhood, min_pair_weight)
-    assert torch.equal(got[0].long(), corners)
-    torch.testing.assert_close(got[1], features, atol=ROUNDING, rtol=ROUNDING)
-    torch.testing.assert_close(got[2], weights, atol=ROUNDING, rtol=ROUNDING)
+    actual = ops.encode_points(points, normals, encoder, 1.0, neighborhood, min_pair_weight)
+    assert torch.equal(actual[0].long(), corners)
+    torch.testing.assert_close(actual[1], features, atol=ROUNDING, rtol=ROUNDING)
+    torch.testing.assert_close(actual[2], weights, atol=ROUNDING, rtol=ROUNDING)
 
 
-def test_decoding_is_that_of_the_op(decoder, generator):
+def test_decoding_equals_that_of_the_op(decoder, generator):
     features = torch.randn(50, 8, generator=generator)
     inputs = torch.cat([torch.zeros(50, 3), features], 1)
-    want = ops.mlp(inputs, decoder, 32, 1, ops.Activation.TANH)[:, 0]
-    torch.testing.assert_close(decode(features, decoder), want, atol=ROUNDING, rtol=ROUNDING)
+    expected = ops.mlp(inputs, decoder, 32, 1, ops.Activation.TANH)[:, 0]
+    torch.testing.assert_close(decode(features, decoder), expected, atol=ROUNDING, rtol=ROUNDING)
 
 
-def test_patches_are_encoded_each_for_itself(encoder, generator):
+def test_patches_are_encoded_independently(encoder, generator):
     patches = observe("box_on_plane", 5, generator, PatchSettings())
     fields = encode_patches(patches, encoder, 64, 1e-3)
-    lattice = torch.cartesian_prod(*[torch.arange(-6, 7)] * 3)
-    embeddings, weights = fields.embeddings.view(5, len(lattice), 8), fields.weights.view(5, len(lattice))
+    grid = torch.cartesian_prod(*[torch.arange(-6, 7)] * 3)
+    embeddings, weights = fields.embeddings.view(5, len(grid), 8), fields.weights.view(5, len(grid))
     for patch in range(5):
         seen = patches.seen[patch]
         corners, features, sums = encode(patches.points[patch][seen], patches.normals[patch][seen], encoder, 64, 1e-3)
         filled = weights[patch] > 0
-        assert torch.equal(lattice[filled], corners)
+        assert torch.equal(grid[filled], corners)
         torch.testing.assert_close(embeddings[patch][filled], features, atol=ROUNDING, rtol=ROUNDING)
         torch.testing.assert_close(weights[patch][filled], sums, atol=ROUNDING, rtol=ROUNDING)
 
 
-def test_interpolation_is_that_of_the_op(generator):
+def test_interpolation_equals_that_of_the_op(generator):
     side = 13
     embeddings = torch.randn(2 * side**3, 8, generator=generator)
     fields = PatchFields(embeddings, torch.ones(2 * side**3))
@@ -80,9 +80,9 @@ def test_interpolation_is_that_of_the_op(generator):
     lower = queries.floor()
     steps = torch.tensor([side * side, side, 1])
     ids = patch[:, None] * side**3 + ((lower.long()[:, None] + corner_offsets(8).flip(1) + 6) * steps).sum(-1)
-    want = ops.trilinear_interpolate(embeddings, ids.int(), queries - lower)
+    expected = ops.trilinear_interpolate(embeddings, ids.int(), queries - lower)
     assert inside.all()
-    torch.testing.assert_close(features, want, atol=ROUNDING, rtol=ROUNDING)
+    torch.testing.assert_close(features, expected, atol=ROUNDING, rtol=ROUNDING)
 
 
 def test_a_query_needs_all_eight_corners():

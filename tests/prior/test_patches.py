@@ -1,4 +1,4 @@
-"""What is observed of the solids."""
+"""Simulated observations of the solids."""
 
 from dataclasses import replace
 
@@ -24,14 +24,14 @@ def test_clean_points_are_the_traced_surface(kind, generator):
 
 
 def test_traced_points_lie_on_the_solid(generator, monkeypatch):
-    """Keeps the solid that `observe` draws, and asks it."""
+    """Evaluates the distance of the solid that `observe` draws."""
     from spslam.prior import patches as patches_module
 
     kept = []
     monkeypatch.setattr(
         patches_module,
-        "_about_the_origin",
-        lambda *a, inner=patches_module._about_the_origin: kept.append(inner(*a)) or kept[-1],
+        "_at_origin",
+        lambda *a, inner=patches_module._at_origin: kept.append(inner(*a)) or kept[-1],
     )
     for kind in KINDS:
         patches = observe(kind, 16, generator, CLEAN)
@@ -51,7 +51,7 @@ def test_values_are_finite_within_reach(kind, generator):
     assert (patches.normals[~patches.seen] == 0).all()
 
 
-def test_noise_runs_along_the_view(generator):
+def test_noise_is_along_the_view_direction(generator):
     patches = observe("plane", 64, generator, PatchSettings(noise=0.1))
     error = (patches.points - patches.surface)[patches.seen]
     view = patches.view.expand_as(patches.surface)[patches.seen]
@@ -61,34 +61,34 @@ def test_noise_runs_along_the_view(generator):
     assert along.mean().abs() < 0.005
 
 
-def test_normals_are_unit_and_jittered(generator):
+def test_normals_are_unit_and_noisy(generator):
     patches = observe("plane", 64, generator, PatchSettings())
-    normals, true = patches.normals[patches.seen], patches.surface_normals[patches.seen]
+    normals, exact = patches.normals[patches.seen], patches.surface_normals[patches.seen]
     assert torch.allclose(normals.norm(dim=-1), torch.ones(len(normals)), atol=1e-5)
-    turned = (normals * true).sum(-1).clamp(-1, 1).arccos()
-    assert 0.02 < turned.median() < 0.3
+    angle = (normals * exact).sum(-1).clamp(-1, 1).arccos()
+    assert 0.02 < angle.median() < 0.3
 
 
-def test_points_are_thinned_and_have_holes(generator):
+def test_points_are_dropped_and_have_holes(generator):
     patches = observe("plane", 200, generator, PatchSettings())
     share = patches.seen.float().mean(1)
     assert share.min() < 0.25 < 0.6 < share.max()
 
 
-def test_queries_agree_with_what_the_ray_sees(generator):
+def test_sign_of_queries_agrees_with_the_view(generator):
     patches = observe("slab", 64, generator, PatchSettings())
     behind = ((patches.queries - patches.surface) * patches.view).sum(-1)[patches.valid]
     sdf = patches.sdf[patches.valid]
     assert ((sdf < 0) == (behind > 0))[behind.abs() > 0.05].all()
 
 
-def test_a_slab_is_not_queried_beyond_its_middle(generator):
-    """Half a slab's thickness is at most 1.5 voxels; deeper queries have their nearest surface on the far side."""
+def test_queries_do_not_go_beyond_the_middle_of_a_slab(generator):
+    """Half the thickness is at most 1.5 voxels; queries deeper than that are nearest to the far side."""
     patches = observe("slab", 64, generator, PatchSettings())
     assert 2 * patches.sdf[patches.valid].min() > -1.5 - ON_SURFACE
 
 
-def test_same_generator_state_gives_the_same_patches_and_leaves_the_global_one_alone():
+def test_patches_depend_on_the_given_generator_only():
     before = torch.get_rng_state()
     first, second = (observe("cut_sphere", 8, torch.Generator().manual_seed(5), PatchSettings()) for _ in range(2))
     assert torch.equal(before, torch.get_rng_state())
@@ -96,20 +96,20 @@ def test_same_generator_state_gives_the_same_patches_and_leaves_the_global_one_a
         assert torch.equal(getattr(first, name), getattr(second, name))
 
 
-def test_batches_join_and_split(generator):
+def test_batches_are_concatenated_and_indexed(generator):
     first, second = (observe("sphere", 3, generator, PatchSettings()) for _ in range(2))
     both = Patches.cat([first, second])
     assert len(both) == 6
     assert torch.equal(both[3:].points, second.points)
 
 
-def test_blurred_normals_turn_gradually_at_an_edge():
-    """Differences over a voxel see both faces of a box near its edge; they change no point and no distance."""
+def test_blurred_normals_change_gradually_at_an_edge():
+    """Near an edge of a box, differences over a voxel use both faces. Points and distances do not change."""
 
-    def look(blur):
+    def observe_box(blur):
         return observe("box", 64, torch.Generator().manual_seed(2), replace(CLEAN, max_normal_blur=blur))
 
-    sharp, blurred = look(0.0), look(1.0)
+    sharp, blurred = observe_box(0.0), observe_box(1.0)
     for name in ("points", "seen", "sdf", "valid", "surface_normals"):
         assert torch.equal(getattr(sharp, name), getattr(blurred, name))
     cosine = (sharp.normals * blurred.normals).sum(-1)[sharp.seen]

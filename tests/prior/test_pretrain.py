@@ -1,4 +1,4 @@
-"""Pretraining: it learns, and the bytes are the same however it is run."""
+"""Training of the prior: it reduces the error, and is reproducible for any number of workers and interruptions."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ def test_weights_load_with_their_provenance(trained):
     assert not (prior.decoder_params[: 32 * 11].view(32, 11)[:, :3]).any()
 
 
-def test_number_of_workers_does_not_matter(trained, tmp_path):
+def test_result_does_not_depend_on_the_number_of_workers(trained, tmp_path):
     pretrain(tmp_path / "two.safetensors", SMALL, workers=2)
     assert (tmp_path / "two.safetensors").read_bytes() == trained.read_bytes()
 
@@ -69,21 +69,21 @@ def test_resumed_training_gives_the_same_bytes(trained, tmp_path):
     assert not training_files(output).checkpoint.exists()
 
 
-def test_seed_matters(trained, tmp_path):
+def test_another_seed_gives_other_weights(trained, tmp_path):
     pretrain(tmp_path / "other.safetensors", replace(SMALL, seed=1))
     assert not torch.equal(
         load_prior(tmp_path / "other.safetensors").encoder_params, load_prior(trained).encoder_params
     )
 
 
-def test_global_state_is_left_alone(tmp_path):
+def test_global_state_is_not_changed(tmp_path):
     threads, numbers = torch.get_num_threads(), torch.get_rng_state()
     pretrain(tmp_path / "prior.safetensors", replace(SMALL, steps=2))
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.get_rng_state(), numbers)
 
 
-def test_log_holds_course_and_validation(trained):
+def test_log_has_errors_and_validation(trained):
     entries = [json.loads(line) for line in training_files(trained).log.read_text().splitlines()]
     assert [entry["step"] for entry in entries] == [5, 10, 15, 20, 20]
     assert all(entry["error_mm"] > 0 for entry in entries[:4])
@@ -98,7 +98,7 @@ def test_checkpoint_of_other_settings_is_refused(tmp_path):
         pretrain(output, replace(SMALL, seed=4), resume=True)
 
 
-def test_damaged_checkpoint_gives_one_line(tmp_path):
+def test_damaged_checkpoint_gives_a_one_line_error(tmp_path):
     output = tmp_path / "prior.safetensors"
     training_files(output).checkpoint.write_bytes(b"no checkpoint")
     with pytest.raises(WeightsError, match=r"prior\.checkpoint\.safetensors: not a checkpoint of spslam pretrain: .+"):
@@ -106,12 +106,12 @@ def test_damaged_checkpoint_gives_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"steps": 0}, {"seed": -1}, {"patches_per_kind": 0}])
-def test_settings_out_of_range_are_named(change):
+def test_settings_out_of_range_are_refused(change):
     with pytest.raises(ValueError, match=f"PretrainSettings: {next(iter(change))} must be"):
         PretrainSettings(**change)
 
 
-def test_learning_rate_warms_up_and_falls():
+def test_learning_rate_warms_up_and_decays():
     settings = PretrainSettings(steps=1000)
     rates = [settings.learning_rate_at(step) for step in range(1000)]
     assert rates[0] < rates[10] < max(rates) <= settings.learning_rate
@@ -127,7 +127,7 @@ def test_first_zero_crossing():
     assert where.tolist() == [1.5, 2.25, 0.0, 2.0]
 
 
-def test_validation_is_repeatable():
+def test_validation_is_reproducible():
     networks = split_networks(initial_networks(0))
     first, second = (validate(*networks, 64, 1e-3, ("torus",)) for _ in range(2))
     assert first == second
@@ -135,7 +135,7 @@ def test_validation_is_repeatable():
 
 
 @pytest.mark.slow
-def test_a_minute_of_training_learns(tmp_path):
+def test_a_minute_of_training_reduces_the_error(tmp_path):
     provenance = pretrain(tmp_path / "prior.safetensors", PretrainSettings(steps=400))
     mean = provenance["validation"]["mean"]
     assert mean["zero_crossing_mm"] < 2.0

@@ -1,4 +1,4 @@
-"""Random solids: compositions against brute force, anchors, and draws from the generator alone."""
+"""Random solids: compositions against brute force, surface near the origin, and reproducibility."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from spslam.prior.shapes import HELD_OUT_KINDS, TRAINING_KINDS, Composition, nea
 from tests.prior import surfaces
 
 KINDS = TRAINING_KINDS + HELD_OUT_KINDS
-# Walks down a composition's distance end in its creases, where there is no normal.
+# Without compositions: gradient steps in their distance end in creases, where normals are undefined.
 PRIMITIVES = [kind for kind in KINDS if "_on_" not in kind and "cut" not in kind]
 # Coordinates of up to 60 voxels in float32.
 ROUNDING = 2e-4
@@ -21,7 +21,7 @@ def test_surface_passes_near_the_origin(kind, generator):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_distance_is_never_more_than_the_way_to_another_point(kind, generator):
+def test_distance_is_lipschitz_continuous(kind, generator):
     solid = random_solid(kind, 16, generator)
     center = nearest_surface(solid, torch.randn(16, 1, 3, generator=generator))
     here, there = (center + 2 * torch.rand(16, 200, 3, generator=generator) - 1 for _ in range(2))
@@ -41,33 +41,33 @@ def test_normals_are_unit_gradients(kind, generator):
 
 
 @pytest.mark.parametrize("operation", ["union", "intersection"])
-def test_composition_bounds_the_distance_and_is_exact_where_its_foot_is_on_the_surface(operation, generator):
+def test_composition_is_a_lower_bound_and_exact_if_the_foot_point_is_on_the_surface(operation, generator):
     parts = [random_solid("box", 1, generator), random_solid("plane", 1, generator)]
     solid = Composition(parts[0], parts[1], operation)
     samples = torch.cat([_samples(part) for part in parts])
     samples = samples[solid.signed_distance(samples[None].float())[0].abs() < 1e-3].double()
     points = 4 * torch.rand(1, 1000, 3, generator=generator) - 2
-    got, normals = solid.signed_distance(points)[0], solid.normals(points)[0]
-    want = surfaces.nearest_distance(points[0].double(), samples)
+    actual, normals = solid.signed_distance(points)[0], solid.normals(points)[0]
+    expected = surfaces.nearest_distance(points[0].double(), samples)
     spacing = 0.2
-    assert (got.abs() <= want + spacing).all()
-    foot = points[0] - got[:, None] * normals
+    assert (actual.abs() <= expected + spacing).all()
+    foot = points[0] - actual[:, None] * normals
     exact = solid.signed_distance(foot[None])[0].abs() < 0.02
     assert exact.float().mean() > 0.3
-    assert ((want - got.abs())[exact] < spacing).all()
+    assert ((expected - actual.abs())[exact] < spacing).all()
 
 
 def _samples(part):
-    """Points of a primitive's surface in the patch's frame, from its parametric form."""
+    """Points of the surface of a primitive in the patch frame, from its parametric form."""
     half_size = part.parameters.get("half_size")
     own = surfaces.plane(8.0) if half_size is None else surfaces.box(half_size[0].tolist())
-    return (own - part.anchor.double()) @ part.rotation[0].T.double() + part.place.double()
+    return (own - part.anchor.double()) @ part.rotation[0].T.double() + part.position.double()
 
 
 def test_concave_solids_are_hollow(generator):
     rooms = random_solid("room", 8, generator)
     assert (rooms.orientation == -1).all()
-    centers = rooms.place - (rooms.anchor[:, None] @ rooms.rotation.transpose(1, 2))[:, 0]
+    centers = rooms.position - (rooms.anchor[:, None] @ rooms.rotation.transpose(1, 2))[:, 0]
     assert (rooms.signed_distance(centers[:, None]) > 0).all()
 
 

@@ -11,7 +11,7 @@ def row(*values):
     return torch.tensor([values], dtype=torch.float64)
 
 
-# kind: distance, its samples, and a point test of what is inside
+# kind: distance, surface samples, and a test whether points are inside
 SOLIDS = {
     "plane": (sd.plane, surfaces.plane(), lambda p: p[:, 2] < 0),
     "sphere": (lambda p: sd.sphere(p, row(2.5)), surfaces.sphere(2.5), lambda p: p.norm(dim=1) < 2.5),
@@ -44,8 +44,8 @@ SOLIDS = {
 }
 # Brute force overestimates by at most the spacing of the samples.
 SPACING = 0.08
-# Iterated foot points are good in the band that training queries, outside, and inside off the medial axis.
-ITERATED, UNSETTLED, BAND, DEPTH = ("superquadric", "wavy_sheet"), 0.01, 2.0, 1.0
+# Iterated foot points are accurate in the band used for training: outside, and inside away from the medial axis.
+ITERATED, TOLERANCE, BAND, DEPTH = ("superquadric", "wavy_sheet"), 0.01, 2.0, 1.0
 
 
 @pytest.fixture
@@ -54,14 +54,14 @@ def points(generator):
 
 
 @pytest.mark.parametrize("kind", SOLIDS)
-def test_distance_is_that_to_the_nearest_sample(kind, points):
+def test_distance_equals_that_to_the_nearest_sample(kind, points):
     distance, samples, _ = SOLIDS[kind]
-    got = distance(points[None])[0]
-    want = surfaces.nearest_distance(points, samples)
-    excess = want - got.abs()
+    actual = distance(points[None])[0]
+    expected = surfaces.nearest_distance(points, samples)
+    excess = expected - actual.abs()
     if kind in ITERATED:
-        excess = excess[(want < BAND) & (got > -DEPTH)]
-    assert excess.min() > (-UNSETTLED if kind in ITERATED else -1e-9)
+        excess = excess[(expected < BAND) & (actual > -DEPTH)]
+    assert excess.min() > (-TOLERANCE if kind in ITERATED else -1e-9)
     assert excess.max() < SPACING
 
 
@@ -72,15 +72,15 @@ def test_negative_inside(kind, points):
 
 
 @pytest.mark.parametrize("kind", SOLIDS)
-def test_gradient_has_length_one(kind, points):
+def test_gradient_has_unit_length(kind, points):
     distance, _, _ = SOLIDS[kind]
     here = distance(points[None])[0]
     near = points[(here < BAND) & (here > -DEPTH)]
     step = 1e-5 * torch.eye(3, dtype=torch.float64)
     differences = [(distance((near + h)[None]) - distance((near - h)[None]))[0] / 2e-5 for h in step]
     length = torch.stack(differences).norm(dim=0)
-    # A difference across the medial axis is shorter.
-    share = ((length - 1).abs() < (UNSETTLED if kind in ITERATED else 1e-6)).double().mean()
+    # Finite differences across the medial axis are shorter.
+    share = ((length - 1).abs() < (TOLERANCE if kind in ITERATED else 1e-6)).double().mean()
     assert share > 0.99
 
 

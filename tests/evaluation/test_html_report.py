@@ -1,4 +1,4 @@
-"""The report: everything a run leaves is shown, whatever is missing is left out, and nothing is fetched."""
+"""The HTML report: it shows all files of a run, leaves out missing ones, and is self-contained."""
 
 import json
 import re
@@ -21,7 +21,7 @@ FRAMES = 30
 
 
 class Structure(HTMLParser):
-    """Collects what a page links to and checks that tags are closed in order."""
+    """Collects the links and texts of a page, and checks that tags are closed in order."""
 
     def __init__(self):
         super().__init__()
@@ -49,13 +49,13 @@ def read(path):
     return page
 
 
-def path_of_poses():
+def trajectory_poses():
     return np.stack([pose_from(np.eye(3), np.array([0.02 * i, 0.01 * np.sin(i), 0.03 * i])) for i in range(FRAMES)])
 
 
 def write_run(folder, mesh=True, ground_truth=True, log=True, previews=True, config=True):
     folder.mkdir(exist_ok=True)
-    times, poses = np.arange(FRAMES) / 30, path_of_poses()
+    times, poses = np.arange(FRAMES) / 30, trajectory_poses()
     lost = np.zeros(FRAMES, bool)
     lost[12:14] = True
     Trajectory(times, poses, lost).save_tum(folder / "trajectory.txt")
@@ -87,7 +87,7 @@ def write_run(folder, mesh=True, ground_truth=True, log=True, previews=True, con
     return folder
 
 
-def test_report_shows_everything_and_fetches_nothing(tmp_path):
+def test_report_shows_all_sections_and_is_self_contained(tmp_path):
     path = write_report(write_run(tmp_path / "kitchen <1>"))
     assert path == tmp_path / "kitchen <1>" / "report.html"
     page = read(path)
@@ -98,36 +98,38 @@ def test_report_shows_everything_and_fetches_nothing(tmp_path):
     assert "http" not in re.sub('data:[^"]*', "", text)
     assert "<script" not in text
     for word in ("kitchen <1>", "<processor & co>", "Map", "Views", "Trajectory", "Error over time", "Time", "Tracking",
-                 "All figures", "Settings", "# a <comment>", "1.25 cm", "ground truth", "lost"):  # fmt: skip
+                 "All metrics", "Settings", "# a <comment>", "1.25 cm", "ground truth", "lost"):  # fmt: skip
         assert any(word in part for part in page.text), word
 
 
 @pytest.mark.parametrize("missing", ["mesh", "ground_truth", "log", "previews", "config"])
-def test_what_is_missing_is_left_out(tmp_path, missing):
+def test_missing_files_are_left_out(tmp_path, missing):
     path = write_report(write_run(tmp_path, **{missing: False}))
     headings = re.findall("<h2>(.*?)</h2>", path.read_text())
-    gone = {"mesh": "Map", "ground_truth": "Error over time", "log": "Time", "previews": "Views", "config": ""}[missing]
-    assert gone not in headings
+    removed = {"mesh": "Map", "ground_truth": "Error over time", "log": "Time", "previews": "Views", "config": ""}[
+        missing
+    ]
+    assert removed not in headings
     read(path)
 
 
-def test_trajectory_and_metrics_alone_are_enough(tmp_path):
+def test_trajectory_and_metrics_are_sufficient(tmp_path):
     run = write_run(tmp_path, mesh=False, ground_truth=False, log=False, previews=False, config=False)
     assert re.findall("<h2>(.*?)</h2>", write_report(run).read_text()) == [
         "Trajectory",
         "As in the paper",
-        "All figures",
+        "All metrics",
     ]
 
 
-def test_one_frame_is_enough(tmp_path):
+def test_one_frame_is_sufficient(tmp_path):
     run = write_run(tmp_path, ground_truth=False)
     Trajectory(np.zeros(1), np.eye(4)[None]).save_tum(run / "trajectory.txt")
     (run / "log.jsonl").write_text('{"tracking_ms": 0, "encode_ms": 1, "mapping_ms": 2}\n')
     read(write_report(run))
 
 
-def test_empty_mesh_is_left_out(tmp_path):
+def test_an_empty_mesh_is_left_out(tmp_path):
     run = write_run(tmp_path)
     header = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\n"
     (run / "mesh.ply").write_text(header + "element face 0\nproperty list uchar int vertex_indices\nend_header\n")
@@ -144,14 +146,14 @@ def test_writing_again_gives_the_same_bytes(tmp_path):
     ("name", "content", "message"),
     [
         ("metrics.json", "{", "metrics.json: must be JSON"),
-        ("metrics.json", "[1]", "metrics.json: must hold a JSON object, got list"),
+        ("metrics.json", "[1]", "metrics.json: must contain a JSON object, got list"),
         ("log.jsonl", "{}\nx\n", "log.jsonl: must be JSON"),
         ("trajectory.txt", "1 2 3\n", "trajectory.txt, line 1: must be"),
         ("mesh.ply", "nonsense", "mesh.ply: can't be read as a mesh"),
-        ("previews/camera.json", '{"width": 3}', "camera.json: must hold a camera"),
+        ("previews/camera.json", '{"width": 3}', "camera.json: must contain a camera"),
     ],
 )
-def test_damaged_files_are_named(tmp_path, name, content, message):
+def test_errors_name_the_damaged_file(tmp_path, name, content, message):
     run = write_run(tmp_path)
     (run / name).write_text(content)
     with pytest.raises(Exception, match=re.escape(message)) as caught:
@@ -160,7 +162,7 @@ def test_damaged_files_are_named(tmp_path, name, content, message):
     assert not (run / "report.html").exists()
 
 
-def test_folder_of_no_run_is_refused(tmp_path):
+def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(OutputError, match="must be the output folder of a finished run, but has no trajectory.txt"):
         write_report(tmp_path)
 
