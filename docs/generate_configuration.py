@@ -23,7 +23,7 @@ HEADER = """# Configuration
 
 <!-- Written by docs/generate_configuration.py; change spslam/options/ or configs/ and run it again. -->
 
-A run's options are merged from four places, each winning over the one before:
+A run's options are merged from four places, each overriding those before:
 
 1. `configs/defaults.yaml`, which holds a value for every option,
 2. a preset, `--preset paper|balanced|fast`,
@@ -35,7 +35,8 @@ A file may name its `preset`, and under `presets: {{paper: {{...}}}}` give optio
 so `configs/replica.yaml` holds the paper's iterations for Replica without touching the other presets. Unknown options,
 wrong types and values out of range are errors before anything runs. So is an option from a file or `--set` that has no
 effect with the other options: "only with" below says what it needs. The resolved options of a run are in its
-`config.yaml`, marked with `resolved: true`, which can be given to `spslam run` again.
+`config.yaml`, marked with `resolved: true`, which can be given to `spslam run` again. Sections and equations in the
+tables are those of the paper.
 
 From Python:
 
@@ -88,8 +89,8 @@ def _preset_table(defaults: dict[str, Any], presets: dict[str, dict[str, Any]]) 
         if len({str(value) for value in values}) > 1:
             rows.append(f"| `{key}` | " + " | ".join(_value(value) for value in values) + " |")
     text = (
-        "`paper` is section IV.A of the paper to the letter; `balanced`, the default, is our most accurate at the "
-        "camera's rate; `fast` is the least work that still maps. They differ in:"
+        "`paper` has the values of section IV.A of the paper; `balanced`, the default, is the most accurate at the "
+        "camera's frame rate; `fast` has the fewest iterations. They differ in:"
     )
     return f"## Presets\n\n{text}\n\n" + "\n".join(rows) + "\n"
 
@@ -119,7 +120,7 @@ def _value(value: Any) -> str:
 
 
 def _meaning(field: Any) -> str:
-    needs = [" or ".join(map(_condition, need.any_of)) for need in needs_of(field) if not need.said_by_section]
+    needs = [" or ".join(map(_condition, need.any_of)) for need in needs_of(field) if not need.documented_by_section]
     text = field.description + (f"; only with {', and '.join(needs)}" if needs else "")
     return text.replace("|", "\\|")
 

@@ -1,7 +1,7 @@
 """Every option of a run: type, unit, range, what it does, and what other options it needs to have an effect.
 
-Values are not defined here. `configs/defaults.yaml` holds a value for every option, a preset and a configuration file
-change some of them, and `spslam.config.load_config` merges the three.
+Values are not defined here. `configs/defaults.yaml` holds a value for every option, a preset, a configuration file
+and `--set` override some of them, and `spslam.config.load_config` merges them.
 """
 
 from __future__ import annotations

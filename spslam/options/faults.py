@@ -26,7 +26,7 @@ RENAMED = {
     "tracking.min_valid_share": "tracking.min_valid_depth_share",
 }
 
-# Options that the command line gives a name of its own, which the user may know alone.
+# Command-line flags of options; messages name them too, as the user may not know the option.
 FLAGS = {"dataset.path": "--data"}
 
 
@@ -71,7 +71,7 @@ def describe_fault(fault: Any) -> str:
     if kind in ("extra_forbidden", "invalid_key"):
         return _unknown(path)
     if kind == "missing":
-        return f"{path} must be given; the configuration file has to say it"
+        return f"{path} must be set in the configuration file"
     if kind == "value_error":
         return str(context["error"])
     return f"{_option_path(path)} must {_rule(kind, context)}, got {brief(value)}"

@@ -10,20 +10,20 @@ _SOME_ITERATIONS = (above("mapping.iterations", 0), above("mapping.first_iterati
 _OPTIMIZES_GEOMETRY = is_("mapping.optimize_geometry", True)
 _OPTIMIZES_POSES = is_("mapping.optimize_poses", True)
 
-_MAPPING = Need(_SOME_ITERATIONS, said_by_section=True)
-_RENDERING = Need((*_SOME_ITERATIONS, _ADAM), said_by_section=True)
+_MAPPING = Need(_SOME_ITERATIONS, documented_by_section=True)
+_RENDERING = Need((*_SOME_ITERATIONS, _ADAM), documented_by_section=True)
 _GEOMETRY = need(_OPTIMIZES_GEOMETRY)
 _POSES = need(_OPTIMIZES_POSES)
 _COLOR = need(above("loss.rgb", 0))
 _UNIFORM = need(above("sampling.uniform", 0))
-# The geometric losses have no gradient by the color planes and the color decoder.
+# The geometric losses have no gradient with respect to the tri-planes and the color decoder.
 _SHAPE = need(_OPTIMIZES_GEOMETRY, _OPTIMIZES_POSES, _ADAM)
 
 
 class SamplingOptions(Section):
     """Samples along a ray (section III.B).
 
-    Rays are rendered by mapping, unless it makes no iteration, and by tracking with `adam`.
+    Rays are rendered by mapping with at least one iteration, and by tracking with `adam`.
     """
 
     uniform: int = option("N_c, samples between near and far", "samples", needs=(_RENDERING,), ge=0, le=128)
@@ -45,17 +45,17 @@ class SamplingOptions(Section):
 
 
 class LossOptions(Section):
-    """Weights of the loss (7) and its geometric targets.
+    """Weights of the loss, eq. (7), and its geometric targets.
 
-    The loss is minimized by mapping, unless it makes no iteration, and by tracking with `adam`.
+    The loss is minimized by mapping with at least one iteration, and by tracking with `adam`.
     """
 
-    rgb: float = option("lambda_rgb, weight of the color loss (8)", needs=(_RENDERING,), ge=0)
-    depth: float = option("lambda_depth, weight of the rendered depth loss (9)", needs=(_RENDERING, _SHAPE), ge=0)
-    free_space: float = option("lambda_fs, weight of the free-space loss (11)", needs=(_RENDERING, _SHAPE), ge=0)
-    sdf: float = option("lambda_sdf, weight of the signed distance loss (10)", needs=(_RENDERING, _SHAPE), ge=0)
+    rgb: float = option("lambda_rgb, weight of the color loss, eq. (8)", needs=(_RENDERING,), ge=0)
+    depth: float = option("lambda_depth, weight of the depth loss, eq. (9)", needs=(_RENDERING, _SHAPE), ge=0)
+    free_space: float = option("lambda_fs, weight of the free-space loss, eq. (11)", needs=(_RENDERING, _SHAPE), ge=0)
+    sdf: float = option("lambda_sdf, weight of the SDF loss, eq. (10)", needs=(_RENDERING, _SHAPE), ge=0)
     cosine_targets: bool = option(
-        "multiply the distance along the ray by the cosine between ray and surface normal; false is (10) as published",
+        "multiply the distance along the ray by the cosine between ray and surface normal; false is eq. (10)",
         needs=(_RENDERING, _SHAPE),
     )
 
@@ -88,13 +88,13 @@ class MappingOptions(Section):
         le=1,
     )
     embedding_rate: float = option("learning rate of the voxel embeddings", needs=(_MAPPING, _GEOMETRY), ge=0)
-    plane_rate: float = option("learning rate of the feature planes", needs=(_MAPPING, _COLOR), ge=0)
+    plane_rate: float = option("learning rate of the tri-planes", needs=(_MAPPING, _COLOR), ge=0)
     decoder_rate: float = option("learning rate of the geometry decoder", needs=(_MAPPING, _GEOMETRY), ge=0)
     color_decoder_rate: float = option("learning rate of the color decoder", needs=(_MAPPING, _COLOR), ge=0)
     pose_rate: float = option("learning rate of the poses", needs=(_MAPPING, _POSES), ge=0)
     optimize_poses: bool = option("optimize the poses of the selected frames together with the map", needs=(_MAPPING,))
     optimize_geometry: bool = option(
-        "optimize voxel embeddings and geometry decoder; false leaves geometry to fusion (1)", needs=(_MAPPING,)
+        "optimize voxel embeddings and geometry decoder; false leaves geometry to the prior's fusion", needs=(_MAPPING,)
     )
     reset_moments: bool = option("reset Adam's moments each time mapping runs", needs=(_MAPPING,))
 

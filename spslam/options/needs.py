@@ -32,7 +32,7 @@ class Condition:
         return f"{self.option}={in_yaml(self.value)}" if self.relation == "=" else f"{self.option} above {self.value}"
 
     def holds(self, config: BaseModel) -> bool:
-        """Whether the option of a whole configuration is so."""
+        """Whether the condition holds for a configuration."""
         actual = option_value(config, self.option)
         if self.relation == ">":
             return actual > self.value
@@ -45,11 +45,11 @@ class Need:
 
     Attributes:
         any_of: the conditions.
-        said_by_section: whether the section's docstring says so, and not each of its options.
+        documented_by_section: whether the section's docstring says so, and not each of its options.
     """
 
     any_of: tuple[Condition, ...]
-    said_by_section: bool = False
+    documented_by_section: bool = False
 
     def __str__(self) -> str:
         return " or ".join(str(condition) for condition in self.any_of)

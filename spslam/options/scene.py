@@ -16,13 +16,13 @@ class SceneOptions(Section):
 
     voxel_size_m: float = option("edge length of a voxel of the sparse volume", "m", gt=0, le=1)
     truncation_m: float = option("truncation distance tr of the signed distance", "m", gt=0, le=4)
-    plane_cell_m: float = option("edge length of a cell of the feature planes", "m", gt=0, le=4)
+    plane_cell_m: float = option("edge length of a tri-plane cell", "m", gt=0, le=4)
     position_scale: float = option("scale of the position that the geometry decoder takes as input", "1/m", gt=0)
     first_pose: Literal["dataset", "identity"] = option(
         "pose of the first frame: the data set's ground truth if there is one, or the identity"
     )
     max_voxels: int = option("maximum number of voxel vertices in the volume", "vertices", ge=1000)
-    max_texels: int = option("maximum number of texels in the three feature planes", "texels", ge=1000)
+    max_texels: int = option("maximum number of texels in the tri-planes", "texels", ge=1000)
 
     def check(self) -> None:
         if self.truncation_m < self.voxel_size_m:
@@ -32,8 +32,8 @@ class SceneOptions(Section):
 class PriorOptions(Section):
     """The depth encoder and its fusion into the volume (section III.A)."""
 
-    enabled: bool = option("encode each mapped frame and fuse it; false starts new voxels from random embeddings")
-    fusion: bool = option("fuse into existing voxels (1); false only fills new ones", needs=(_PRIOR,))
+    enabled: bool = option("encode each mapped frame and fuse it; false starts new vertices from random embeddings")
+    fusion: bool = option("fuse into existing vertices by eq. (1); false only fills new ones", needs=(_PRIOR,))
     weights: str | None = option(
         "file of encoder and decoder weights (safetensors); null is the shipped one for the neighborhood",
         needs=(need(_ENABLED, is_("prior.decoder", "pretrained")),),
@@ -48,7 +48,7 @@ class PriorOptions(Section):
     max_weight: float = option("upper limit of the fused weight W_g", needs=(_PRIOR,), gt=0)
     normal_step_px: int = option("step of the depth differences that surface normals are computed from", "px", ge=1)
     max_jump: float = option(
-        "depth difference between neighboring pixels, as a fraction of the depth, that is an edge", gt=0
+        "a pixel gets no normal if the depth `normal_step_px` away differs by this fraction or more", gt=0
     )
 
 

@@ -46,8 +46,8 @@ class TrackingOptions(Section):
         ge=0,
     )
     color_weight_m: float = option(
-        "Gauss-Newton: distance that a brightness difference between black and white to the last mapped frame counts "
-        "as; 0 does not compare colors",
+        "Gauss-Newton: weight of brightness residuals to the last mapped frame: the distance that a difference from "
+        "black to white counts as; 0 does not compare brightness",
         "m",
         ge=0,
     )
@@ -76,7 +76,10 @@ class TrackingOptions(Section):
     )
     lost_threshold: float = option("a frame is lost when its error probability stays above this", ge=0, le=1)
     relocalization_threshold: float = option(
-        "relocalize a lost camera only when the error probability is below this", ge=0, le=1
+        "relocalize a lost camera when the error probability is at most this, or at most 0.1 in 4 consecutive frames "
+        "with consistent poses",
+        ge=0,
+        le=1,
     )
     relocalization_candidates: int = option(
         "number of stored frames, the most similar ones, that a lost frame is aligned with; 0 does not relocalize",

@@ -66,7 +66,7 @@ def _failed(device: torch.device, error: RuntimeError) -> DeviceError:
     if "out of memory" in reason:
         return _out_of_memory(device)
     return DeviceError(
-        f"{_name(device)} has failed: {reason}; nvidia-smi shows its state, --device cpu does without it"
+        f"{_name(device)} has failed: {reason}; nvidia-smi shows its state; use --device cpu to run without it"
     )
 
 

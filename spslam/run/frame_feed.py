@@ -18,7 +18,7 @@ from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 from spslam.slam.upload import Uploader
 
-# More threads hardly decode faster: they wait for Python's lock, and slow down the frame loop.
+# More threads hardly decode faster: they wait for Python's GIL, and slow down the frame loop.
 MAX_WORKERS = 16
 MIN_WORKERS = 2
 MIN_AHEAD = 8
@@ -28,7 +28,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
     """Iterates over the frames of a data set in order; a frame that can't be read comes as its `DatasetError`.
 
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
-    another process do not compete with the frame loop for Python's lock. A data set that can't be pickled is read by
+    another process do not compete with the frame loop for Python's GIL. A data set that can't be pickled is read by
     threads of this process. At most `run.prefetch_ahead` frames exist at the same time. Nothing is read before the
     first frame is requested.
 

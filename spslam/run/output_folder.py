@@ -24,7 +24,7 @@ from spslam.run_folder import RunFolder
 from spslam.scene import Scene
 from spslam.trajectory import Trajectory
 
-# What locking says where the file system has no locks.
+# Error codes of flock on file systems without locks.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF)
 
 

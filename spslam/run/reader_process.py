@@ -1,4 +1,4 @@
-"""Frames prepared by the threads of another process, so that they don't compete with the frame loop for Python's lock.
+"""Frames prepared by the threads of another process, so that they don't compete with the frame loop for Python's GIL.
 
 Both processes map the same memory, divided into slots that hold one frame's pixels each. Over a socket the loop sends
 the work and then the numbers of slots that are free again; the reader sends one message per frame. Either side detects
@@ -183,6 +183,6 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
 def _describe_exit(code: int | None) -> str:
     how = f"by {signal.Signals(-code).name}" if code is not None and code < 0 else f"with code {code}"
     return (
-        f"the process that reads frames ended {how}; where memory was short, lower run.prefetch_ahead; "
-        "run.reader=threads reads without it"
+        f"the process that reads frames ended {how}; if memory was short, lower run.prefetch_ahead; "
+        "run.reader=threads uses no separate process"
     )

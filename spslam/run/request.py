@@ -1,4 +1,4 @@
-"""What a run is asked to do."""
+"""The input of a run."""
 
 from dataclasses import dataclass
 from pathlib import Path

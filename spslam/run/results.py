@@ -31,7 +31,7 @@ def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest,
         What is written to metrics.json.
 
     Raises:
-        SpslamError: there is no frame, no frame has a known pose, or a file can't be written.
+        SpslamError: there is no frame, all frames are lost, or a file can't be written.
     """
     config, folder, clock = request.config, session.folder, session.clock
     frames, skipped = system.state.frames, folder.read_skipped()
@@ -73,7 +73,7 @@ def write_results(system: SlamSystem, dataset: RgbdDataset, request: RunRequest,
 def _nothing_known(dataset: RgbdDataset, config: Config) -> str:
     depth = config.dataset
     return (
-        f"{dataset.name}: no frame has a known pose: none shows a surface between dataset.min_depth_m "
+        f"{dataset.name}: all frames are lost: none shows a surface between dataset.min_depth_m "
         f"({depth.min_depth_m:g} m) and dataset.max_depth_m ({depth.max_depth_m:g} m) in at least "
         f"tracking.min_valid_depth_share ({config.tracking.min_valid_depth_share:g}) of its pixels; "
         "`spslam check-data` shows what the depth images hold"

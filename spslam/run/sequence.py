@@ -82,16 +82,16 @@ def _kernel_threads_limited(device: torch.device) -> Iterator[None]:
 def _run(request: RunRequest, device: torch.device, progress: Progress | None) -> dict[str, Any]:
     started = time.perf_counter()
     dataset = open_sequence(request.config.dataset, request.data_dir, request.frames)
+    system = SlamSystem(request.config, dataset.camera, _first_pose(request.config, dataset), device)
     with OutputFolder(Path(request.output_dir)).locked():
         finished = finished_metrics(request, dataset)
-        return _process(request, dataset, device, progress, started) if finished is None else finished
+        return _process(request, dataset, system, progress, started) if finished is None else finished
 
 
 def _process(
-    request: RunRequest, dataset: RgbdDataset, device: torch.device, progress: Progress | None, started: float
+    request: RunRequest, dataset: RgbdDataset, system: SlamSystem, progress: Progress | None, started: float
 ) -> dict[str, Any]:
-    config = request.config
-    system = SlamSystem(config, dataset.camera, _first_pose(config, dataset), device)
+    config, device = request.config, system.device
     session = open_session(request, dataset, system)
     with FrameFeed(dataset, config, device, session.start) as feed:
         if device.type == "cuda":

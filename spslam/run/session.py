@@ -82,7 +82,7 @@ def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any
 
 
 def identity_of(dataset: RgbdDataset, data_dir: Path | None) -> dict[str, Any]:
-    """JSON object that tells the frames of one run from those of another."""
+    """JSON object that identifies the frames of a run."""
     return {
         "folder": str(Path(data_dir).resolve()) if data_dir else "",
         "frames": len(dataset),

@@ -1,1 +1,1 @@
-"""Tracking and mapping: the tracker, the mapper, what they remember, and the frame loop that joins them."""
+"""Tracking and mapping: the tracker, the mapper, their state, and the system that connects them."""

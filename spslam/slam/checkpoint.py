@@ -1,4 +1,4 @@
-"""Saving and restoring the system's state, so that an interrupted run goes on to the same bytes.
+"""Saving and restoring the system's state, so that a resumed run gives bit-identical results.
 
 One safetensors file, written to a temporary file, synced and renamed: a kill at any moment leaves the last whole one.
 """
@@ -106,14 +106,14 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, A
         The `source` object that was saved.
 
     Raises:
-        OutputError: the file cannot be read, or belongs to a run with other settings.
+        OutputError: the file cannot be read, or belongs to a run with other options.
     """
     try:
         tensors, header = load_tensors(path, FORMAT, "checkpoint")
     except SpslamError as error:
         raise OutputError(str(error)) from None
     if header.get("config") != fingerprint(config):
-        raise OutputError(f"{path}: belongs to a run with other settings; use the same options, or another --output")
+        raise OutputError(f"{path}: belongs to a run with other options; use the same ones, or another --output")
     try:
         _restore(state, tensors, header)
         return header["source"]

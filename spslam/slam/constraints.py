@@ -20,7 +20,7 @@ class Constraints:
         reference: the last mapped frame, to compare brightness with; None compares none.
         depth_keyframes: depth images of earlier frames; None uses the map alone.
         keyframes_from_start: whether these take part in all iterations. Normally they join in the second half, as the
-            map alone brings a pose from farther away; a strip of depth would slide along the map before that.
+            map alone has the larger convergence basin; but with little depth the map does not constrain the pose.
     """
 
     reference: ops.ReferenceImage | None = None
@@ -38,7 +38,7 @@ class ConstraintSource:
     """Gathers the constraints of a frame from the frames before it.
 
     Args:
-        config: settings.
+        config: options of the run.
         camera: of all frames.
     """
 
@@ -56,5 +56,5 @@ class ConstraintSource:
         mapped = history.last_mapped(self._mapping_every) if self._references else None
         if mapped is None or self._references is None:
             return None
-        row, keyframe = mapped
-        return self._references.get(row, keyframe.records, keyframe.pose)
+        row, earlier = mapped
+        return self._references.get(row, earlier.records, earlier.pose)

@@ -51,11 +51,11 @@ class DepthKeyframeStore:
 
         Args:
             frame: its number.
-            lost: bool [F] on the CPU, whether a frame's pose is unknown.
+            lost: bool [F] on the CPU, whether a frame's pose is not trusted.
             poses: float32 [F, 7] of the frames before.
 
         Returns:
-            The images whose pose is known; None where there is none.
+            The images of frames with a trusted pose; None if there is none.
         """
         wanted = [(0, frame - 1)]
         for age in AGES:
@@ -72,7 +72,7 @@ class DepthKeyframeStore:
         return {"images": self.images, "frames": torch.tensor(self.frames)}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Replaces the content by a copy of what `tensors()` gave."""
+        """Replaces the content by a copy of what `tensors()` returned."""
         self.images.copy_(state["images"])
         self.frames = state["frames"].tolist()
 

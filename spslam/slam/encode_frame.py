@@ -10,8 +10,8 @@ from spslam.options import PriorOptions
 from spslam.prior.encoder import Prior
 from spslam.scene import SparseVolume
 
-# Pairs of a point and a vertex lighter than this share of the least weight of a vertex are not encoded: they move
-# 99 % of the field by less than 0.1 mm.
+# Point-vertex pairs with a weight below this fraction of `options.min_weight` are not encoded: this changes 99 % of the
+# SDF by less than 0.1 mm.
 _LIGHT_PAIR = 1 / 60
 
 

@@ -14,8 +14,8 @@ class Fit:
         residual_cm: RMS distance of the frame's pixels to the mapped surface, weighted as in `mean_robust_weight`.
         inlier_share: share of the pixels that fall on mapped surface.
         mean_robust_weight: mean robust weight of all pixels by the score kernel, from 0 (none fits the map) to 1.
-        min_eigenvalue: smallest eigenvalue of the normal equations per pixel (m and rad): how firmly the least
-            constrained direction is held.
+        min_eigenvalue: smallest eigenvalue of the normal matrix divided by the number of pixels (m and rad): how well
+            the least constrained direction is determined.
         prediction_error_cm, prediction_error_deg: distance and angle to the pose that the motion model predicted.
         free_space_violation: share of the surface known from other frames that the frame would look through.
         occluded_share: share of that surface that something nearer occludes; no sign of a wrong pose.

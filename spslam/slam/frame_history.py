@@ -1,4 +1,4 @@
-"""The frames before the present one, as tracking and recovery ask for them."""
+"""Read access to earlier frames, for tracking and recovery."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,8 @@ RECENT_COMPARED = 16
 
 
 @dataclass(frozen=True)
-class Keyframe:
-    """An earlier frame whose pose is known.
+class EarlierFrame:
+    """An earlier frame with a trusted pose.
 
     Attributes:
         records: int32 [P, 3] its packed pixels in random order.
@@ -25,7 +25,7 @@ class Keyframe:
 
 
 class FrameHistory:
-    """Read access to the frames of a state, as they are when asked.
+    """Read access to the frames of a state, always in their current version.
 
     Args:
         state: of the system; not changed.
@@ -36,7 +36,7 @@ class FrameHistory:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the last frame's pose is unknown."""
+        """Whether the last frame is lost."""
         return bool(self._state.frames.lost[-1])
 
     @property
@@ -46,7 +46,7 @@ class FrameHistory:
 
     @property
     def consecutive_lost_frames(self) -> int:
-        """How many frames at the end have no known pose."""
+        """How many frames at the end are lost."""
         known = (~self._state.frames.lost).nonzero()
         return len(self._state.frames) - (int(known[-1]) + 1 if len(known) else 0)
 
@@ -57,28 +57,28 @@ class FrameHistory:
 
     @property
     def depth_thumbnails(self) -> torch.Tensor:
-        """float16 [F, h, w] coarse depth (m) of all frames, 0 where unknown, on the device."""
+        """float16 [F, h, w] depth thumbnails (m) of all frames, 0 where unknown, on the device."""
         return self._state.frames.depth_thumbnails
 
-    def keyframe(self, row: int) -> Keyframe:
-        """The frame of a row."""
-        return Keyframe(self._state.pixels.records[row], self._state.frames.poses[row])
+    def frame(self, row: int) -> EarlierFrame:
+        """The frame in a row of the frame table."""
+        return EarlierFrame(self._state.pixels.records[row], self._state.frames.poses[row])
 
-    def last(self) -> Keyframe | None:
+    def last(self) -> EarlierFrame | None:
         """The last frame with pixels and a trusted pose; None where there is none."""
         rows = self.usable_rows()
-        return self.keyframe(int(rows[-1])) if len(rows) else None
+        return self.frame(int(rows[-1])) if len(rows) else None
 
-    def last_mapped(self, every: int) -> tuple[int, Keyframe] | None:
+    def last_mapped(self, every: int) -> tuple[int, EarlierFrame] | None:
         """The newest frame with a trusted pose that mapping took, given that it takes every n-th, and its number."""
         has_pixels, lost = self._state.pixels.has_pixels, self._state.frames.lost
         for row in range((len(lost) - 1) // every * every, -1, -every):
             if has_pixels[row] and not lost[row]:
-                return row, self.keyframe(row)
+                return row, self.frame(row)
         return None
 
     def depth_keyframes(self) -> ops.DepthKeyframes | None:
-        """Earlier depth images to align the next frame with; None where there is none of known pose."""
+        """Earlier depth images to align the next frame with; None if there is none with a trusted pose."""
         state = self._state
         if state.depth_keyframes is None:
             return None

@@ -1,4 +1,4 @@
-"""What is reported of each frame, also while the device still works on it."""
+"""The report of a frame, which can be created before the device has finished the frame."""
 
 import math
 from dataclasses import asdict, dataclass, replace
@@ -15,7 +15,7 @@ class FrameReport:
     """What happened to one frame; `log_row()` is its line of log.jsonl.
 
     The stages' times are the device's. On CUDA they are taken by events, from where the stage begins in the stream to
-    where it ends, so they hold what the device did and what it idled in between for want of launches.
+    where it ends, so they include the time in which the device was idle between launches.
 
     Attributes:
         frame: number of the frame in the run, from 0.
@@ -26,14 +26,14 @@ class FrameReport:
         tracking_iterations: of this frame; 0 for the first.
         fit: how well its pose fits; NaN where it was not tracked or a measure was not needed.
         error_probability: that its pose is wrong; NaN where it was not tracked.
-        recovered: whether its pose comes from a start that projective ICP found.
-        relocalized: whether that start was a stored frame that looks alike.
+        recovered: whether its pose was tracked from an initial pose that projective ICP found.
+        relocalized: whether ICP found it against a stored frame that looks alike.
         mapping_iterations: of the joint optimization after this frame.
         voxels: allocated vertices.
         decode_ms: reading, decoding and sampling the frame, on a thread and ahead of need.
         loss: total loss of the last mapping iteration; None where there was none.
         upload_ms: copying it to the device, beside other work; 0 on the CPU.
-        wait_ms: the device had nothing to do, for the frame was not there yet.
+        wait_ms: time in which the device was idle because the frame had not been read yet.
         tracking_ms: predicting and finding its pose.
         encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
         mapping_ms: joint optimization; 0 where there was none.

@@ -25,7 +25,7 @@ class Mapper:
         self._graph = ops.LaunchGraph()
 
     def integrate(self, state: SlamState, pixels: FramePixels) -> None:
-        """Allocates voxels around the newest frame's surface, fills them from the prior, and covers it with planes."""
+        """Allocates and encodes voxel vertices around the newest frame's surface; grows the tri-planes to cover it."""
         if len(pixels.records) == 0:
             return
         scene = state.scene
@@ -73,7 +73,7 @@ class Mapper:
             self._moments(state),
             num_pixels=config.mapping.pixels,
             iterations=iterations,
-            # The frame that founded the map holds the world in place.
+            # The first usable frame is kept fixed: it defines the world frame.
             fixed_frame=int(state.usable.nonzero()[0, 0]),
             first_step=state.steps + 1,
             first_stamp=state.stamp + 1,

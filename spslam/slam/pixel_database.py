@@ -1,4 +1,4 @@
-"""Pixels of every frame ever seen, within a memory budget (section III.D)."""
+"""Pixels of all processed frames, within a memory budget (section III.D)."""
 
 import torch
 
@@ -26,10 +26,10 @@ class PixelDatabase:
 
         Args:
             pixels_per_frame: records per frame, to start with.
-            budget_mb: most megabytes it may take.
+            budget_mb: maximum memory, MB.
             device: where the records are.
-            keyframe_every: frames whose number isn't a multiple are forgotten when the next one comes, as systems with
-                keyframes do; 1 keeps all.
+            keyframe_every: frames whose number is not a multiple of this are dropped when the next one is added, as in
+                keyframe-based systems; 1 keeps all.
         """
         self.pixels_per_frame = pixels_per_frame
         self.keyframe_every = keyframe_every

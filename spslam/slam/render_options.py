@@ -5,7 +5,7 @@ from spslam.config import Config
 
 
 def render_options(config: Config, stream: ops.Stream, frame: int) -> ops.RenderOptions:
-    """The sampling, losses and random counters of a call's first render step, from the configuration."""
+    """Sampling, losses and random stream (Philox) of a call's first render step, from the configuration."""
     return ops.RenderOptions(
         num_uniform=config.sampling.uniform,
         num_surface=config.sampling.surface,

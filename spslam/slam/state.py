@@ -68,7 +68,7 @@ class FrameTable:
 
     @property
     def depth_thumbnails(self) -> torch.Tensor:
-        """float16 [F, h, w] coarse depth (m), on the device."""
+        """float16 [F, h, w] depth thumbnails (m), on the device."""
         return self._columns["depth_thumbnails"][: self._count]
 
     def append(
@@ -105,7 +105,7 @@ class FrameTable:
         return {name: column[: self._count] for name, column in self._columns.items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Replaces the content by copies of what `tensors()` gave."""
+        """Replaces the content by copies of what `tensors()` returned."""
         self._count = len(state["poses"])
         self._columns = {name: state[name].to(column.device, copy=True) for name, column in self._columns.items()}
 

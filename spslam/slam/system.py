@@ -23,7 +23,7 @@ from spslam.slam.tracker import Tracker, TrackingProblem
 from spslam.slam.upload import Upload
 from spslam.trajectory import Trajectory
 
-SETTLED_FRAMES = 3  # known ones in a row, before what follows a lost frame is trusted with the map
+SETTLED_FRAMES = 3  # trusted frames in a row, this one included, before mapping continues after a lost frame
 MAX_DISTANCE_M = 10_000.0  # a float32 still resolves a millimeter there
 
 
@@ -46,7 +46,7 @@ class SlamSystem:
         """A system without a map.
 
         Args:
-            config: settings.
+            config: options of the run.
             camera: pinhole intrinsics of all frames.
             first_pose: float64 [4, 4] T_world_camera of the first frame; identity where not given.
             device: where the map lives and the kernels run.
@@ -83,7 +83,7 @@ class SlamSystem:
         return self.submit(PreparedFrame(frame.index, frame.timestamp, pixels)).result()
 
     def submit(self, frame: PreparedFrame) -> PendingReport:
-        """Tracks and maps the next frame as `process` does, but waits only for its pose: mapping is asynchronous."""
+        """Tracks and maps the next frame as `process` does, but does not wait for the optimization of the map."""
         self._record = event_recorder(self.device)
         started = self._record()
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
@@ -115,7 +115,7 @@ class SlamSystem:
             pixels: of the frame.
             predicted: float32 [7], the pose to start from.
             number: of the frame; keys its random draws.
-            to_be_mapped: whether the frame is to be mapped if its pose is trusted, and so must not be obstructed.
+            to_be_mapped: whether the frame is to be mapped if its pose is trusted; it is then checked for occlusion.
         """
         if self._has_too_little_depth(pixels):
             return TrackedFrame.untracked(predicted.clone(), lost=True)
@@ -145,7 +145,7 @@ class SlamSystem:
         return tracked
 
     def _store(self, frame: PreparedFrame, pixels: FramePixels, tracked: TrackedFrame) -> None:
-        """Adds the frame to the state. What obstructs the scene is no part of it and is not drawn from later."""
+        """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
         state, number = self.state, len(self.state.frames)
         state.frames.append(
             tracked.pose,
@@ -155,15 +155,15 @@ class SlamSystem:
             pixels.depth_thumbnail,
             tracked.consistent_frames,
         )
-        state.pixels.add(pixels.records[:0] if tracked.obstructed else pixels.records)
-        if state.depth_keyframes is not None and not tracked.obstructed and not tracked.lost:
+        state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records)
+        if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:
             state.depth_keyframes.add(number, pixels.depth_image)
 
     def _map(
         self, pixels: FramePixels, tracked: TrackedFrame, number: int, events: FrameEvents
     ) -> tuple[int, torch.Tensor | None]:
         """Encodes and optimizes if it is the frame's turn; returns the iterations made and the last total loss."""
-        is_mapped = not tracked.obstructed and self._is_mapping_frame(number)
+        is_mapped = not tracked.occluded and self._is_mapping_frame(number)
         self.state.unmapped = not is_mapped
         if not is_mapped:
             return 0, None

@@ -24,7 +24,7 @@ class TrackingProblem:
         records: int32 [P, 3] the frame's packed pixels.
         predicted: float32 [7], the pose that the motion model predicts.
         frame: number of the frame; keys the random draws.
-        constraints: what the frame is held against beside the map.
+        constraints: residual terms in addition to the map's.
     """
 
     scene: Scene
@@ -53,7 +53,7 @@ class Tracker:
     """Tracks one frame at a time; holds no state but scratch. Whether a pose is to be trusted is not decided here.
 
     Args:
-        config: settings.
+        config: options of the run.
         camera: of all frames.
         score_kernel_m: width of the robust kernel that the fit is measured by, m.
     """
@@ -80,7 +80,7 @@ class Tracker:
         return self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m)
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
-        """Optimizes the pose from another start, float32 [7], by Gauss-Newton."""
+        """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
         tracking = self.config.tracking
         return self._gauss_newton(problem, start, tracking.iterations, tracking.kernel_start_m)
 
@@ -126,7 +126,7 @@ class Tracker:
             views=problem.constraints.depth_keyframes_of(iterations),
             tf32=self.config.precision == "tf32",
         )
-        # The frame's one wait for the device.
+        # Waits for the device: whether the pose is trusted decides what is done next.
         numbers = torch.cat([problem.predicted, pose, stats[-1], hessian.view(-1)]).tolist()
         mean_square, inlier_share, _, _, mean_robust_weight = numbers[14:19]
         error_cm, error_deg = prediction_error(numbers[:7], numbers[7:14])

@@ -67,7 +67,7 @@ class Uploader:
         if runtime.cudaHostRegister(memory.data_ptr(), memory.nbytes, 0) == runtime.cudaError.success:
             return True
         with contextlib.suppress(RuntimeError):
-            torch.zeros(1, device=self.device)  # takes the error that the next kernel would be blamed for
+            torch.zeros(1, device=self.device)  # clears the pending error, which the next launch would report
         return False
 
     @staticmethod

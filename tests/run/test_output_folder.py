@@ -81,9 +81,7 @@ def test_a_run_without_a_known_pose_is_an_error(monkeypatch, tmp_path, depth):
     def blank(frame):
         frame.depth[:] = depth
 
-    with pytest.raises(
-        DatasetError, match=r"no frame has a known pose: none shows a surface between dataset\.min_depth"
-    ):
+    with pytest.raises(DatasetError, match=r"all frames are lost: none shows a surface between dataset\.min_depth"):
         run_on(monkeypatch, Recorded(3, change=blank), tmp_path / "out")
     assert not (tmp_path / "out" / "metrics.json").exists()
     assert not (tmp_path / "out" / "map.safetensors").exists()

@@ -64,8 +64,8 @@ def test_difference_of_depth_images(device):
 def test_the_likest_frames_come_first_and_apart(dataset, pixels, device):
     history = FrameHistory(state_of(dataset, pixels, device))
     found = retrieve(history, pixels[8].to(device), 6, dataset.camera)
-    poses = torch.stack([candidate.keyframe.pose for candidate in found]).cpu()
-    torch.testing.assert_close(found[0].start, found[0].keyframe.pose)
+    poses = torch.stack([candidate.earlier.pose for candidate in found]).cpu()
+    torch.testing.assert_close(found[0].start, found[0].earlier.pose)
     rows = [int((poses[i] - history._state.frames.poses.cpu()).norm(dim=1).argmin()) for i in range(len(found))]
     assert rows[0] == 8
     assert 1 <= len(rows) <= 6
@@ -108,7 +108,7 @@ def test_lost_frames_are_not_offered(dataset, pixels):
     assert history.consecutive_lost_frames == 2
     torch.testing.assert_close(history.last().pose, pose_tensor(dataset.poses()[17], CPU))
     assert not torch.equal(
-        retrieve(history, pixels[8], 1, dataset.camera)[0].keyframe.pose, pose_tensor(dataset.poses()[8], CPU)
+        retrieve(history, pixels[8], 1, dataset.camera)[0].earlier.pose, pose_tensor(dataset.poses()[8], CPU)
     )
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from spslam.geometry import pose7_to_matrix, rotation_angle
-from spslam.slam.frame_history import FrameHistory, Keyframe
+from spslam.slam.frame_history import EarlierFrame, FrameHistory
 from spslam.slam.pixels import sample_frame, unpack_points
 from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.icp_alignment import IcpAlignment, surface_maps
@@ -42,7 +42,7 @@ def moved(pose, shift_m, angle_deg):
 
 
 def earlier(system):
-    return Keyframe(system.state.pixels.records[-1], system.state.frames.poses[-1])
+    return EarlierFrame(system.state.pixels.records[-1], system.state.frames.poses[-1])
 
 
 def assert_near(found, ground_truth, distance_m=0.01, angle_deg=0.5):
@@ -105,7 +105,7 @@ class Elsewhere(FrameHistory):
     """Frames that were seen in another place."""
 
     def keyframe(self, row):
-        return Keyframe(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
+        return EarlierFrame(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
 
 
 def test_what_cannot_be_recovered_stays_lost(dataset, system, pixels):

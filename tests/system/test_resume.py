@@ -202,7 +202,7 @@ def test_interrupted_run_is_not_overwritten(monkeypatch, interrupted):
 
 @pytest.mark.parametrize("override", ["seed=1", "tracking.pixels=512", "scene.voxel_size_m=0.05", "dataset.stride=2"])
 def test_resuming_with_other_settings_is_refused(monkeypatch, interrupted, override):
-    with pytest.raises(OutputError, match="belongs to a run with other settings") as error:
+    with pytest.raises(OutputError, match="belongs to a run with other options") as error:
         run_on(monkeypatch, Recorded(8), interrupted, override, resume=True)
     assert "\n" not in str(error.value)
 

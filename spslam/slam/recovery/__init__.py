@@ -1,1 +1,1 @@
-"""What happens to a doubtful pose: how probable an error is, verification, other starts, relocalization."""
+"""Handling of doubtful poses: error probability, verification, other initial poses, relocalization."""

@@ -1,4 +1,4 @@
-"""Whether a frame's brightness agrees with the map's colors at a pose: plain shapes fit in many places."""
+"""Whether a frame's brightness agrees with the map's colors at a pose: featureless geometry fits in many places."""
 
 import math
 
@@ -14,8 +14,8 @@ from spslam.slam.reference_image import LUMA_OF_WHITE, luma
 POINTS = 2048  # pixels of a frame that are compared
 MAX_DISTANCE = 0.5  # from the mapped surface, in units of the truncation
 MIN_POINTS = 100  # with fewer the correlation is unknown
-MIN_MAP_DEVIATION = 0.05  # of the map's brightness; on plainer surface the correlation is unknown
-NOISE_DEVIATION = 0.02  # of the image's brightness; less is the camera's noise
+MIN_MAP_DEVIATION = 0.05  # standard deviation of the map's brightness; below it the correlation is unknown
+NOISE_DEVIATION = 0.02  # standard deviation of the image's brightness; smaller ones are the camera's noise
 MIN_BRIGHTNESS, MAX_BRIGHTNESS = 0.05, 0.95  # mean of the image; beyond it is under- or overexposed
 
 
@@ -44,7 +44,7 @@ def brightness_correlation(
 ) -> float:
     """Correlation in [-1, 1] of the map's brightness and the image's, of `brightness_sums`.
 
-    It is invariant to exposure. NaN where it is unknown: few pixels, plain surface, a dark or overexposed image.
+    It is invariant to exposure. NaN where it is unknown: few pixels, uniform color, a dark or overexposed image.
     """
     if not pixels >= MIN_POINTS:
         return math.nan

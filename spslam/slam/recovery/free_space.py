@@ -10,7 +10,7 @@ from spslam.slam.poses import rotations
 TOLERANCE_M, TOLERANCE_SHARE = 0.05, 0.02  # of a depth
 CLEAR_TOLERANCES = 1.5  # what is this far before or behind the surface is clearly not on it
 BEST_FRAMES = 8  # of the frames compared, those that share most surface are counted
-FEW_POINTS = 50  # weigh as much as what is assumed before anything is counted
+ASSUMED_POINTS = 50  # number of points that `unknown_share` counts as in the average
 MIN_DEPTH_M = 0.05
 
 
@@ -24,7 +24,7 @@ def surface_shares(seen: float, through: float, occluded: float, unknown_share: 
     Returns:
         Two numbers from 0 to 1.
     """
-    share = (through + unknown_share * FEW_POINTS) / (seen + through + FEW_POINTS)
+    share = (through + unknown_share * ASSUMED_POINTS) / (seen + through + ASSUMED_POINTS)
     return share, occluded / max(seen + occluded, 1)
 
 
@@ -45,7 +45,7 @@ def surface_counts(
         intrinsics: of that map.
         pose: float32 [7] of the frame.
         poses: float32 [F, 7] of the other frames.
-        depth_thumbnails: float16 [F, h, w] their coarse depth (m).
+        depth_thumbnails: float16 [F, h, w] their depth thumbnails (m).
         camera: of all frames.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Further starts for tracking: projective ICP against earlier frames, which needs no map."""
+"""Further initial poses for tracking, from projective ICP against earlier frames; needs no map."""
 
 import torch
 
@@ -6,7 +6,7 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.geometry import compose, inverse
 from spslam.slam.cell_grid import CellGrid
-from spslam.slam.frame_history import Keyframe
+from spslam.slam.frame_history import EarlierFrame
 from spslam.slam.pixels import FramePixels, unpack_points
 from spslam.slam.poses import pose_matrix, pose_tensor
 
@@ -15,7 +15,7 @@ ITERATIONS = 20  # converge from 10 cm and 10 degrees; 15 do not always
 
 
 class IcpAlignment:
-    """Poses of one frame by ICP against earlier ones, from any number of starts.
+    """Poses of one frame by ICP against earlier ones, from any initial pose.
 
     Attributes:
         vertices, normals, intrinsics: the frame's surface maps, see `surface_maps`.
@@ -25,14 +25,16 @@ class IcpAlignment:
         self._camera = camera
         self.vertices, self.normals, self.intrinsics = surface_maps(pixels, camera)
 
-    def pose(self, earlier: Keyframe, start: torch.Tensor) -> torch.Tensor:
+    def pose(self, earlier: EarlierFrame, start: torch.Tensor) -> torch.Tensor:
         """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
-        origin = pose_matrix(earlier.pose)
-        between = pose_tensor(compose(inverse(pose_matrix(start)), origin), start.device)
+        earlier_to_world = pose_matrix(earlier.pose)
+        earlier_to_frame = pose_tensor(compose(inverse(pose_matrix(start)), earlier_to_world), start.device)
         points = unpack_points(earlier.records[:POINTS], self._camera)
         maps = self.vertices, self.normals
-        between, _, _ = ops.projective_icp(points, *maps, between, self.intrinsics, iterations=ITERATIONS)
-        return pose_tensor(compose(origin, inverse(pose_matrix(between))), start.device)
+        earlier_to_frame, _, _ = ops.projective_icp(
+            points, *maps, earlier_to_frame, self.intrinsics, iterations=ITERATIONS
+        )
+        return pose_tensor(compose(earlier_to_world, inverse(pose_matrix(earlier_to_frame))), start.device)
 
 
 def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:

@@ -1,4 +1,4 @@
-"""Place recognition: earlier frames whose coarse depth looks like that of a frame, as starts for relocalization."""
+"""Place recognition: earlier frames with a similar depth thumbnail, as candidates for relocalization."""
 
 import math
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ import torch.nn.functional as F
 
 from spslam.camera import Camera
 from spslam.geometry import compose, matrix_to_pose7, pose7_to_matrix
-from spslam.slam.frame_history import FrameHistory, Keyframe
+from spslam.slam.frame_history import EarlierFrame, FrameHistory
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, FramePixels
 
-# Difference of two coarse depth images: of the logarithms, clamped, and what a cell costs that only one of them knows.
+# Difference per cell: of the log depths, at most the first; the second where only one thumbnail has depth.
 MAX_LOG_DIFFERENCE, ONE_SIDED_DIFFERENCE = 0.3, 0.15
 MIN_SEPARATION = 5  # frames; of similar frames in a row only the best is a candidate
 TURNED_CANDIDATES = 32  # the best are also compared as if the camera had turned
@@ -26,11 +26,11 @@ class RelocalizationCandidate:
     """An earlier frame that looks like the present one.
 
     Attributes:
-        keyframe: the earlier frame.
+        earlier: the earlier frame.
         start: float32 [7], the pose from which the present frame would look most like it.
     """
 
-    keyframe: Keyframe
+    earlier: EarlierFrame
     start: torch.Tensor
 
 
@@ -57,16 +57,16 @@ def retrieve(history: FrameHistory, pixels: FramePixels, count: int, camera: Cam
     shifts, differences = turned_differences(pixels.depth_thumbnail, history.depth_thumbnails[rows])
     smallest, turn = differences.min(0)
     order = smallest.argsort(stable=True)[:count]
-    keyframes = [history.keyframe(row) for row in rows[order].tolist()]
+    frames = [history.frame(row) for row in rows[order].tolist()]
     turns = [shifts[i] for i in turn[order].tolist()]
     return [
-        RelocalizationCandidate(keyframe, turned(keyframe.pose, shift, camera))
-        for keyframe, shift in zip(keyframes, turns, strict=True)
+        RelocalizationCandidate(earlier, turned(earlier.pose, shift, camera))
+        for earlier, shift in zip(frames, turns, strict=True)
     ]
 
 
 def thumbnail_difference(depth_thumbnail: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
-    """Mean difference of the logarithms of depth between coarse depth images, clamped to `MAX_LOG_DIFFERENCE`.
+    """Mean difference of the logarithms of depth between depth thumbnails, clamped to `MAX_LOG_DIFFERENCE`.
 
     Args:
         depth_thumbnail: float16 [h, w], m, 0 where unknown.
@@ -86,7 +86,7 @@ def thumbnail_difference(depth_thumbnail: torch.Tensor, others: torch.Tensor) ->
 def turned_differences(
     depth_thumbnail: torch.Tensor, others: torch.Tensor
 ) -> tuple[list[tuple[int, int]], torch.Tensor]:
-    """Differences of coarse depth images with the first one shifted over the others by rows and columns.
+    """Differences of depth thumbnails with the first one shifted over the others by rows and columns.
 
     Args:
         depth_thumbnail: float16 [h, w], m.

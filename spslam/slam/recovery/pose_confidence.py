@@ -1,12 +1,12 @@
 """The probability that a pose is wrong, from all measures of its fit.
 
-A logistic model, fitted to right poses of clean runs and to poses that tracking made of wrong starts:
+A logistic model, fitted to correct poses and to wrong ones to which tracking converged from wrong initial poses:
 
     ln odds = intercept + sum of factor * measure
 
-over the mean robust weight, lg(min_eigenvalue), ln(1 + prediction error), the free-space violation and what is missing
-of the least brightness correlation of right poses. docs/tracking-failure.md explains the terms and how well they tell
-right from wrong; the numbers and where they come from are in configs/models/pose_confidence.yaml.
+over the mean robust weight, log10(min_eigenvalue), ln(1 + prediction error), the free-space violation and the shortfall
+of the brightness correlation below the minimum of correct poses. docs/tracking-failure.md explains the terms and how
+well they separate correct from wrong poses; the constants and their origin are in configs/models/pose_confidence.yaml.
 """
 
 import math
@@ -25,7 +25,7 @@ class PoseConfidenceModel:
 
     Attributes:
         intercept: ln odds of an error where all measures are 0.
-        per_mean_robust_weight, per_lg_min_eigenvalue, per_prediction_error, per_free_space_violation,
+        per_mean_robust_weight, per_log10_min_eigenvalue, per_prediction_error, per_free_space_violation,
             per_missing_correlation: factors of the measures.
         score_kernel_m: width of the robust kernel that the first two are measured by, m.
         prediction_error_scale_cm, prediction_error_scale_deg: what counts as 1 in ln(1 + distance + angle).
@@ -33,13 +33,13 @@ class PoseConfidenceModel:
         max_free_space_violation: larger ones count as this.
         unknown_prediction_error, unknown_free_space_violation: used where the measure is NaN.
         expected_map_coverage: map coverage below which the mean robust weight is scaled up.
-        min_brightness_correlation: least of right poses.
-        max_occluded_share: above it the frame is obstructed.
+        min_brightness_correlation: minimum of correct poses.
+        max_occluded_share: above it the frame is occluded.
     """
 
     intercept: float
     per_mean_robust_weight: float
-    per_lg_min_eigenvalue: float
+    per_log10_min_eigenvalue: float
     per_prediction_error: float
     per_free_space_violation: float
     per_missing_correlation: float
@@ -79,15 +79,15 @@ class PoseConfidenceModel:
         ln_odds = (
             self.intercept
             + self.per_mean_robust_weight * self._weight_where_mapped(fit)
-            + self.per_lg_min_eigenvalue * self._lg_min_eigenvalue(fit)
+            + self.per_log10_min_eigenvalue * self._log10_min_eigenvalue(fit)
             + self.per_prediction_error * self._prediction_error(fit)
             + self.per_free_space_violation * min(violation, self.max_free_space_violation)
             + self.per_missing_correlation * self._missing_correlation(fit)
         )
         return 1 / (1 + math.exp(-ln_odds))
 
-    def is_obstructed(self, fit: Fit) -> bool:
-        """Whether something that is no part of the scene stands before the camera; False where that is not known."""
+    def is_occluded(self, fit: Fit) -> bool:
+        """Whether something that is not part of the scene is in front of the camera; False if it was not measured."""
         return fit.occluded_share > self.max_occluded_share
 
     def _weight_where_mapped(self, fit: Fit) -> float:
@@ -96,8 +96,8 @@ class PoseConfidenceModel:
             return fit.mean_robust_weight
         return min(fit.mean_robust_weight * self.expected_map_coverage / fit.map_coverage, 1.0)
 
-    def _lg_min_eigenvalue(self, fit: Fit) -> float:
-        """The logarithm, which falls faster below the least eigenvalue of clean runs."""
+    def _log10_min_eigenvalue(self, fit: Fit) -> float:
+        """log10 of the smallest eigenvalue, falling faster below `firm_eigenvalue`."""
         lg = math.log10(max(fit.min_eigenvalue, self.eigenvalue_floor))
         return lg + (self.weak_eigenvalue_factor - 1) * min(lg - math.log10(self.firm_eigenvalue), 0.0)
 

@@ -19,10 +19,10 @@ from spslam.slam.tracker import PoseEstimate, Tracker, TrackingProblem
 CONSISTENT_FRAMES = 4  # lost frames in a row whose likely poses are consistent are found
 CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one of them to the next
 LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
-LIKELY_MIN_EIGENVALUE = 0.004  # of each of them at least: a plane is consistent with itself wherever it is laid
-OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be obstructed
-SHORT_LOSS = 5  # frames; for as long the camera cannot be far from where it was
-MIN_GAIN = 0.02  # of mean robust weight: less is the chance of another draw, and no other pose
+LIKELY_MIN_EIGENVALUE = 0.004  # of each of them at least: poses that slide along a plane are consistent too
+OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
+SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
+MIN_GAIN = 0.02  # of mean robust weight; smaller differences come from the random choice of pixels
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class TrackedFrame:
     """A frame's pose and whether it is trusted.
 
     Attributes:
-        pose: float32 [7]; where the frame is lost, a likely pose, the last known or the predicted one.
-        iterations: of tracking, all starts together.
+        pose: float32 [7]; where the frame is lost, a likely pose, the last trusted or the predicted one.
+        iterations: of tracking, summed over all initial poses.
         fit: of the pose found, also where it is not trusted.
         error_probability: that the pose is wrong; NaN where it was not tracked.
         lost: whether the pose is not trusted.
-        obstructed: whether something that is no part of the scene stands before the camera.
-        recovered: whether the pose comes from a start that ICP found.
-        relocalized: whether that start was another frame than the last.
+        occluded: whether something that is not part of the scene is in front of the camera.
+        recovered: whether the pose was tracked from an initial pose that ICP found.
+        relocalized: whether ICP found it against a stored frame that looks alike.
         consistent_frames: how many lost frames up to this one had likely poses that are consistent; `pose` is the
             last of them.
     """
@@ -47,7 +47,7 @@ class TrackedFrame:
     fit: Fit
     error_probability: float
     lost: bool
-    obstructed: bool = False
+    occluded: bool = False
     recovered: bool = False
     relocalized: bool = False
     consistent_frames: int = 0
@@ -59,13 +59,13 @@ class TrackedFrame:
 
 
 class Recovery:
-    """From a pose estimate to a decision. A frame without doubt costs nothing but the decision.
+    """Decides whether a pose estimate is trusted. Only a doubtful one is verified and tracked again.
 
     Args:
-        config: settings.
+        config: options of the run.
         camera: of all frames.
-        tracker: optimizes the pose from other starts.
-        confidence: tells how probable an error is.
+        tracker: optimizes the pose from other initial poses.
+        confidence: computes the probability that a pose is wrong.
     """
 
     def __init__(self, config: Config, camera: Camera, tracker: Tracker, confidence: PoseConfidenceModel):
@@ -84,11 +84,11 @@ class Recovery:
         history: FrameHistory,
         to_be_mapped: bool,
     ) -> TrackedFrame:
-        """The frame's best pose: the estimate, or where that is doubtful the best of what other starts lead to.
+        """The frame's best pose: the estimate or, if it is doubtful, the best one from other initial poses.
 
         Args:
             problem: the frame.
-            estimate: what tracking made of it.
+            estimate: the tracker's result.
             pixels: of the frame.
             history: the frames before.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
@@ -100,7 +100,7 @@ class Recovery:
             tracked = self._verify(problem, tracked, IcpAlignment(pixels, self._camera), history, with_colors=False)
         if not tracked.lost or tracked.consistent_frames:
             return tracked
-        # The prediction from lost frames is no more than likely.
+        # A pose predicted from lost frames is not trusted: continue from the last trusted pose.
         known = history.last() if history.consistent_frames else None
         return replace(tracked, pose=(problem.predicted if known is None else known.pose).clone())
 
@@ -111,7 +111,7 @@ class Recovery:
             tracked,
             error_probability=probability,
             lost=not (tracked.fit.inlier_share >= tracking.min_inlier_share and probability <= tracking.lost_threshold),
-            obstructed=self._confidence.is_obstructed(tracked.fit),
+            occluded=self._confidence.is_occluded(tracked.fit),
         )
 
     def _is_doubtful(self, tracked: TrackedFrame) -> bool:
@@ -137,10 +137,10 @@ class Recovery:
     def _recover(
         self, problem: TrackingProblem, first: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
-        """The best of the first result and of those from the last trusted frame; of similar frames if that is lost."""
+        """The best result from the prediction and the last trusted frame; if that is lost, also from similar frames."""
         alignment = IcpAlignment(pixels, self._camera)
         best = self._best(problem, first, self._starts_at_last(problem, first, alignment, history))
-        # After lost frames whose poses are consistent, the prediction is not where the camera was last known.
+        # After lost frames with consistent poses, the prediction does not come from the last trusted pose.
         if history.consecutive_lost_frames <= SHORT_LOSS and not history.consistent_frames:
             best = self._verify(problem, best, alignment, history)
             if not best.lost:
@@ -154,7 +154,7 @@ class Recovery:
         tracking = self._config.tracking
         wanted = tracking.recovery and (tracking.optimizer == "gauss_newton" or first.lost)
         last = history.last() if wanted else None
-        return [] if last is None else [alignment.pose(last, guess) for guess in (problem.predicted, last.pose)]
+        return [] if last is None else [alignment.pose(last, start) for start in (problem.predicted, last.pose)]
 
     def _best(self, problem: TrackingProblem, best: TrackedFrame, starts: list[torch.Tensor]) -> TrackedFrame:
         """The result of the largest mean robust weight among a given one and those from other starts."""
@@ -176,20 +176,20 @@ class Recovery:
     ) -> TrackedFrame:
         """The best of a given result and those from stored frames that look alike, if it is certain enough."""
         candidates = retrieve(history, pixels, self._config.tracking.relocalization_candidates, self._camera)
-        starts = [alignment.pose(candidate.keyframe, candidate.start) for candidate in candidates]
+        starts = [alignment.pose(candidate.earlier, candidate.start) for candidate in candidates]
         found = self._verify(problem, self._best(problem, best, starts), alignment, history)
         found = self._accept_anywhere(found, history.consistent_frames)
         return replace(found, relocalized=found.pose is not best.pose and not found.lost)
 
     def _accept_anywhere(self, tracked: TrackedFrame, consistent_before: int) -> TrackedFrame:
-        """The result, judged as that of a camera that may be anywhere: some places always look alike.
+        """The result, accepted by stricter thresholds, as the camera may be anywhere and some places look alike.
 
-        The motion model has no say in the probability of an error, and that must be next to nothing; or small, in some
-        frames in a row whose poses are consistent with one another.
+        The error probability is computed without the prediction error. It must be at most
+        `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
+        frames with consistent poses.
         """
-        prediction = tracked.fit
         is_consistent = (
-            prediction.prediction_error_cm < CONSISTENT_CM and prediction.prediction_error_deg < CONSISTENT_DEG
+            tracked.fit.prediction_error_cm < CONSISTENT_CM and tracked.fit.prediction_error_deg < CONSISTENT_DEG
         )
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
         tracked = self._judged(replace(tracked, fit=fit))

@@ -21,9 +21,9 @@ class Verifier:
     """Compares poses with other frames' surface and the map's colors.
 
     Args:
-        config: settings.
+        config: options of the run.
         camera: of all frames.
-        confidence: names the score kernel, and what counts as known.
+        confidence: provides the kernel width of the fit and the free-space violation assumed where none is measured.
     """
 
     def __init__(self, config: Config, camera: Camera, confidence: PoseConfidenceModel):
@@ -59,7 +59,7 @@ class Verifier:
             self._camera,
         )
         colors = [] if records is None else [brightness_sums(scene, records[:POINTS], pose, self._camera)]
-        # A doubtful frame's second wait for the device.
+        # Waits for the device, once.
         numbers = torch.cat([counts, self._map_coverage(scene, history), *colors]).tolist()
         violation, occluded = surface_shares(*numbers[:3], self._confidence.unknown_free_space_violation)
         return replace(
