@@ -105,7 +105,7 @@ def encode_frame_(
     fusion: FrameFusion,
     tf32: bool = True,
 ) -> EncodedFrame:
-    """Encodes a frame's points and fuses them into the volume, in place; section III.B and equation (1) of SP-SLAM.
+    """Encodes a frame's points and fuses them into the volume, in place; section III.A and equation (1) of SP-SLAM.
 
     The same as `encode_points`, then `voxel_hash_insert`, `voxel_hash_update_corner_ids` and `fuse_prior_` with the
     share min(w / kappa, 1) for the vertices of weight w above `min_weight`, in one call that waits for CUDA once.

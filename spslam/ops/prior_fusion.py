@@ -67,7 +67,7 @@ def encode_points(
     min_pair_weight: float = 1e-4,
     tf32: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Encodes surface points into features at the voxel vertices around them; section III.B of SP-SLAM.
+    """Encodes surface points into features at the voxel vertices around them; section III.A of SP-SLAM.
 
     A point x (in voxels) with normal n gives to a vertex c the feature `encoder([(x - c) / r, n])`, with the weight
     `prod(1 - |x - c| / r)^3` over the axes: r = 2 and the 4x4x4 vertices around the point for a neighborhood of 64,

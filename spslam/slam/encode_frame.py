@@ -24,7 +24,7 @@ def encode_frame(
     seed: int = 0,
     tf32: bool = True,
 ) -> ops.EncodedFrame:
-    """Encodes a frame's surface points and fuses them into the volume; section III.B and equation (1) of SP-SLAM.
+    """Encodes a frame's surface points and fuses them into the volume; section III.A and equation (1) of SP-SLAM.
 
     Vertices whose points weigh more than `options.min_weight` in sum are allocated; the weight of a fusion is that sum
     over `options.kappa`, at most 1; without `options.fusion` only new vertices take a feature (Table VIII). Without a

@@ -130,7 +130,8 @@ class PendingReport:
         """The whole report; waits until the device is done with the frame."""
         self.events.finished.wait()
         loss = None if self.loss is None else float(self.loss)
-        return replace(self.report, loss=loss, **self.events.times_ms(self.host_wait_ms))
+        times: dict[str, Any] = {**self.events.times_ms(self.host_wait_ms)}
+        return replace(self.report, loss=loss, **times)
 
 
 def _length_ms(stage: tuple[DeviceEvent, DeviceEvent] | None) -> float:

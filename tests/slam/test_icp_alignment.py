@@ -104,7 +104,7 @@ def test_a_wrong_start_is_recovered(dataset, system, pixels, shift_m, angle_deg)
 class Elsewhere(FrameHistory):
     """Frames that were seen in another place."""
 
-    def keyframe(self, row):
+    def frame(self, row):
         return EarlierFrame(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
 
 

@@ -61,11 +61,13 @@ class Verifier:
         colors = [] if records is None else [brightness_sums(scene, records[:POINTS], pose, self._camera)]
         # Waits for the device, once.
         numbers = torch.cat([counts, self._map_coverage(scene, history), *colors]).tolist()
-        violation, occluded = surface_shares(*numbers[:3], self._confidence.unknown_free_space_violation)
+        seen, through, occluded = numbers[:3]
+        unknown = self._confidence.unknown_free_space_violation
+        violation, occluded_share = surface_shares(seen, through, occluded, unknown)
         return replace(
             fit,
             free_space_violation=violation,
-            occluded_share=occluded,
+            occluded_share=occluded_share,
             map_coverage=numbers[3],
             brightness_correlation=brightness_correlation(*numbers[4:]) if colors else math.nan,
         )
