@@ -64,9 +64,11 @@ def _folder_beside_the_package() -> Iterator[Path]:
         yield ROOT
         return
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("tests", "experiments", "examples"):
+        # What tests import, run or read.
+        for name in ("tests", "experiments", "examples", "docs"):
             shutil.copytree(ROOT / name, Path(folder) / name)
-        shutil.copy(ROOT / "pyproject.toml", folder)
+        for file in (*ROOT.glob("*.md"), ROOT / "pyproject.toml"):
+            shutil.copy(file, folder)
         yield Path(folder)
 
 
