@@ -1,7 +1,7 @@
 """Accuracy of settings: runs each one over each sequence with several seeds, in parallel, and prints one table.
 
     python -m experiments.settings --sequence kitchen=7scenes:path/to/redkitchen:0:300 --sequence room=demo::0:150 \
-        --setting balanced --setting balanced,mapping.pose_rate=1e-3 --seeds 3 --workers 4 --jsonl settings.jsonl
+        --setting balanced --setting balanced,mapping.every=3 --seeds 3 --workers 4 --jsonl settings.jsonl
 
 A sequence is NAME=CONFIG:FOLDER:START:STOP[:STEP] and optional ,KEY=VALUE of its own; a setting is PRESET,KEY=VALUE,...
 Workers are processes with `--threads` kernel threads each; with `--device cuda` they are distributed over all GPUs. A

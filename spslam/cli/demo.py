@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 from pathlib import Path
 
 from spslam.cli.arguments import add_device, add_quiet, at_least_one, overrides
@@ -44,6 +45,8 @@ def execute(args: argparse.Namespace) -> None:
     frames = None if args.frames is None else slice(0, args.frames, 1)
     command = f"{command_name()} run demo" + ("" if frames is None else f" --frames 0:{args.frames}")
     run(make_request(config, args.output, frames), args.quiet, command)
+    if not args.quiet:
+        print("comparing the mesh with the room's exact surface", file=sys.stderr, flush=True)
     metrics = _evaluate(RunFolder(args.output))
     if not args.quiet:
         print_summary(metrics, args.output)

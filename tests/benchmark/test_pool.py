@@ -21,7 +21,7 @@ def by_key(*jobs):
 
 
 def test_runs_leave_records_once(tmp_path):
-    jobs = by_key(tiny_job(thorough=True), tiny_job(GICP))
+    jobs = by_key(tiny_job(), tiny_job(GICP))
     reports = []
     outcomes = run_jobs(jobs, tmp_path, PoolOptions(workers=2, threads=1, keep=True), lambda *r: reports.append(r))
     assert [(done, total) for done, total, _ in reports] == [(1, 2), (2, 2)]
@@ -32,9 +32,6 @@ def test_runs_leave_records_once(tmp_path):
         assert record["figures"]["ate_rmse_cm"] < 5
         assert record["environment"]["runs_at_a_time"] == 2
         assert record["environment"]["kernel_threads"] == 1
-    ours = outcomes[next(iter(jobs))].record
-    assert 0 < ours["figures"]["f1_5cm"] < 100
-    assert {"depth_l1_cm", "psnr_db"} <= set(ours["figures"])
     assert (tmp_path / RUNS / next(iter(jobs)) / "trajectory.txt").is_file()
     assert not list((tmp_path / WORK).glob("*"))
 

@@ -36,11 +36,13 @@ def accuracy(iterations, *overrides):
     return float(np.mean(np.isfinite(errors) & (errors < NEAR_M)))
 
 
+@pytest.mark.slow
 def test_with_the_prior_ten_iterations_are_as_good_as_fifty():
     assert accuracy(10) == pytest.approx(accuracy(50), rel=EQUAL)
     assert accuracy(1) == pytest.approx(accuracy(50), rel=EQUAL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overrides", WITHOUT_PRIOR.values(), ids=WITHOUT_PRIOR)
 def test_without_it_they_are_not(overrides):
     assert accuracy(10, *overrides) < (1 - EQUAL) * accuracy(50, *overrides)

@@ -97,7 +97,7 @@ def test_the_first_pose_is_the_data_sets_or_the_identity(monkeypatch, tmp_path):
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("distance_m", [1000.0, 5000.0])
+@pytest.mark.parametrize("distance_m", [pytest.param(1000.0, marks=pytest.mark.slow), 5000.0])
 def test_far_from_the_origin_all_is_the_same(distance_m):
     dataset = Recorded(15)
     ground_truth = dataset.poses()

@@ -94,7 +94,9 @@ def interrupt_after(frames: int):
     return progress
 
 
-@pytest.mark.parametrize("after", [1, 7, FRAMES])
+@pytest.mark.parametrize(
+    "after", [pytest.param(1, marks=pytest.mark.slow), 7, pytest.param(FRAMES, marks=pytest.mark.slow)]
+)
 def test_ctrl_c_leaves_a_checkpoint_of_every_frame_up_to_there(monkeypatch, tmp_path, after):
     output = tmp_path / "out"
     run_on(monkeypatch, Recorded(FRAMES), tmp_path / "whole")

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from spslam.config import Config, load_config
+from spslam.options import PRESETS
 from spslam.options.faults import option_fields
 from spslam.options.needs import needs_of, option_value
 from spslam.slam.system import SlamSystem
@@ -52,7 +53,9 @@ def outcome(config: Config) -> list[torch.Tensor]:
     return [system.state.frames.poses, *system.state.scene.state_dict().values()]
 
 
-@pytest.mark.parametrize("name", SITUATIONS)
+@pytest.mark.parametrize(
+    "name", [name if name in PRESETS else pytest.param(name, marks=pytest.mark.slow) for name in SITUATIONS]
+)
 def test_options_without_effect_change_nothing(name):
     preset, overrides = SITUATIONS[name]
     config = load_config("demo", preset, overrides)
