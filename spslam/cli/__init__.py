@@ -1,1 +1,1 @@
-"""The ``spslam`` command: the only part that prints, parses arguments or exits."""
+"""The `spslam` command line: the only part of the package that prints, parses arguments or exits."""

@@ -1,4 +1,4 @@
-"""``spslam bench``: suites of sequences, presets and seeds, in tables beside the paper's figures."""
+"""`spslam bench`: runs a suite of sequences, presets and seeds, and compares the results with the paper."""
 
 from __future__ import annotations
 
@@ -25,20 +25,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="YAML file of folders, SUITE: {SEQUENCE: FOLDER}, where the data has other names",
     )
     parser.add_argument("--output", metavar="DIR", type=Path, help="folder of results; runs/bench-SUITE if not given")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto takes the GPUs, if any")
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto uses all GPUs if there are any"
+    )
     parser.add_argument("--presets", metavar="NAME", nargs="+", choices=PRESETS, help="presets to run")
-    parser.add_argument("--seeds", metavar="N", type=at_least_one, help="runs of each, seeds 0 to N-1 (the paper: 5)")
-    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="only these frames of every sequence; : is all")
+    parser.add_argument(
+        "--seeds", metavar="N", type=at_least_one, help="runs per sequence and preset, with seeds 0 to N-1 (paper: 5)"
+    )
+    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="only these frames of every sequence; : for all")
     parser.add_argument("--sequences", metavar="NAME", nargs="+", help="only these sequences")
     parser.add_argument("--studies", metavar="NAME", nargs="+", help="only these studies of the ablation")
-    parser.add_argument("--workers", metavar="N", type=at_least_one, help="runs at a time; one a GPU if not given")
-    parser.add_argument("--threads", metavar="N", type=at_least_one, help="kernel threads of each run")
-    parser.add_argument("--no-baseline", action="store_true", help="leave out the classical baseline")
-    parser.add_argument("--keep", action="store_true", help="keep each run's trajectory, mesh and report")
-    parser.add_argument(
-        "--report", metavar="PAGE", type=Path, help="put the tables into a Markdown page's regions, too"
-    )
-    parser.add_argument("--list", action="store_true", help="say what would be run, and run nothing")
+    parser.add_argument("--workers", metavar="N", type=at_least_one, help="parallel runs (default: one per GPU)")
+    parser.add_argument("--threads", metavar="N", type=at_least_one, help="CPU threads per run")
+    parser.add_argument("--no-baseline", action="store_true", help="skip the GICP baseline")
+    parser.add_argument("--keep", action="store_true", help="keep trajectory, mesh and report of each run")
+    parser.add_argument("--report", metavar="PAGE", type=Path, help="also update the tables in a Markdown page")
+    parser.add_argument("--list", action="store_true", help="list the runs without starting them")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     parser.add_argument("--key", help=argparse.SUPPRESS)
     add_quiet(parser)
@@ -108,20 +110,22 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     if summary.failed:
         raise SpslamError(f"{len(summary.failed)} of {len(plan.jobs)} runs failed; the first: {summary.failed[0]}")
     if not plan.jobs:
-        raise SpslamError(f"nothing of {suite.name} could be run: no data; --data names the folder that holds it")
+        raise SpslamError(
+            f"no run of {suite.name} is possible: no data found; --data names the folder that contains it"
+        )
 
 
 def _run_job(args: argparse.Namespace) -> None:
-    """One run, for `run_jobs` in another process; ends when that one does."""
+    """Executes one run as a child process of `run_jobs`; exits when the parent process ends."""
     from spslam.benchmark.jobs import Job
     from spslam.benchmark.pool import run_here
 
-    threading.Thread(target=_exit_with_input, daemon=True).start()
+    threading.Thread(target=_exit_at_end_of_input, daemon=True).start()
     run_here(Job.from_json(args.job), args.key, args.output, args.workers, args.threads, args.keep)
 
 
-def _exit_with_input() -> None:
-    # Not through sys.stdin, whose lock a thread that waits would still hold as Python ends.
+def _exit_at_end_of_input() -> None:
+    # os.read instead of sys.stdin.read, which would hold the lock of sys.stdin at the exit of the interpreter.
     while os.read(0, 1):
         pass
     os._exit(1)
@@ -144,7 +148,7 @@ def _print_plan(plan: Any) -> None:
 
 
 def _print_progress(done: int, total: int, outcome: Any) -> None:
-    """A line on the error stream for each run as it ends; earlier ones pass in silence but for the last."""
+    """Prints a line to stderr for each run that ends; runs from earlier calls are skipped, except the last."""
     if outcome.earlier and done < total:
         return
     record = outcome.record

@@ -1,4 +1,4 @@
-"""``spslam check-data``: what is in a data set, and what looks wrong with it."""
+"""`spslam check-data`: shows statistics of a dataset and reports likely problems."""
 
 from __future__ import annotations
 
@@ -30,37 +30,37 @@ def _print(found: Inspection) -> None:
     for problem in found.problems:
         print(f"! {problem}")
     if not found.problems:
-        print("nothing looks wrong")
+        print("no problems found")
 
 
 def _rows(found: Inspection) -> list[tuple[str, str]]:
     camera = found.camera
     rows = [
         ("data", found.name),
-        ("frames", f"{found.frames}, {found.frames_per_second:.1f} a second; depth of {found.frames_read} looked at"),
+        ("frames", f"{found.frames}, {found.frames_per_second:.1f} frames/s; depth of {found.frames_read} checked"),
         ("size", f"{camera.width}x{camera.height} px"),
         ("intrinsics", f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f} px"),
     ]
     if found.depth is not None:
         depth = found.depth
         rows.append(("depth", f"{depth.near_m:.2f} to {depth.far_m:.2f} m (1 to 99 %), median {depth.median_m:.2f} m"))
-        rows.append(("holes", f"{depth.holes:.1%} of the pixels, {depth.most_holes:.1%} in the worst frame"))
+        rows.append(("no depth", f"{depth.holes:.1%} of the pixels, {depth.most_holes:.1%} in the worst frame"))
     return [*rows, *_pose_rows(found)]
 
 
 def _pose_rows(found: Inspection) -> list[tuple[str, str]]:
     poses = found.poses
     if poses is None:
-        return [("true poses", "none")]
+        return [("ground truth", "none")]
     rows = [
-        ("true poses", f"{poses.count} of {found.frames}"),
+        ("ground truth", f"{poses.count} of {found.frames} poses"),
         (
             "motion",
-            f"median {poses.step_cm:.2f} cm and {poses.step_deg:.2f} deg a frame, "
-            f"at most {poses.max_step_cm:.1f} cm and {poses.max_step_deg:.1f} deg",
+            f"median {poses.step_cm:.2f} cm and {poses.step_deg:.2f} deg per frame, "
+            f"maximum {poses.max_step_cm:.1f} cm and {poses.max_step_deg:.1f} deg",
         ),
     ]
     if poses.agreement is not None:
-        text = f"depth carried between views by the true poses agrees to {poses.agreement.median_cm:.2f} cm (median)"
-        rows.append(("poses, depth", text))
+        text = f"{poses.agreement.median_cm:.2f} cm median difference of depth reprojected with ground-truth poses"
+        rows.append(("consistency", text))
     return rows

@@ -1,4 +1,4 @@
-"""``spslam doctor``: versions, kernels and devices, and why CUDA is off if it is."""
+"""`spslam doctor`: shows versions, kernels and devices, and the reason if CUDA is off."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spslam.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """No option."""
+    """This command has no options."""
 
 
 def execute(args: argparse.Namespace) -> None:
@@ -28,12 +28,12 @@ def execute(args: argparse.Namespace) -> None:
     except ImportError as error:
         raise DeviceError(str(error).removeprefix("spslam: ")) from error
     except RuntimeError as error:
-        raise DeviceError(f"the kernel libraries don't fit this spslam, build them again: {error}") from error
-    _row("CPU kernels", f"{ops.CPU_ISA}, {torch.get_num_threads()} threads; {_try(torch.device('cpu'))}")
+        raise DeviceError(f"the kernel libraries do not match this spslam, build them again: {error}") from error
+    _row("CPU kernels", f"{ops.CPU_ISA}, {torch.get_num_threads()} threads; {_test_kernel(torch.device('cpu'))}")
     if ops.CUDA_OFF_REASON:
         _row("CUDA kernels", f"off: {ops.CUDA_OFF_REASON}")
     else:
-        _row("CUDA kernels", _try(torch.device("cuda")))
+        _row("CUDA kernels", _test_kernel(torch.device("cuda")))
     archs = cuda_archs(Path(spslam.__file__).parent / "_ops_cuda.so")
     if archs:
         _row("built for", ", ".join(archs))
@@ -43,7 +43,7 @@ def execute(args: argparse.Namespace) -> None:
 
 
 def cuda_archs(library: Path) -> list[str]:
-    """GPU architectures in a CUDA library, such as `sm_90` and `PTX 120`; it need not be loadable. [] without one."""
+    """GPU architectures in a CUDA library, such as `sm_90` and `PTX 120`, without loading it; [] if there is none."""
     try:
         found = re.search(rb"spslam-cuda-archs=([\w -]+)", library.read_bytes())
     except OSError:
@@ -51,13 +51,13 @@ def cuda_archs(library: Path) -> list[str]:
     names = []
     for arch in found[1].decode().split() if found else []:
         number, _, kind = arch.partition("-")
-        # CMake's words: nothing behind the number means both.
+        # In CMake's notation a number without -real or -virtual means both.
         names += [f"sm_{number}"] * (kind != "virtual") + [f"PTX {number}"] * (kind != "real")
     return names
 
 
-def _try(device: Any) -> str:
-    """Runs one small kernel, whose result is known, on a device."""
+def _test_kernel(device: Any) -> str:
+    """Runs one small kernel on a device and compares its result with that of the CPU."""
     from spslam import ops
 
     try:
@@ -65,7 +65,7 @@ def _try(device: Any) -> str:
         expected = ops.philox_uniform(0, ops.Stream.EVALUATION, 0, 0, 1000, device="cpu")
     except Exception as error:
         return f"fail: {' '.join(str(error).split())[:200]}"
-    return "working" if drawn.cpu().equal(expected) else "fail: wrong numbers"
+    return "working" if drawn.cpu().equal(expected) else "fail: wrong result"
 
 
 def _row(name: str, text: str) -> None:

@@ -1,4 +1,4 @@
-"""``spslam eval``: a finished run's trajectory, mesh and pictures against the truth."""
+"""`spslam eval`: evaluates trajectory, mesh and rendered views of a finished run against ground truth."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from spslam.run_folder import RunFolder
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_folder(parser)
-    parser.add_argument("--gt-mesh", metavar="PLY", type=Path, help="the true surface, in the true trajectory's world")
-    parser.add_argument("--views", action="store_true", help="compare pictures of the map with the input: PSNR, SSIM")
-    parser.add_argument("--scale", action="store_true", help="give ATE after alignment with scale too, as ate_scaled")
+    parser.add_argument("--gt-mesh", metavar="PLY", type=Path, help="ground-truth mesh, in the ground-truth world")
+    parser.add_argument("--views", action="store_true", help="PSNR and SSIM of the rendered map against the input")
+    parser.add_argument("--scale", action="store_true", help="also compute ATE after alignment with scale")
 
 
 def execute(args: argparse.Namespace) -> None:
@@ -31,8 +31,8 @@ def execute(args: argparse.Namespace) -> None:
     figures: dict[str, Any] = trajectory_figures(run, args.scale)
     if not figures and args.gt_mesh is None and not args.views:
         raise OutputError(
-            f"{args.output}: the data has no true poses to compare with; "
-            "--gt-mesh compares the mesh, --views pictures of the map"
+            f"{args.output}: there are no ground-truth poses to compare with; "
+            "--gt-mesh evaluates the mesh, --views rendered views of the map"
         )
     if args.gt_mesh is not None or args.views:
         figures |= _map_figures(run, args.gt_mesh, args.views)

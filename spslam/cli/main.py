@@ -19,14 +19,14 @@ EXIT_INTERRUPTED = 130
 # Modules of this package with `HELP`, `add_arguments(parser)` and `execute(args)`, imported when they are asked for.
 COMMANDS = {
     "run": "track and map an RGB-D sequence",
-    "demo": "track and map a generated room with known truth; needs no data",
-    "eval": "compare a run's trajectory and mesh with the truth",
-    "mesh": "extract a mesh from a run's map",
-    "download": "fetch a public data set from its official address",
-    "check-data": "look through a data set before running on it",
-    "bench": "run a suite of sequences and compare with the paper's figures",
-    "pretrain": "train the scene prior on procedural solids",
-    "doctor": "say which kernels, device and versions are in use",
+    "demo": "track and map a generated room with known ground truth; needs no data",
+    "eval": "evaluate a finished run against ground truth",
+    "mesh": "extract a mesh from the map of a finished run",
+    "download": "download a public dataset",
+    "check-data": "check a dataset for problems before running on it",
+    "bench": "run a benchmark suite and compare the results with the paper",
+    "pretrain": "train the scene prior on procedurally generated solids",
+    "doctor": "show which kernels, devices and versions are in use",
 }
 
 

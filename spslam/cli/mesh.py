@@ -1,4 +1,4 @@
-"""``spslam mesh``: a mesh from the map of a finished run."""
+"""`spslam mesh`: extracts a mesh from the map of a finished run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``spslam pretrain``: train the scene prior's encoder and decoder on procedural solids."""
+"""`spslam pretrain`: trains the encoder and decoder of the scene prior on procedurally generated solids."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         type=Path,
         default=DEFAULT_OUTPUT,
-        help=f"file of weights to write, {DEFAULT_OUTPUT} if not given; prior.weights in a configuration uses it",
+        help=f"weights file to write (default: {DEFAULT_OUTPUT}), for prior.weights in a configuration",
     )
-    parser.add_argument("--steps", metavar="N", type=at_least_one, help="optimization steps; the default is as shipped")
-    parser.add_argument("--seed", metavar="N", type=int, help="seed of all random draws, 0 if not given")
+    parser.add_argument("--steps", metavar="N", type=at_least_one, help="optimization steps (default: as shipped)")
+    parser.add_argument("--seed", metavar="N", type=int, help="seed of all random numbers (default: 0)")
     parser.add_argument(
         "--neighborhood",
         type=int,
         choices=(8, 64),
-        help="voxel corners around a point that it is encoded at, 64 if not given",
+        help="number of voxel vertices that a point is encoded to (default: 64)",
     )
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted training")
-    parser.add_argument("--plot", action="store_true", help="draw the course of the training, beside FILE")
+    parser.add_argument("--resume", action="store_true", help="resume an interrupted training from its checkpoint")
+    parser.add_argument("--plot", action="store_true", help="plot the training error to an image beside FILE")
     add_quiet(parser)
 
 
@@ -70,7 +70,7 @@ def _settings(args: argparse.Namespace) -> Any:
 
 
 def _make_progress(quiet: bool) -> Callable[[int, int, float], None] | None:
-    """A bar on a terminal, a line every few seconds elsewhere."""
+    """A progress bar on a terminal; elsewhere a line every few seconds."""
     if quiet:
         return None
     return _Bar() if sys.stderr.isatty() else _Lines()

@@ -1,4 +1,4 @@
-"""What a run shows while it goes on, and the table at its end."""
+"""Progress display of a run, and the summary at its end."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ SECONDS_BETWEEN_LINES = 5.0
 
 
 def make_progress(quiet: bool) -> ProgressBar | ProgressLines | None:
-    """A callback for ``run_sequence``: a bar on a terminal, a line every few seconds elsewhere, None if quiet."""
+    """A callback for `run_sequence`: a progress bar on a terminal, else a line every few seconds; None if quiet."""
     if quiet:
         return None
     return ProgressBar() if sys.stderr.isatty() else ProgressLines()
 
 
 class ProgressBar:
-    """Frames done, frames a second, the map's loss and whether the camera is lost, on one line of a terminal."""
+    """A progress bar on a terminal: completed frames, frames per second, and the state of the last frame."""
 
     def __init__(self) -> None:
         self._bar: Any = None
@@ -35,20 +35,20 @@ class ProgressBar:
             bar = (
                 "{desc}{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
             )
-            # Some terminals say that they are 0 by 0; a bar for them would be empty.
+            # Some terminals report a size of 0 by 0; tqdm would then show an empty bar.
             columns, rows = shutil.get_terminal_size()
             self._bar = tqdm(total=total, initial=done - 1, unit=" frames", ncols=columns, nrows=rows, bar_format=bar)
         self._bar.set_postfix_str(describe(report), refresh=False)
         self._bar.update(done - self._bar.n)
 
     def close(self) -> None:
-        """End the line, so that what is printed next stands on its own."""
+        """Ends the line of the progress bar."""
         if self._bar is not None:
             self._bar.close()
 
 
 class ProgressLines:
-    """The same as plain lines, one every few seconds and one at the end."""
+    """Progress as plain lines, one every few seconds and one at the end."""
 
     def __init__(self) -> None:
         self._last = time.monotonic()
@@ -65,11 +65,11 @@ class ProgressLines:
         )
 
     def close(self) -> None:
-        """Nothing is left open."""
+        """Nothing to do."""
 
 
 class Rate:
-    """Frames a second since the first one counted."""
+    """Counts frames per second since its creation."""
 
     def __init__(self) -> None:
         self._started = time.monotonic()
@@ -83,7 +83,7 @@ class Rate:
 
 
 def describe(report: Any) -> str:
-    """A frame in a few words: ok, lost or skipped, and the map's loss where it was just optimized."""
+    """The state of a frame: ok, LOST or skipped; its tracking residual, and the mapping loss if it was mapped."""
     if report is None:
         return "unreadable frame skipped"
     parts = ["LOST" if report.lost else "ok"]
@@ -95,18 +95,18 @@ def describe(report: Any) -> str:
 
 
 def print_summary(metrics: Mapping[str, Any], output: Path) -> None:
-    """The figures that matter, and where the rest is."""
+    """Prints the most important metrics and the paths of the results."""
     for name, value in summarize(metrics, output):
         print(f"{name:<14}{value}")
 
 
 def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]:
-    """Rows of the table at the end of a run; figures that weren't measured are left out."""
+    """Rows (name, value) of the summary of a run; metrics that were not measured are left out."""
     rows = [("frames", _frames(metrics))]
     for name, key, form in (
         ("speed", "fps", "{:.1f} frames/s"),
         ("ATE RMSE", "ate_rmse_cm", "{:.2f} cm"),
-        ("RPE", "rpe_cm", "{:.2f} cm a frame"),
+        ("RPE", "rpe_cm", "{:.2f} cm/frame"),
         ("accuracy", "accuracy_cm", "{:.2f} cm"),
         ("completeness", "completeness_cm", "{:.2f} cm"),
         ("F1 at 5 cm", "f1_5cm", "{:.1f} %"),

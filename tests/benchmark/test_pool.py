@@ -146,7 +146,7 @@ def test_nothing_to_run_is_reported(tmp_path):
     done = spslam("bench", "tum", cwd=tmp_path)
     assert done.returncode == 2
     assert "skipped fr1/desk: no --data given" in done.stderr
-    assert "nothing of tum could be run" in done.stderr
+    assert "no run of tum is possible: no data found" in done.stderr
 
 
 def test_output_that_is_a_file_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""Whatever is wrong with the input: one clear line, exit code 2, and nothing half-written."""
+"""Invalid input: a one-line error, exit code 2, and no partial output."""
 
 import shutil
 
@@ -57,7 +57,7 @@ def break_intrinsics(scene):
     (scene / "camera-intrinsics.txt").write_text("1 2 3\n4 5 6\n")
 
 
-SPOILERS = {
+DAMAGES = {
     "no such folder": shutil.rmtree,
     "must be a folder": replace_by_file,
     "7-Scenes frames": replace_by_other_layout,
@@ -69,9 +69,9 @@ SPOILERS = {
 }
 
 
-@pytest.mark.parametrize("message", SPOILERS)
+@pytest.mark.parametrize("message", DAMAGES)
 def test_unusable_data_is_refused(tmp_path, scene, message):
-    SPOILERS[message](scene)
+    DAMAGES[message](scene)
     assert_refused(run(tmp_path, "7scenes", "--data", scene, "--quiet"), message)
     assert not (tmp_path / "out").exists()
 
@@ -110,7 +110,7 @@ def test_absent_device_is_refused(tmp_path, command):
     ("name", "message"),
     [("notes.txt", "is not empty"), ("metrics.json", "holds"), ("checkpoint.safetensors", "--resume")],
 )
-def test_output_folder_in_use_is_refused_and_left_alone(tmp_path, scene, name, message):
+def test_an_output_folder_in_use_is_refused_and_not_changed(tmp_path, scene, name, message):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).write_text("mine")
     assert_refused(run(tmp_path, "7scenes", "--data", scene), message)
@@ -142,7 +142,7 @@ def test_commands_on_a_finished_run_refuse_other_folders(tmp_path, command):
     assert_refused(spslam(command, "empty", cwd=tmp_path), "must be the output folder of a finished run, but has no ")
 
 
-def test_check_data_looks_at_every_sequence_of_a_scene(tmp_path, scene):
+def test_check_data_reads_every_sequence_of_a_scene(tmp_path, scene):
     shutil.copytree(scene / "seq-01", scene / "seq-02")
     (scene / "seq-02" / "frame-000001.depth.png").write_bytes(b"")
     result = spslam("check-data", "7scenes", "--data", scene, cwd=tmp_path)

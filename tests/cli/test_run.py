@@ -1,4 +1,4 @@
-"""The commands from end to end, on a few small frames of the generated room."""
+"""End-to-end tests of the commands, on a few small frames of the generated room."""
 
 import json
 import re
@@ -51,7 +51,7 @@ def few_samples(monkeypatch):
     monkeypatch.setattr(finished_run, "surface_figures", few)
 
 
-def test_run_leaves_all_files_and_says_where(finished):
+def test_run_writes_all_files_and_prints_their_paths(finished):
     folder, result = finished
     assert {path.name for path in (folder / "out").iterdir()} == FILES | {"mesh.ply"}
     assert re.search(r"^frames +8$", result.stdout, re.MULTILINE)
@@ -65,7 +65,7 @@ def test_run_leaves_all_files_and_says_where(finished):
     assert not [key for key in metrics if f"`{key}`" not in page]
 
 
-def test_kept_configuration_is_the_one_that_ran(finished):
+def test_saved_configuration_is_that_of_the_run(finished):
     config = load_config(finished[0] / "out" / "config.yaml")
     assert config == load_config(
         "demo", overrides=[*(text.removeprefix("--set=") for text in SMALL[:-1]), "device=cpu"]
@@ -83,17 +83,17 @@ def test_finished_run_is_not_overwritten(finished):
     assert (folder / "out" / "trajectory.txt").read_bytes() == before
 
 
-def test_eval_adds_figures_of_the_mesh(finished, few_samples):
+def test_eval_adds_metrics_of_the_mesh(finished, few_samples):
     folder, _ = finished
     result = spslam("eval", "out", "--gt-mesh", "out/mesh.ply", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert "F1 at 5 cm" in result.stdout
-    # Against itself the mesh is off by what the alignment of estimated and true views carries it.
+    # Compared with itself, the mesh differs only by the alignment of estimated and ground-truth poses.
     assert json.loads((folder / "out" / "metrics.json").read_text())["f1_5cm"] > 99
     assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such mesh file")
 
 
-def test_eval_adds_figures_of_pictures_and_of_alignment_with_scale(finished):
+def test_eval_adds_metrics_of_views_and_of_alignment_with_scale(finished):
     folder, _ = finished
     result = spslam("eval", "out", "--views", "--scale", cwd=folder)
     assert result.returncode == 0, result.stderr
@@ -107,7 +107,7 @@ def test_eval_adds_figures_of_pictures_and_of_alignment_with_scale(finished):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb"])
-def test_mesh_is_made_from_the_map(finished, suffix):
+def test_mesh_is_extracted_from_the_map(finished, suffix):
     folder, _ = finished
     result = spslam("mesh", "out", "--resolution", "0.08", "--format", suffix, cwd=folder)
     assert result.returncode == 0, result.stderr
@@ -162,7 +162,7 @@ def test_demo_replaces_an_earlier_run_over_the_room(finished, few_samples, tmp_p
 def test_check_data_describes_the_room(tmp_path):
     result = spslam("check-data", "demo", "--set", "dataset.width=64", "--set", "dataset.height=48", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    for line in ("frames        300", "size          64x48 px", "true poses    300 of 300", "nothing looks wrong"):
+    for line in ("frames        300", "size          64x48 px", "ground truth  300 of 300 poses", "no problems found"):
         assert line in result.stdout
 
 
@@ -170,7 +170,7 @@ class Report:
     lost, fit, loss = False, Fit(residual_cm=0.31), 0.2
 
 
-def test_progress_without_a_terminal_is_lines(capsys):
+def test_progress_without_a_terminal_is_printed_as_lines(capsys):
     lines = ProgressLines()
     lines(1, 3, None)
     lines(2, 3, Report())
@@ -179,7 +179,7 @@ def test_progress_without_a_terminal_is_lines(capsys):
     assert re.fullmatch(r"3/3 frames, [\d.]+ frames/s, ok, residual 0\.31 cm, loss 0\.200\n", error)
 
 
-def test_progress_on_a_terminal_is_a_bar_that_ends_its_line(capsys):
+def test_progress_on_a_terminal_is_a_bar_that_ends_with_a_newline(capsys):
     bar = ProgressBar()
     bar(4, 9, Report())  # a resumed run
     time.sleep(0.2)  # tqdm draws ten times a second
@@ -191,7 +191,7 @@ def test_progress_on_a_terminal_is_a_bar_that_ends_its_line(capsys):
     assert error.endswith("\n")
 
 
-def test_summary_leaves_out_what_was_not_measured(tmp_path):
+def test_summary_leaves_out_missing_metrics(tmp_path):
     assert summarize({"frames": 5}, tmp_path) == [("frames", "5")]
     assert summarize({"frames": 5, "lost_frames": 1, "skipped_frames": 2, "fps": 3.21}, tmp_path) == [
         ("frames", "5 (1 lost, 2 skipped)"),

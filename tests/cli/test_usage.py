@@ -1,4 +1,4 @@
-"""The command line itself: help, versions, wrong arguments, and what becomes of errors."""
+"""The command line: help, version, wrong arguments, and the output of errors."""
 
 import argparse
 import re
@@ -74,7 +74,7 @@ def test_version(tmp_path):
         (["mesh", "x", "--format", "stl"], "--format: invalid choice: 'stl'"),
     ],
 )
-def test_wrong_command_line_is_one_line(tmp_path, arguments, message):
+def test_a_wrong_command_line_is_a_one_line_error(tmp_path, arguments, message):
     assert_refused(spslam(*arguments, cwd=tmp_path), message)
     assert not list(tmp_path.iterdir())
 
@@ -124,14 +124,14 @@ class Raising:
         (KeyboardInterrupt("go on with x"), 130, "spslam: interrupted; go on with x"),
     ],
 )
-def test_every_error_is_one_line_and_a_code(monkeypatch, capsys, error, code, line):
+def test_every_error_is_one_line_with_an_exit_code(monkeypatch, capsys, error, code, line):
     monkeypatch.setattr(main_module, "_module", lambda command: Raising(error))
     assert main(["doctor"]) == code
     assert capsys.readouterr().err == line + "\n"
 
 
 @pytest.mark.parametrize("arguments", [["--debug", "doctor"], ["doctor", "--debug"]])
-def test_debug_shows_where_an_error_comes_from(monkeypatch, capsys, arguments):
+def test_debug_prints_the_traceback(monkeypatch, capsys, arguments):
     monkeypatch.setattr(main_module, "_module", lambda command: Raising(RuntimeError("odd")))
     assert main(arguments) == 1
     error = capsys.readouterr().err
