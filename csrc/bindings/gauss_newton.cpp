@@ -33,23 +33,23 @@ ReferenceImage load_reference(const std::optional<Tensor>& cells, const std::opt
 
 // None without images. Row 2 k of `rows` is view k's image, row 2 k + 1 its pose.
 DepthKeyframes load_depth_keyframes(const std::optional<Tensor>& images, const std::optional<Tensor>& poses,
-                      const std::vector<std::int64_t>& rows, const std::vector<double>& intrinsics, double unit,
-                      double kernel_end, std::int64_t first_iteration) {
+                                    const std::vector<std::int64_t>& rows, const std::vector<double>& intrinsics,
+                                    double unit, double kernel_end, std::int64_t first_iteration) {
   if (!images || !poses || rows.empty()) return {};
   SPS_CHECK(images->dim() == 3 && poses->dim() == 2 && poses->size(1) == kPoseSize && unit > 0.0 && kernel_end > 0.0,
             "track_gauss_newton: views must have shape [R, H, W], their poses [F, 7]");
   SPS_CHECK(rows.size() % 2 == 0 && rows.size() <= 2 * kMaxDepthKeyframes, "track_gauss_newton: at most 8 views");
   DepthKeyframes views{data<std::uint16_t>(*images),
-                   data<float>(*poses),
-                   images->size(1),
-                   images->size(2),
-                   load_intrinsics(intrinsics),
-                   static_cast<float>(unit),
-                   static_cast<float>(kernel_end),
-                   first_iteration,
-                   static_cast<int>(rows.size() / 2),
-                   {},
-                   {}};
+                       data<float>(*poses),
+                       images->size(1),
+                       images->size(2),
+                       load_intrinsics(intrinsics),
+                       static_cast<float>(unit),
+                       static_cast<float>(kernel_end),
+                       first_iteration,
+                       static_cast<int>(rows.size() / 2),
+                       {},
+                       {}};
   for (int k = 0; k < views.count; ++k) {
     views.image_rows[k] = rows[2 * k];
     views.pose_rows[k] = rows[2 * k + 1];
@@ -64,11 +64,11 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
     std::vector<Tensor> tensors, std::vector<double> scalars, std::vector<std::int64_t> layout, Tensor pixels,
     Tensor pose, std::vector<double> intrinsics, std::int64_t num_pixels, std::int64_t iterations, double truncation,
     double kernel_start, double kernel_end, double score_kernel, double damping, std::int64_t seed, std::int64_t stream,
-    std::int64_t frame, double noise_crossover_depth, std::optional<Tensor> reference, std::optional<Tensor> reference_pose,
-    std::vector<double> reference_intrinsics, double intensity_weight, double intensity_kernel,
-    std::optional<Tensor> views, std::optional<Tensor> view_poses, std::vector<std::int64_t> view_rows,
-    std::vector<double> view_intrinsics, double depth_image_unit, double view_kernel_end, std::int64_t view_first_iteration,
-    bool tf32) {
+    std::int64_t frame, double noise_crossover_depth, std::optional<Tensor> reference,
+    std::optional<Tensor> reference_pose, std::vector<double> reference_intrinsics, double intensity_weight,
+    double intensity_kernel, std::optional<Tensor> views, std::optional<Tensor> view_poses,
+    std::vector<std::int64_t> view_rows, std::vector<double> view_intrinsics, double depth_image_unit,
+    double view_kernel_end, std::int64_t view_first_iteration, bool tf32) {
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
             "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
@@ -96,7 +96,8 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
       philox_key(seed, stream, frame, 0),
       static_cast<float>(noise_crossover_depth),
       load_reference(reference, reference_pose, reference_intrinsics, intensity_weight, intensity_kernel),
-      load_depth_keyframes(views, view_poses, view_rows, view_intrinsics, depth_image_unit, view_kernel_end, view_first_iteration),
+      load_depth_keyframes(views, view_poses, view_rows, view_intrinsics, depth_image_unit, view_kernel_end,
+                           view_first_iteration),
       tf32};
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
                              workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
@@ -138,7 +139,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
         "float kernel_start, float kernel_end, float score_kernel, float damping, int seed, int stream, int frame, "
         "float noise_crossover_depth, Tensor? reference, Tensor? reference_pose, float[] reference_intrinsics, "
         "float intensity_weight, float intensity_kernel, Tensor? views, Tensor? view_poses, int[] view_rows, "
-        "float[] view_intrinsics, float depth_image_unit, float view_kernel_end, int view_first_iteration, bool tf32=True) -> "
+        "float[] view_intrinsics, float depth_image_unit, float view_kernel_end, int view_first_iteration, bool "
+        "tf32=True) -> "
         "(Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "

@@ -26,8 +26,8 @@ struct Measurement {
 void add_views(const Measurement& measure, const SurfacePoint& point, float certainty, const MapResidual& map,
                double* terms) {
   for (int k = 0; k < measure.views.count; ++k) {
-    add_depth_keyframe_residual(measure.views, measure.view[k], point.world, point.offset, measure.kernel.view, certainty,
-                            map, terms + kTrackingTerms);
+    add_depth_keyframe_residual(measure.views, measure.view[k], point.world, point.offset, measure.kernel.view,
+                                certainty, map, terms + kTrackingTerms);
   }
 }
 

@@ -80,8 +80,8 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
   const float certainty = depth_certainty(pixel.depth, measure.noise_crossover_depth);
   for (int v = lane % 4 / 2; v < measure.num_keyframes && pixel.depth > 0.0f; v += 2) {
-    add_depth_keyframe_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view, certainty,
-                            {sdf * measure.truncation, known}, keyframe_terms);
+    add_depth_keyframe_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view,
+                                certainty, {sdf * measure.truncation, known}, keyframe_terms);
   }
   if (adds && known) {
     add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, certainty, terms);

@@ -45,9 +45,9 @@ struct MapResidual {
 // type T; nothing where the point falls off the image or between pixels that have no depth or an edge. The inverse
 // depth q of a plane is linear in the image, so z q(u, v) - 1 is linear in the point, and by its slope a distance.
 template <class T>
-SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& views, const DepthKeyframe& view, const Vec3<float>& world,
-                                        const Vec3<float>& offset, float kernel, float certainty,
-                                        const MapResidual& map, T* terms) {
+SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& views, const DepthKeyframe& view,
+                                            const Vec3<float>& world, const Vec3<float>& offset, float kernel,
+                                            float certainty, const MapResidual& map, T* terms) {
   const FramePlace place = place_in_frame(view.pose, views.intrinsics, views.height, views.width, world);
   if (!place.inside) return;
   const std::uint16_t* row = view.image + place.row * views.width + place.column;

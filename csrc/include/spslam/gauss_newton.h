@@ -49,8 +49,9 @@ struct TrackingOptions {
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
   float score_kernel;              // m, width of the kernel of cost and mean weight; 0: the iteration's own
   double damping;
-  PhiloxKey key;      // its iteration is replaced by the running one
-  float noise_crossover_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
+  PhiloxKey key;                // its iteration is replaced by the running one
+  float noise_crossover_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0:
+                                // noise alike
   ReferenceImage reference;
   DepthKeyframes views;
   bool tf32;  // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
