@@ -5,6 +5,7 @@
 #include "kernels/depth_keyframes.h"
 #include "kernels/gauss_newton.h"
 #include "kernels/reference_image.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace {

@@ -7,6 +7,7 @@
 #include "cpu/render_step_geometry.h"
 #include "cpu/render_step_losses.h"
 #include "cpu/render_step_scatter.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace render {

@@ -5,6 +5,9 @@
 #pragma once
 
 #include "cpu/render_step_chunk.h"
+#include "kernels/interpolation.h"
+#include "kernels/ray_sampling.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam::render {
 

@@ -5,6 +5,7 @@
 
 #include "cpu/mlp_tile.h"
 #include "kernels/pixel_record.h"
+#include "kernels/ray_sampling.h"
 #include "kernels/volume_rendering.h"
 #include "spslam/render_step.h"
 

@@ -4,6 +4,7 @@
 #include <initializer_list>
 
 #include "cpu/render_step_geometry.h"
+#include "kernels/interpolation.h"
 
 namespace spslam::render {
 

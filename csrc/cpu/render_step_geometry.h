@@ -3,6 +3,7 @@
 
 #include "cpu/render_step_chunk.h"
 #include "kernels/decoders.h"
+#include "kernels/interpolation.h"
 
 namespace spslam::render {
 

@@ -2,7 +2,7 @@
 // one after the other.
 #include "cuda/fused/map_update.cuh"
 #include "cuda/fused/ray_step.h"
-#include "kernels/optimize_map_launch.h"
+#include "launch/optimize_map.h"
 
 namespace spslam {
 namespace {

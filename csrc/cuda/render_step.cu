@@ -2,7 +2,7 @@
 #include "core/for_each.h"
 #include "cuda/fused/block_sums.cuh"
 #include "cuda/fused/ray_step.h"
-#include "kernels/render_step_launch.h"
+#include "launch/render_step.h"
 
 namespace spslam {
 namespace {

@@ -2,7 +2,7 @@
 // one after the other.
 #include "cuda/fused/block_sums.cuh"
 #include "cuda/fused/ray_step.h"
-#include "kernels/track_adam_launch.h"
+#include "launch/track_adam.h"
 
 namespace spslam {
 namespace {
@@ -67,7 +67,7 @@ __global__ void __launch_bounds__(fused::kSumThreads) track_step_kernel(const __
   PoseSearch search = *a.search;
   step_pose_search(a.rotation, a.translation, a.losses[0], terms + kLossSums, search);
   *a.search = search;
-  for (int k = 0; k < kPoseNumbers; ++k) a.best[k] = search.best[k];
+  for (int k = 0; k < kPoseSize; ++k) a.best[k] = search.best[k];
 }
 
 KernelLaunches fused_launches(const PoseTracking& call, const FusedTrackBuffers& buffers) {

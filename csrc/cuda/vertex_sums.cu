@@ -5,6 +5,7 @@
 
 #include "core/cuda_check.cuh"
 #include "cuda/vertex_sums.cuh"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace {

@@ -9,7 +9,6 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
-#include "kernels/gauss_newton.h"
 #include "kernels/pixel_record.h"
 #include "spslam/covisibility.h"
 

@@ -6,7 +6,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
-#include "spslam/scene_view.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 

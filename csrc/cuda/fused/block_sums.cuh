@@ -4,6 +4,7 @@
 #include "cuda/fused/arguments.cuh"
 #include "cuda/fused/column_sums.cuh"
 #include "cuda/fused/fragment.cuh"
+#include "kernels/ray_source.h"
 
 namespace spslam::fused {
 

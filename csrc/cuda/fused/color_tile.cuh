@@ -5,6 +5,7 @@
 
 #include "cuda/fused/stage.cuh"
 #include "cuda/fused/warp_ray.cuh"
+#include "kernels/interpolation.h"
 
 namespace spslam::fused {
 

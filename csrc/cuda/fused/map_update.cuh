@@ -4,6 +4,7 @@
 #include "cuda/fused/block_sums.cuh"
 #include "kernels/optimizer.h"
 #include "kernels/pose_adam.h"
+#include "kernels/ray_source.h"
 
 namespace spslam::fused {
 
@@ -61,7 +62,7 @@ __device__ __forceinline__ void step_pose(const MapUpdateArguments& a, std::int6
   float gradient[kPoseGradientSize];
   sum_pulls(a.pulls, a.rays, slot, lane, gradient);
   if (lane != 0) return;
-  const std::int64_t at = kPoseNumbers * row;
+  const std::int64_t at = kPoseSize * row;
   pose_adam(a.poses.coefficients, a.poses.coefficients, gradient, a.poses.param + at, a.poses.exp_avg + at,
             a.poses.exp_avg_sq + at);
 }

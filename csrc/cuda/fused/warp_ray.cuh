@@ -3,8 +3,11 @@
 
 #include "cuda/fused/arguments.cuh"
 #include "cuda/fused/fragment.cuh"
+#include "kernels/interpolation.h"
 #include "kernels/ray_sampling.h"
+#include "kernels/ray_source.h"
 #include "kernels/volume_rendering.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam::fused {
 

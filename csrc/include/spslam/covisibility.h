@@ -5,7 +5,7 @@
 
 #include "core/device.h"
 #include "core/philox.h"
-#include "spslam/gauss_newton.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 

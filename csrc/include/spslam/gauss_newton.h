@@ -9,7 +9,6 @@
 
 namespace spslam {
 
-constexpr int kPoseSize = 7;  // unit quaternion (w, x, y, z), translation (m)
 // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean judging weight over all pixels
 constexpr int kTrackingStatSize = 5;
 

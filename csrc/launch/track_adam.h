@@ -1,8 +1,8 @@
 // A tracking call put together from the launches of its parts, for any device.
 #pragma once
 
-#include "kernels/drawn_rays_launch.h"
-#include "kernels/optimizer_launch.h"
+#include "launch/drawn_rays.h"
+#include "launch/optimizer.h"
 #include "spslam/track_adam.h"
 
 namespace spslam {
@@ -67,7 +67,7 @@ struct TrackAdamLaunch {
   void finish() {
     const PoseSearch* search = search_;
     float* best = call_.best;
-    for_each(device_, kPoseNumbers, [=] SPS_HOST_DEVICE(std::int64_t i) { best[i] = search->best[i]; });
+    for_each(device_, kPoseSize, [=] SPS_HOST_DEVICE(std::int64_t i) { best[i] = search->best[i]; });
   }
 
   const Device device_;

@@ -3,8 +3,11 @@
 #pragma once
 
 #include "core/for_each.h"
+#include "kernels/interpolation.h"
 #include "kernels/pixel_record.h"
-#include "kernels/render_step_buffers.h"
+#include "kernels/ray_sampling.h"
+#include "kernels/voxel_hash.h"
+#include "launch/render_step_buffers.h"
 #include "spslam/ray_sampling.h"
 
 namespace spslam {

@@ -4,7 +4,7 @@
 #include "core/for_each.h"
 #include "kernels/pose_adam.h"
 #include "kernels/ray_source.h"
-#include "kernels/render_step_buffers.h"
+#include "launch/render_step_buffers.h"
 
 namespace spslam {
 
@@ -16,7 +16,7 @@ struct DrawnRays {
   DrawnRays(Workspace& memory, const RaySource& source)
       : pixels(memory.take<std::int32_t>(kPixelWords * source.num_rays)),
         slots(memory.take<std::int32_t>(source.num_rays)),
-        poses(memory.take<float>(kPoseNumbers * source.num_slots)) {}
+        poses(memory.take<float>(kPoseSize * source.num_slots)) {}
 
   RayBatch batch(const RaySource& source, const Intrinsics& intrinsics) const {
     return {pixels, slots, source.num_rays, poses, source.num_slots, intrinsics};
@@ -33,8 +33,8 @@ struct DrawnRays {
       out.slots[r] = static_cast<std::int32_t>(slot);
     });
     for_each(device, source.num_slots, [=] SPS_HOST_DEVICE(std::int64_t slot) {
-      const float* pose = source.poses + kPoseNumbers * slot_row(source, slot);
-      for (int k = 0; k < kPoseNumbers; ++k) out.poses[kPoseNumbers * slot + k] = pose[k];
+      const float* pose = source.poses + kPoseSize * slot_row(source, slot);
+      for (int k = 0; k < kPoseSize; ++k) out.poses[kPoseSize * slot + k] = pose[k];
     });
   }
 };

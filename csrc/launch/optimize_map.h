@@ -1,9 +1,10 @@
 // A mapping call put together from the launches of its parts, for any device.
 #pragma once
 
-#include "kernels/drawn_rays_launch.h"
-#include "kernels/optimizer_launch.h"
 #include "kernels/pose_adam.h"
+#include "kernels/ray_source.h"
+#include "launch/drawn_rays.h"
+#include "launch/optimizer.h"
 #include "spslam/optimize_map.h"
 
 namespace spslam {
@@ -89,7 +90,7 @@ struct OptimizeMapLaunch {
     const float* gradients = grad_poses_;
     const std::int64_t fixed = call_.fixed_row;
     for_each(device_, source.num_slots, [=] SPS_HOST_DEVICE(std::int64_t slot) {
-      const std::int64_t row = slot_row(source, slot), at = kPoseNumbers * row;
+      const std::int64_t row = slot_row(source, slot), at = kPoseSize * row;
       if (row == fixed) return;
       pose_adam(c, c, gradients + kPoseGradientSize * slot, poses.param + at, poses.exp_avg + at,
                 poses.exp_avg_sq + at);
