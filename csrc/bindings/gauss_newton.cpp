@@ -84,7 +84,7 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
   Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
   Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, 1, num_pixels)}, ScalarType::Byte);
-  const TrackingOptions options{
+  const GaussNewtonOptions options{
       load_intrinsics(intrinsics),
       num_pixels,
       iterations,
@@ -95,10 +95,10 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
       damping,
       philox_key(seed, stream, frame, 0),
       static_cast<float>(noise_crossover_depth),
+      tf32,
       load_reference(reference, reference_pose, reference_intrinsics, intensity_weight, intensity_kernel),
       load_depth_keyframes(views, view_poses, view_rows, view_intrinsics, depth_image_unit, view_kernel_end,
-                           view_first_iteration),
-      tf32};
+                           view_first_iteration)};
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
                              workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
                              mutable_data<float>(hessian));
@@ -124,8 +124,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
   Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, frames, count)}, ScalarType::Byte);
   spslam::gauss_newton_poses(scope.context, scene.view, data<std::int32_t>(pixels), data<float>(poses), frames, count,
                              load_intrinsics(intrinsics), static_cast<float>(truncation), static_cast<float>(kernel),
-                             workspace.mutable_data_ptr(), mutable_data<float>(hessian), mutable_data<float>(gradient),
-                             mutable_data<float>(cost), mutable_data<float>(inliers));
+                             workspace.mutable_data_ptr(),
+                             {mutable_data<float>(hessian), mutable_data<float>(gradient), mutable_data<float>(cost),
+                              mutable_data<float>(inliers)});
   return {hessian, gradient, cost, inliers};
 }
 

@@ -18,9 +18,10 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
   pose = contiguous(pose);
   DeviceScope scope(records);
   const Tensor points = rows_of_three(records), world_normals = rows_of_three(records);
-  spslam::unproject_pixels(scope.context, data<std::int32_t>(records), data<float>(normals), records.size(0),
-                           data<float>(pose), static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx),
-                           static_cast<float>(cy), mutable_data<float>(points), mutable_data<float>(world_normals));
+  spslam::unproject_pixels(
+      scope.context, data<std::int32_t>(records), data<float>(normals), records.size(0), data<float>(pose),
+      {static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx), static_cast<float>(cy)},
+      mutable_data<float>(points), mutable_data<float>(world_normals));
   return {points, world_normals};
 }
 

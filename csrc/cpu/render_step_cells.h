@@ -28,7 +28,7 @@ inline void load_rays(const RayBatch& batch, const RenderOptions& options, std::
     if (ray.frame != pose_frame) pose = load_pose(batch.poses + 7 * static_cast<std::int64_t>(ray.frame));
     pose_frame = ray.frame;
     ray.origin = pose.translation;
-    ray.direction = pose.rotation * pixel_ray(ray.pixel, k.fx, k.fy, k.cx, k.cy);
+    ray.direction = pose.rotation * pixel_ray(ray.pixel, k);
   }
 }
 

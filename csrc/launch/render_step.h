@@ -48,7 +48,7 @@ struct RenderStepLaunch {
       const Intrinsics& k = rays.intrinsics;
       const Pose<float> pose = known ? load_pose(rays.poses + 7 * static_cast<std::int64_t>(frame)) : Pose<float>{};
       b.origin[r] = pose.translation;
-      b.direction[r] = pose.rotation * pixel_ray(pixel, k.fx, k.fy, k.cx, k.cy);
+      b.direction[r] = pose.rotation * pixel_ray(pixel, k);
       b.depth[r] = known && has_depth(pixel.depth) ? pixel.depth : 0.0f;
       b.foreshortening[r] = pixel.foreshortening;
       for (int c = 0; c < 3; ++c) b.target_color[3 * r + c] = pixel.color[c];

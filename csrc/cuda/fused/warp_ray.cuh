@@ -40,7 +40,7 @@ __device__ __forceinline__ WarpRay load_ray(const RayStepArguments& a, std::int6
   ray.cosine = a.cosine_targets ? ray.pixel.foreshortening : 1.0f;
   const Pose<float> pose = load_pose(a.rays.poses + 7 * row);
   ray.origin = pose.translation;
-  ray.direction = pose.rotation * pixel_ray(ray.pixel, a.camera.fx, a.camera.fy, a.camera.cx, a.camera.cy);
+  ray.direction = pose.rotation * pixel_ray(ray.pixel, a.camera);
   return ray;
 }
 

@@ -5,6 +5,7 @@
 
 #include "core/device.h"
 #include "core/philox.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 
@@ -53,6 +54,6 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
 // at `pose`: seven numbers, unit quaternion (w, x, y, z) and translation of T_world_camera, on the device.
 template <class Device>
 void unproject_pixels(Device device, const std::int32_t* records, const float* camera_normals, std::int64_t n,
-                      const float* pose, float fx, float fy, float cx, float cy, float* points, float* normals);
+                      const float* pose, const Intrinsics& intrinsics, float* points, float* normals);
 
 }  // namespace spslam
