@@ -23,7 +23,7 @@ inline void load_rays(const RayBatch& batch, const RenderOptions& options, std::
     ray.frame = batch.ray_frames[begin + i];
     ray.valid = has_depth(ray.pixel.depth) && ray.frame >= 0 && ray.frame < batch.num_frames;
     ray.cosine = options.cosine_targets ? ray.pixel.foreshortening : 1.0f;
-    chunk.pulls[i] = {};
+    chunk.pose_gradients[i] = {};
     if (!ray.valid) continue;
     if (ray.frame != pose_frame) pose = load_pose(batch.poses + 7 * static_cast<std::int64_t>(ray.frame));
     pose_frame = ray.frame;

@@ -152,7 +152,8 @@ inline void decode_color(const PackedMlp<float>& net, Chunk& chunk) {
   }
 }
 
-inline void pull_rays_by_color(const float* grad_x, std::int64_t first, std::int64_t rows, Chunk& chunk) {
+// The same of the color decoder's input.
+inline void add_color_gradients(const float* grad_x, std::int64_t first, std::int64_t rows, Chunk& chunk) {
   for (std::int64_t r = 0; r < rows; ++r) {
     const float* slopes = chunk.color_slopes + (first + r) * kColorSlopes;
     Vector<float> sums[3] = {};
@@ -160,8 +161,8 @@ inline void pull_rays_by_color(const float* grad_x, std::int64_t first, std::int
       const Vector<float> grad = load_vector<Vector<float>>(grad_x + r * kPlaneChannels + c);
       for (int k = 0; k < 3; ++k) sums[k] += grad * load_vector<Vector<float>>(slopes + k * kPlaneChannels + c);
     }
-    pull_ray(chunk, chunk.color_sample[first + r],
-             {sum_lanes<float>(sums[0]), sum_lanes<float>(sums[1]), sum_lanes<float>(sums[2])});
+    add_sample_gradient(chunk, chunk.color_sample[first + r],
+                        {sum_lanes<float>(sums[0]), sum_lanes<float>(sums[1]), sum_lanes<float>(sums[2])});
   }
 }
 
@@ -187,7 +188,7 @@ inline void color_backward(const PackedMlp<float>& net, const Plan& plan, std::i
       mlp_tile_add_weight_gradients(l, rows, chunk.color_x + row * l.input_stride, h1, h2, chunk.grad_rgb + row, stride,
                                     chunk.g1, chunk.g2, partial);
     }
-    if (plan.pose) pull_rays_by_color(grad_x, row, rows, chunk);
+    if (plan.pose) add_color_gradients(grad_x, row, rows, chunk);
   }
 }
 

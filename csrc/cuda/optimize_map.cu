@@ -11,14 +11,14 @@ namespace {
 constexpr int kUpdateBlocks = 1056;
 
 struct FusedMapBuffers {
-  float *partials, *pulls;
+  float *partials, *pose_gradients;
   std::int64_t bytes;
 
   FusedMapBuffers(void* base, const MapOptimization& call) {
     Workspace memory(base);
     partials = memory.take<float>(std::int64_t{fused::num_blocks(call.options.precision, true, call.rays.num_rays)} *
                                   fused::kPartialSize);
-    pulls = memory.take<float>(call.rays.num_rays * fused::kPullSize);
+    pose_gradients = memory.take<float>(call.rays.num_rays * fused::kPoseGradientStride);
     bytes = memory.used();
   }
 };
@@ -78,7 +78,7 @@ class MapLaunches {
     a.texels = a.color ? table_sums(call_.texels) : fused::TableSums{};
     a.stamp = call_.first_stamp + static_cast<std::int32_t>(iteration);
     a.partials = buffers_.partials;
-    a.pulls = buffers_.pulls;
+    a.pose_gradients = buffers_.pose_gradients;
     return a;
   }
 
@@ -87,7 +87,7 @@ class MapLaunches {
     const std::int64_t step = call_.first_step + iteration;
     fused::MapUpdateArguments a{};
     a.partials = buffers_.partials;
-    a.pulls = buffers_.pulls;
+    a.pose_gradients = buffers_.pose_gradients;
     a.blocks = blocks;
     a.rays = rays.rays;
     a.fixed_row = call_.fixed_row;

@@ -41,8 +41,8 @@ SPS_INLINE float depth_certainty(float depth, float noise_crossover_depth) {
 template <class T>
 SPS_INLINE void add_weighted_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, T weight,
                                       T* terms) {
-  const Vec3<float> torque = cross(offset, slope);
-  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
+  const Vec3<float> by_rotation = cross(offset, slope);
+  const T jacobian[6] = {slope.x, slope.y, slope.z, by_rotation.x, by_rotation.y, by_rotation.z};
   const T cost = terms[kNormalTerms - 1];
   add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
   terms[kNormalTerms - 1] = cost;

@@ -59,7 +59,7 @@ struct RenderStepBuffers {
   float* mlp_workspace;
   float* grad_table;
   std::int64_t* scatter_words;
-  float* pulls;  // [R, 6]
+  float* pose_gradients;  // [R, 6]
 
   template <class Device>
   RenderStepBuffers(Device device, void* base, const SceneView& scene, const RayBatch& rays,
@@ -90,7 +90,7 @@ struct RenderStepBuffers {
                                               mlp_backward_workspace_size(device, kColorDecoder, n)));
     grad_table = memory.take<float>(table_size);
     scatter_words = memory.take<std::int64_t>(scatter_workspace_words<Device>(table_size));
-    pulls = memory.take<float>(kPoseGradientSize * r);
+    pose_gradients = memory.take<float>(kPoseGradientSize * r);
     bytes = memory.used();
   }
 };
