@@ -21,7 +21,7 @@ class KeyframesArgument {
              poses.size(0),
              depth_thumbnails.size(1),
              depth_thumbnails.size(2),
-             load_intrinsics(intrinsics),
+             load_intrinsics(function, intrinsics),
              step};
   }
 

@@ -26,7 +26,7 @@ ReferenceImage load_reference(const std::optional<Tensor>& cells, const std::opt
           data<float>(*pose),
           cells->size(0),
           cells->size(1),
-          load_intrinsics(intrinsics),
+          load_intrinsics("track_gauss_newton", intrinsics),
           static_cast<float>(weight),
           static_cast<float>(kernel)};
 }
@@ -43,7 +43,7 @@ DepthKeyframes load_depth_keyframes(const std::optional<Tensor>& images, const s
                        data<float>(*poses),
                        images->size(1),
                        images->size(2),
-                       load_intrinsics(intrinsics),
+                       load_intrinsics("track_gauss_newton", intrinsics),
                        static_cast<float>(unit),
                        static_cast<float>(kernel_end),
                        first_iteration,
@@ -85,7 +85,7 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
   Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, 1, num_pixels)}, ScalarType::Byte);
   const GaussNewtonOptions options{
-      load_intrinsics(intrinsics),
+      load_intrinsics("track_gauss_newton", intrinsics),
       num_pixels,
       iterations,
       static_cast<float>(truncation),
@@ -123,8 +123,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
   Tensor inliers = empty(poses, {frames}, ScalarType::Float);
   Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, frames, count)}, ScalarType::Byte);
   spslam::gauss_newton_poses(scope.context, scene.view, data<std::int32_t>(pixels), data<float>(poses), frames, count,
-                             load_intrinsics(intrinsics), static_cast<float>(truncation), static_cast<float>(kernel),
-                             workspace.mutable_data_ptr(),
+                             load_intrinsics("gauss_newton_poses", intrinsics), static_cast<float>(truncation),
+                             static_cast<float>(kernel), workspace.mutable_data_ptr(),
                              {mutable_data<float>(hessian), mutable_data<float>(gradient), mutable_data<float>(cost),
                               mutable_data<float>(inliers)});
   return {hessian, gradient, cost, inliers};

@@ -1,7 +1,7 @@
 // Geometry in render_step on the CPU: embeddings gathered, decoded, and the way back to embeddings and positions.
 #pragma once
 
-#include "cpu/render_step_chunk.h"
+#include "cpu/render_step_decoder.h"
 #include "kernels/decoders.h"
 #include "kernels/interpolation.h"
 
@@ -110,18 +110,12 @@ inline void geometry_backward(const SceneView& scene, const PackedMlp<float>& ne
     chunk.grad_sdf[i] *= activation_slope(MlpActivation::kTanh, chunk.sdf[i]);
   }
   for (std::int64_t i = n; i < round_up(n, kRowBlock); ++i) chunk.grad_sdf[i] = 0.0f;
-  for (std::int64_t row = 0; row < n; row += kTileRows) {
-    const std::int64_t rows = row + kTileRows < n ? kTileRows : n - row;
-    const float *h1 = chunk.h1 + row * l.hidden_stride, *h2 = chunk.h2 + row * l.hidden_stride;
-    float* grad_x = plan.embeddings ? tables.embedding + (first_row + row) * l.input_stride : chunk.grad_x;
-    mlp_tile_backward(net, round_up(rows, kRowBlock), h1, h2, chunk.grad_sdf + row, rows, chunk.g1, chunk.g2,
-                      plan.embeddings || plan.pose ? grad_x : nullptr);
-    if (plan.geometry_params) {
-      mlp_tile_add_weight_gradients(l, rows, chunk.x + row * l.input_stride, h1, h2, chunk.grad_sdf + row, rows,
-                                    chunk.g1, chunk.g2, partial);
-    }
-    if (plan.pose) add_geometry_gradients(scene, grad_x, l.input_stride, row, rows, chunk);
-  }
+  const DecoderRows decoder{n, chunk.x, chunk.h1, chunk.h2, chunk.grad_sdf, 1};
+  float* table = plan.embeddings ? tables.embedding + first_row * l.input_stride : nullptr;
+  decoder_backward(net, decoder, plan.geometry_params ? partial : nullptr, table, plan.pose, chunk,
+                   [&](const float* grad_x, std::int64_t first, std::int64_t rows) {
+                     add_geometry_gradients(scene, grad_x, l.input_stride, first, rows, chunk);
+                   });
 }
 
 // Tells the tables which cells the samples inside lie in; returns the number of runs.

@@ -66,11 +66,8 @@ class MapLaunches {
 
  private:
   fused::RayStepArguments ray_arguments(std::int64_t iteration) const {
-    RaySource rays = call_.rays;
-    RenderOptions options = call_.options;
-    rays.draw.iteration += static_cast<std::uint32_t>(iteration);
-    options.key.iteration += static_cast<std::uint32_t>(iteration);
-    fused::RayStepArguments a = fused::make_arguments(call_.scene, rays, call_.intrinsics, options);
+    fused::RayStepArguments a = fused::make_arguments(call_.scene, at_iteration(call_.rays, iteration),
+                                                      call_.intrinsics, at_iteration(call_.options, iteration));
     a.pose = call_.poses.exp_avg != nullptr;
     a.geometry_params = call_.geometry_params.exp_avg != nullptr;
     a.color_params = a.color && call_.color_params.exp_avg;

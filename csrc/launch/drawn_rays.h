@@ -8,6 +8,16 @@
 
 namespace spslam {
 
+// A call's random keys in an iteration.
+inline RaySource at_iteration(RaySource source, std::int64_t iteration) {
+  source.draw.iteration += static_cast<std::uint32_t>(iteration);
+  return source;
+}
+inline RenderOptions at_iteration(RenderOptions options, std::int64_t iteration) {
+  options.key.iteration += static_cast<std::uint32_t>(iteration);
+  return options;
+}
+
 // All members are public: nvcc takes no device lambda from a private function.
 struct DrawnRays {
   std::int32_t *pixels, *slots;  // [R, 3], [R]

@@ -1,6 +1,7 @@
 // Scratch memory of render_step where it is put together from the launches of the single ops.
 #pragma once
 
+#include "launch/workspace.h"
 #include "spslam/decoders.h"
 #include "spslam/interpolation.h"
 #include "spslam/render_step.h"
@@ -17,26 +18,6 @@ inline std::int64_t plane_rows(const TriPlaneLayout& layout) {
   }
   return rows;
 }
-
-// Hands out pieces of scratch memory; with a null base it only counts.
-class Workspace {
- public:
-  explicit Workspace(void* base) : base_(static_cast<char*>(base)) {}
-
-  template <class T>
-  T* take(std::int64_t count) {
-    constexpr std::int64_t kAlignment = 256;
-    T* piece = base_ ? reinterpret_cast<T*>(base_ + used_) : nullptr;
-    used_ += (count * static_cast<std::int64_t>(sizeof(T)) + kAlignment - 1) / kAlignment * kAlignment;
-    return piece;
-  }
-
-  std::int64_t used() const { return used_; }
-
- private:
-  char* base_;
-  std::int64_t used_ = 0;
-};
 
 // Scratch of one step: R rays, N = R * S samples.
 struct RenderStepBuffers {

@@ -24,12 +24,9 @@ struct TrackAdamLaunch {
   void run() {
     start();
     for (std::int64_t iteration = 0; iteration < call_.iterations; ++iteration) {
-      RaySource source = source_;
-      RenderOptions options = call_.options;
-      source.draw.iteration += static_cast<std::uint32_t>(iteration);
-      options.key.iteration += static_cast<std::uint32_t>(iteration);
-      rays_.draw(device_, source);
-      render_step(device_, call_.scene, batch(), options, gradients(iteration), step_workspace_);
+      rays_.draw(device_, at_iteration(source_, iteration));
+      render_step(device_, call_.scene, batch(), at_iteration(call_.options, iteration), gradients(iteration),
+                  step_workspace_);
       step(iteration);
     }
     finish();
