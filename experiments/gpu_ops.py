@@ -6,6 +6,7 @@ python -m experiments.gpu_ops --json gpu_ops.json
 import argparse
 import statistics
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,8 +18,16 @@ from spslam.slam.pixels import FramePixels, unpack_points
 from spslam.slam.recovery.icp_alignment import POINTS, surface_maps
 
 PIXELS_PER_FRAME = 15000
-TRACKING = dict(
-    truncation=room.TRUNCATION_M, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=0, stream=1, frame=0
+TRACKING = ops.GaussNewtonOptions(
+    num_pixels=1024,
+    iterations=8,
+    truncation=room.TRUNCATION_M,
+    kernel_start=0.08,
+    kernel_end=0.02,
+    damping=1e-4,
+    seed=0,
+    stream=ops.Stream.TRACKING_PIXELS,
+    frame=0,
 )
 
 
@@ -55,10 +64,7 @@ def tracking_rows(scene: ops.SceneView, rays: ops.RayBatch, rounds: int) -> list
                         rays.pixels,
                         rays.poses[0],
                         rays.intrinsics,
-                        num_pixels=pixels,
-                        iterations=iterations,
-                        tf32=tf32,
-                        **TRACKING,
+                        replace(TRACKING, num_pixels=pixels, iterations=iterations, tf32=tf32),
                     ),
                     rounds,
                 )

@@ -24,6 +24,7 @@
 
 #include "core/device.h"
 #include "core/philox.h"
+#include "spslam/types/camera.h"
 
 namespace spslam::bindings {
 
@@ -159,6 +160,12 @@ class Scratch {
 inline PhiloxKey philox_key(std::int64_t seed, std::int64_t stream, std::int64_t frame, std::int64_t iteration) {
   return {static_cast<std::uint64_t>(seed), static_cast<std::uint32_t>(stream), static_cast<std::uint32_t>(frame),
           static_cast<std::uint32_t>(iteration)};
+}
+
+inline Intrinsics load_intrinsics(const char* function, const std::vector<double>& values) {
+  SPS_CHECK(values.size() == 4, function, ": intrinsics must be fx, fy, cx, cy");
+  return {static_cast<float>(values[0]), static_cast<float>(values[1]), static_cast<float>(values[2]),
+          static_cast<float>(values[3])};
 }
 
 }  // namespace spslam::bindings

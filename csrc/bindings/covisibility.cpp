@@ -9,10 +9,11 @@ namespace {
 class KeyframesArgument {
  public:
   KeyframesArgument(const char* function, const Tensor& poses, const Tensor& depth_thumbnails,
-                const std::vector<double>& intrinsics, std::int64_t step)
+                    const std::vector<double>& intrinsics, std::int64_t step)
       : poses_(torch::stable::contiguous(poses)), thumbnails_(torch::stable::contiguous(depth_thumbnails)) {
     SPS_CHECK(poses.dim() == 2 && poses.size(1) == kPoseSize, function, ": poses must have shape [F, 7]");
-    SPS_CHECK(depth_thumbnails.dim() == 3 && depth_thumbnails.size(0) == poses.size(0) && depth_thumbnails.scalar_type() == ScalarType::Half,
+    SPS_CHECK(depth_thumbnails.dim() == 3 && depth_thumbnails.size(0) == poses.size(0) &&
+                  depth_thumbnails.scalar_type() == ScalarType::Half,
               function, ": depth_thumbnails must be float16 of shape [F, h, w]");
     SPS_CHECK(step >= 1, function, ": thumbnail_step must be >= 1");
     views = {data<float>(poses_),
@@ -20,7 +21,7 @@ class KeyframesArgument {
              poses.size(0),
              depth_thumbnails.size(1),
              depth_thumbnails.size(2),
-             load_intrinsics(intrinsics),
+             load_intrinsics(function, intrinsics),
              step};
   }
 
@@ -41,10 +42,10 @@ Tensor frame_overlap(Tensor points, Tensor poses, Tensor depth_thumbnails, std::
   return share;
 }
 
-Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor poses, Tensor depth_thumbnails, Tensor candidates,
-                               std::vector<double> intrinsics, std::int64_t thumbnail_step, std::int64_t num_points,
-                               std::int64_t num_covisible, std::int64_t count, double threshold, std::int64_t seed,
-                               std::int64_t stream, std::int64_t frame) {
+Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor poses, Tensor depth_thumbnails,
+                               Tensor candidates, std::vector<double> intrinsics, std::int64_t thumbnail_step,
+                               std::int64_t num_points, std::int64_t num_covisible, std::int64_t count,
+                               double threshold, std::int64_t seed, std::int64_t stream, std::int64_t frame) {
   SPS_CHECK(records.dim() == 2 && records.size(1) == 3 && records.size(0) > 0,
             "select_covisible_frames: records must have shape [P, 3] with P >= 1");
   SPS_CHECK(current >= 0 && current < poses.size(0), "select_covisible_frames: current must be a row of poses");
@@ -69,7 +70,9 @@ Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor pose
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
-  m.def("frame_overlap(Tensor points, Tensor poses, Tensor depth_thumbnails, float[] intrinsics, int thumbnail_step) -> Tensor");
+  m.def(
+      "frame_overlap(Tensor points, Tensor poses, Tensor depth_thumbnails, float[] intrinsics, int thumbnail_step) -> "
+      "Tensor");
   m.def(
       "select_covisible_frames(Tensor records, int current, Tensor poses, Tensor depth_thumbnails, Tensor candidates, "
       "float[] intrinsics, int thumbnail_step, int num_points, int num_covisible, int count, float threshold, "

@@ -1,5 +1,6 @@
 #include "spslam/gauss_newton.h"
 
+#include "bindings/number_list.h"
 #include "bindings/scene.h"
 
 namespace spslam::bindings {
@@ -16,88 +17,125 @@ Tensor predict_pose(Tensor before, Tensor last) {
   return next;
 }
 
-// None without cells. The tensors must outlive the launch.
-ReferenceImage load_reference(const std::optional<Tensor>& cells, const std::optional<Tensor>& pose,
-                              const std::vector<double>& intrinsics, double weight, double kernel) {
-  if (!cells || !pose) return {};
-  SPS_CHECK(cells->dim() == 3 && cells->size(2) == 2 && pose->numel() == kPoseSize,
-            "track_gauss_newton: reference must have shape [H, W, 2], its pose [7]");
-  return {data<float>(*cells),
-          data<float>(*pose),
-          cells->size(0),
-          cells->size(1),
-          load_intrinsics(intrinsics),
-          static_cast<float>(weight),
-          static_cast<float>(kernel)};
+constexpr char kName[] = "track_gauss_newton";
+
+// Places in the op's lists of numbers; spslam/ops/gauss_newton.py fills them.
+enum class Scalar {
+  kFx,
+  kFy,
+  kCx,
+  kCy,
+  kTruncation,
+  kKernelStart,
+  kKernelEnd,
+  kScoreKernel,
+  kDamping,
+  kNoiseCrossoverDepth,
+  kCount
+};
+enum class Integer { kNumPixels, kIterations, kSeed, kStream, kFrame, kTf32, kCount };
+enum class ReferenceScalar { kFx, kFy, kCx, kCy, kWeight, kKernel, kCount };
+enum class KeyframeScalar { kFx, kFy, kCx, kCy, kUnit, kKernelEnd, kCount };
+// Before the rows of each depth keyframe's image and pose.
+enum class KeyframeInteger { kFirstIteration, kCount };
+
+std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
+  std::vector<Tensor> result;
+  for (const Tensor& tensor : tensors) result.push_back(contiguous(tensor));
+  return result;
 }
 
-// None without images. Row 2 k of `rows` is view k's image, row 2 k + 1 its pose.
-DepthKeyframes load_depth_keyframes(const std::optional<Tensor>& images, const std::optional<Tensor>& poses,
-                      const std::vector<std::int64_t>& rows, const std::vector<double>& intrinsics, double unit,
-                      double kernel_end, std::int64_t first_iteration) {
-  if (!images || !poses || rows.empty()) return {};
-  SPS_CHECK(images->dim() == 3 && poses->dim() == 2 && poses->size(1) == kPoseSize && unit > 0.0 && kernel_end > 0.0,
-            "track_gauss_newton: views must have shape [R, H, W], their poses [F, 7]");
-  SPS_CHECK(rows.size() % 2 == 0 && rows.size() <= 2 * kMaxDepthKeyframes, "track_gauss_newton: at most 8 views");
-  DepthKeyframes views{data<std::uint16_t>(*images),
-                   data<float>(*poses),
-                   images->size(1),
-                   images->size(2),
-                   load_intrinsics(intrinsics),
-                   static_cast<float>(unit),
-                   static_cast<float>(kernel_end),
-                   first_iteration,
-                   static_cast<int>(rows.size() / 2),
-                   {},
-                   {}};
-  for (int k = 0; k < views.count; ++k) {
-    views.image_rows[k] = rows[2 * k];
-    views.pose_rows[k] = rows[2 * k + 1];
-    SPS_CHECK(views.image_rows[k] >= 0 && views.image_rows[k] < images->size(0) && views.pose_rows[k] >= 0 &&
-                  views.pose_rows[k] < poses->size(0),
-              "track_gauss_newton: a view names an image or a pose that is not there");
+// Of the cells and the pose; none without tensors. They must outlive the launch.
+ReferenceImage load_reference(const std::vector<Tensor>& tensors, const std::vector<double>& numbers) {
+  if (tensors.empty()) return {};
+  const Scalars<ReferenceScalar> scalars(kName, "reference_scalars", numbers);
+  SPS_CHECK(tensors.size() == 2 && tensors[0].dim() == 3 && tensors[0].size(2) == 2 && tensors[1].numel() == kPoseSize,
+            kName, ": reference must be cells [H, W, 2] and a pose [7]");
+  return {data<float>(tensors[0]),
+          data<float>(tensors[1]),
+          tensors[0].size(0),
+          tensors[0].size(1),
+          load_intrinsics(scalars),
+          scalars.as<float>(ReferenceScalar::kWeight),
+          scalars.as<float>(ReferenceScalar::kKernel)};
+}
+
+// Of the images and the poses; none without tensors. They must outlive the launch.
+DepthKeyframes load_depth_keyframes(const std::vector<Tensor>& tensors, const std::vector<double>& numbers,
+                                    const std::vector<std::int64_t>& integers) {
+  if (tensors.empty()) return {};
+  const Scalars<KeyframeScalar> scalars(kName, "depth_keyframe_scalars", numbers);
+  SPS_CHECK(tensors.size() == 2 && tensors[0].dim() == 3 && tensors[1].dim() == 2 && tensors[1].size(1) == kPoseSize,
+            kName, ": depth_keyframes must be images [R, H, W] and poses [F, 7]");
+  SPS_CHECK(scalars[KeyframeScalar::kUnit] > 0.0 && scalars[KeyframeScalar::kKernelEnd] > 0.0, kName,
+            ": depth_keyframes must have a positive unit and kernel_end");
+  constexpr std::size_t kFirstRow = static_cast<std::size_t>(KeyframeInteger::kCount);
+  SPS_CHECK(integers.size() % 2 == kFirstRow % 2 && integers.size() >= kFirstRow &&
+                integers.size() <= kFirstRow + 2 * kMaxDepthKeyframes,
+            kName, ": depth_keyframes must be at most ", kMaxDepthKeyframes);
+  DepthKeyframes keyframes{};
+  keyframes.images = data<std::uint16_t>(tensors[0]);
+  keyframes.poses = data<float>(tensors[1]);
+  keyframes.height = tensors[0].size(1);
+  keyframes.width = tensors[0].size(2);
+  keyframes.intrinsics = load_intrinsics(scalars);
+  keyframes.unit = scalars.as<float>(KeyframeScalar::kUnit);
+  keyframes.kernel_end = scalars.as<float>(KeyframeScalar::kKernelEnd);
+  keyframes.first_iteration = integers[static_cast<std::size_t>(KeyframeInteger::kFirstIteration)];
+  keyframes.count = static_cast<int>((integers.size() - kFirstRow) / 2);
+  for (int k = 0; k < keyframes.count; ++k) {
+    const std::int64_t image = integers[kFirstRow + 2 * k], pose = integers[kFirstRow + 2 * k + 1];
+    SPS_CHECK(image >= 0 && image < tensors[0].size(0) && pose >= 0 && pose < tensors[1].size(0), kName,
+              ": depth_keyframes must name images and poses that are there, got ", image, " and ", pose);
+    keyframes.image_rows[k] = image;
+    keyframes.pose_rows[k] = pose;
   }
-  return views;
+  return keyframes;
 }
 
-std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
-    std::vector<Tensor> tensors, std::vector<double> scalars, std::vector<std::int64_t> layout, Tensor pixels,
-    Tensor pose, std::vector<double> intrinsics, std::int64_t num_pixels, std::int64_t iterations, double truncation,
-    double kernel_start, double kernel_end, double score_kernel, double damping, std::int64_t seed, std::int64_t stream,
-    std::int64_t frame, double noise_crossover_depth, std::optional<Tensor> reference, std::optional<Tensor> reference_pose,
-    std::vector<double> reference_intrinsics, double intensity_weight, double intensity_kernel,
-    std::optional<Tensor> views, std::optional<Tensor> view_poses, std::vector<std::int64_t> view_rows,
-    std::vector<double> view_intrinsics, double depth_image_unit, double view_kernel_end, std::int64_t view_first_iteration,
-    bool tf32) {
-  SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
-            "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
-  SPS_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
-  SPS_CHECK(num_pixels >= 1 && iterations >= 1, "track_gauss_newton: num_pixels and iterations must be >= 1");
+GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<Integer>& integers) {
+  GaussNewtonOptions options{};
+  options.intrinsics = load_intrinsics(scalars);
+  options.num_pixels = integers[Integer::kNumPixels];
+  options.iterations = integers[Integer::kIterations];
+  options.truncation = scalars.as<float>(Scalar::kTruncation);
+  options.kernel_start = scalars.as<float>(Scalar::kKernelStart);
+  options.kernel_end = scalars.as<float>(Scalar::kKernelEnd);
+  options.score_kernel = scalars.as<float>(Scalar::kScoreKernel);
+  options.damping = scalars[Scalar::kDamping];
+  options.key = load_key(integers, 0);
+  options.noise_crossover_depth = scalars.as<float>(Scalar::kNoiseCrossoverDepth);
+  options.tf32 = integers.as<bool>(Integer::kTf32);
+  SPS_CHECK(options.num_pixels >= 1 && options.iterations >= 1, kName,
+            ": num_pixels and iterations must be at least 1");
+  return options;
+}
+
+std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> scene_tensors,
+                                                      std::vector<double> scene_scalars,
+                                                      std::vector<std::int64_t> plane_layout, Tensor pixels,
+                                                      Tensor pose, std::vector<double> scalars,
+                                                      std::vector<std::int64_t> integers, std::vector<Tensor> reference,
+                                                      std::vector<double> reference_scalars,
+                                                      std::vector<Tensor> depth_keyframes,
+                                                      std::vector<double> depth_keyframe_scalars,
+                                                      std::vector<std::int64_t> depth_keyframe_integers) {
+  SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0, kName,
+            ": pixels must have shape [P, 3] with P >= 1");
+  SPS_CHECK(pose.numel() == kPoseSize, kName, ": pose must have 7 elements");
   DeviceScope scope(pixels);
-  const SceneArgument scene(tensors, scalars, layout);
-  pixels = torch::stable::contiguous(pixels);
-  if (reference) reference = torch::stable::contiguous(*reference);
-  if (reference_pose) reference_pose = torch::stable::contiguous(*reference_pose);
-  if (views) views = torch::stable::contiguous(*views);
-  if (view_poses) view_poses = torch::stable::contiguous(*view_poses);
-  Tensor result = torch::stable::clone(torch::stable::contiguous(pose));
-  Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
+  const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
+  pixels = contiguous(pixels);
+  reference = all_contiguous(reference);
+  depth_keyframes = all_contiguous(depth_keyframes);
+  GaussNewtonOptions options = load_options({kName, "scalars", scalars}, {kName, "integers", integers});
+  options.reference = load_reference(reference, reference_scalars);
+  options.depth_keyframes = load_depth_keyframes(depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);
+  Tensor result = torch::stable::clone(contiguous(pose));
+  Tensor stats = empty(pose, {options.iterations, kTrackingStatSize}, ScalarType::Float);
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
-  Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, 1, num_pixels)}, ScalarType::Byte);
-  const TrackingOptions options{
-      load_intrinsics(intrinsics),
-      num_pixels,
-      iterations,
-      static_cast<float>(truncation),
-      static_cast<float>(kernel_start),
-      static_cast<float>(kernel_end),
-      static_cast<float>(score_kernel),
-      damping,
-      philox_key(seed, stream, frame, 0),
-      static_cast<float>(noise_crossover_depth),
-      load_reference(reference, reference_pose, reference_intrinsics, intensity_weight, intensity_kernel),
-      load_depth_keyframes(views, view_poses, view_rows, view_intrinsics, depth_image_unit, view_kernel_end, view_first_iteration),
-      tf32};
+  Tensor workspace =
+      empty(pixels, {gauss_newton_workspace_size(scope.context, 1, options.num_pixels)}, ScalarType::Byte);
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
                              workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
                              mutable_data<float>(hessian));
@@ -122,9 +160,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
   Tensor inliers = empty(poses, {frames}, ScalarType::Float);
   Tensor workspace = empty(pixels, {gauss_newton_workspace_size(scope.context, frames, count)}, ScalarType::Byte);
   spslam::gauss_newton_poses(scope.context, scene.view, data<std::int32_t>(pixels), data<float>(poses), frames, count,
-                             load_intrinsics(intrinsics), static_cast<float>(truncation), static_cast<float>(kernel),
-                             workspace.mutable_data_ptr(), mutable_data<float>(hessian), mutable_data<float>(gradient),
-                             mutable_data<float>(cost), mutable_data<float>(inliers));
+                             load_intrinsics("gauss_newton_poses", intrinsics), static_cast<float>(truncation),
+                             static_cast<float>(kernel), workspace.mutable_data_ptr(),
+                             {mutable_data<float>(hessian), mutable_data<float>(gradient), mutable_data<float>(cost),
+                              mutable_data<float>(inliers)});
   return {hessian, gradient, cost, inliers};
 }
 
@@ -134,12 +173,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
   m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
-        ", Tensor pixels, Tensor pose, float[] intrinsics, int num_pixels, int iterations, float truncation, "
-        "float kernel_start, float kernel_end, float score_kernel, float damping, int seed, int stream, int frame, "
-        "float noise_crossover_depth, Tensor? reference, Tensor? reference_pose, float[] reference_intrinsics, "
-        "float intensity_weight, float intensity_kernel, Tensor? views, Tensor? view_poses, int[] view_rows, "
-        "float[] view_intrinsics, float depth_image_unit, float view_kernel_end, int view_first_iteration, bool tf32=True) -> "
-        "(Tensor, Tensor, Tensor)");
+        ", Tensor pixels, Tensor pose, float[] scalars, int[] integers, Tensor[] reference, "
+        "float[] reference_scalars, Tensor[] depth_keyframes, float[] depth_keyframe_scalars, "
+        "int[] depth_keyframe_integers) -> (Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
         "-> (Tensor, Tensor, Tensor, Tensor)");

@@ -18,9 +18,10 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
   pose = contiguous(pose);
   DeviceScope scope(records);
   const Tensor points = rows_of_three(records), world_normals = rows_of_three(records);
-  spslam::unproject_pixels(scope.context, data<std::int32_t>(records), data<float>(normals), records.size(0),
-                           data<float>(pose), static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx),
-                           static_cast<float>(cy), mutable_data<float>(points), mutable_data<float>(world_normals));
+  spslam::unproject_pixels(
+      scope.context, data<std::int32_t>(records), data<float>(normals), records.size(0), data<float>(pose),
+      {static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx), static_cast<float>(cy)},
+      mutable_data<float>(points), mutable_data<float>(world_normals));
   return {points, world_normals};
 }
 
@@ -30,16 +31,17 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
 std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, double fx, double fy, double cx,
                                                      double cy, std::int64_t count, double min_depth, double max_depth,
                                                      std::int64_t step_px, double max_jump, std::int64_t thumbnail_step,
-                                                     std::int64_t depth_image_step, double depth_image_unit, std::int64_t seed,
-                                                     std::int64_t stream, std::int64_t frame) {
+                                                     std::int64_t depth_image_step, double depth_image_unit,
+                                                     std::int64_t seed, std::int64_t stream, std::int64_t frame) {
   constexpr std::int64_t kMaxSide = 65535;  // a record has 16 bits a coordinate
   SPS_CHECK(depth.dim() == 2 && depth.size(0) <= kMaxSide && depth.size(1) <= kMaxSide &&
                 depth.numel() < (std::int64_t{1} << 31) && color.numel() == 3 * depth.numel(),
             "sample_frame_pixels: depth and color must have shapes [H, W] and [H, W, 3], H and W below 2^16");
-  SPS_CHECK(
-      count >= 0 && count <= (std::int64_t{1} << 30) && step_px >= 1 && step_px <= kMaxSide && thumbnail_step >= 1 &&
-          thumbnail_step <= kMaxSide && depth_image_step >= 0 && depth_image_step <= kMaxSide && (depth_image_step == 0 || depth_image_unit > 0.0),
-      "sample_frame_pixels: count, step_px, thumbnail_step, depth_image_step must be at least 0, 1, 1, 0, depth_image_unit positive");
+  SPS_CHECK(count >= 0 && count <= (std::int64_t{1} << 30) && step_px >= 1 && step_px <= kMaxSide &&
+                thumbnail_step >= 1 && thumbnail_step <= kMaxSide && depth_image_step >= 0 &&
+                depth_image_step <= kMaxSide && (depth_image_step == 0 || depth_image_unit > 0.0),
+            "sample_frame_pixels: count, step_px, thumbnail_step, depth_image_step must be at least 0, 1, 1, 0, "
+            "depth_image_unit positive");
   depth = contiguous(depth);
   color = contiguous(color);
   const std::int32_t height = static_cast<std::int32_t>(depth.size(0)),
@@ -54,9 +56,9 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
                                static_cast<std::int32_t>(depth_image_step),
                                static_cast<float>(depth_image_unit)};
   const std::int64_t depth_thumbnail = static_cast<std::int64_t>(thumbnail_size(height, sampling.thumbnail_step)) *
-                               thumbnail_size(width, sampling.thumbnail_step);
-  const std::int64_t view =
-      static_cast<std::int64_t>(depth_image_size(height, sampling.depth_image_step)) * depth_image_size(width, sampling.depth_image_step);
+                                       thumbnail_size(width, sampling.thumbnail_step);
+  const std::int64_t view = static_cast<std::int64_t>(depth_image_size(height, sampling.depth_image_step)) *
+                            depth_image_size(width, sampling.depth_image_step);
   const std::int64_t thumbnail_at = 6 * count, view_at = thumbnail_at + (depth_thumbnail + 1) / 2;
   const Tensor buffer = empty(depth, {view_at + (view + 1) / 2}, ScalarType::Int);
   std::int32_t* words = mutable_data<std::int32_t>(buffer);
@@ -79,7 +81,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "(Tensor points, Tensor normals)");
   m.def(
       "sample_frame_pixels(Tensor depth, Tensor color, float fx, float fy, float cx, float cy, int count, float "
-      "min_depth, float max_depth, int step_px, float max_jump, int thumbnail_step, int depth_image_step, float depth_image_unit, int "
+      "min_depth, float max_depth, int step_px, float max_jump, int thumbnail_step, int depth_image_step, float "
+      "depth_image_unit, int "
       "seed, int stream, int frame) -> "
       "(Tensor buffer, int num_valid)");
 }

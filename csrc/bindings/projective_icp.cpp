@@ -24,7 +24,7 @@ std::tuple<Tensor, Tensor, Tensor> projective_icp(Tensor points, Tensor vertices
   const std::int64_t count = points.size(0);
   Tensor workspace = empty(points, {projective_icp_workspace_size(scope.context, count)}, ScalarType::Byte);
   const SurfaceMaps target{data<float>(vertices), data<float>(normals), vertices.size(0), vertices.size(1),
-                           load_intrinsics(intrinsics)};
+                           load_intrinsics("projective_icp", intrinsics)};
   const IcpOptions options{iterations, static_cast<float>(max_distance), static_cast<float>(kernel_start),
                            static_cast<float>(kernel_end), damping};
   spslam::projective_icp(scope.context, data<float>(points), count, target, options, workspace.mutable_data_ptr(),

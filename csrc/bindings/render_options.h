@@ -15,12 +15,6 @@ namespace spslam::bindings {
       double truncation, bool cosine_targets, std::vector<double> weights, std::int64_t seed, std::int64_t stream, \
       std::int64_t frame, std::int64_t iteration
 
-inline Intrinsics load_intrinsics(const char* function, const std::vector<double>& values) {
-  SPS_CHECK(values.size() == 4, function, ": intrinsics must be fx, fy, cx, cy");
-  return {static_cast<float>(values[0]), static_cast<float>(values[1]), static_cast<float>(values[2]),
-          static_cast<float>(values[3])};
-}
-
 inline RenderOptions load_options(const char* function, std::int64_t num_uniform, std::int64_t num_surface, double near,
                                   double far, double truncation, bool cosine_targets,
                                   const std::vector<double>& weights, const PhiloxKey& key, std::int64_t precision) {

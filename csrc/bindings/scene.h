@@ -9,12 +9,6 @@ namespace spslam::bindings {
 // What a schema says for the scene; spslam/ops/scene_view.py fills it.
 #define SPS_SCENE_SCHEMA "Tensor[] scene, float[] scene_scalars, int[] plane_layout"
 
-inline Intrinsics load_intrinsics(const std::vector<double>& intrinsics) {
-  SPS_CHECK(intrinsics.size() == 4, "spslam: intrinsics must be fx, fy, cx, cy");
-  return {static_cast<float>(intrinsics[0]), static_cast<float>(intrinsics[1]), static_cast<float>(intrinsics[2]),
-          static_cast<float>(intrinsics[3])};
-}
-
 // Keeps the tensors alive while a kernel reads the view.
 class SceneArgument {
  public:

@@ -3,8 +3,8 @@
 #include <limits>
 #include <vector>
 
-#include "kernels/prior_fusion_launch.h"
-#include "kernels/voxel_hash_launch.h"
+#include "launch/prior_fusion.h"
+#include "launch/voxel_hash.h"
 
 namespace spslam {
 namespace {

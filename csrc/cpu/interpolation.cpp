@@ -1,9 +1,10 @@
+#include "launch/interpolation.h"
+
 #include <algorithm>
 #include <cstring>
 #include <type_traits>
 
 #include "core/parallel.h"
-#include "kernels/interpolation_launch.h"
 
 namespace spslam {
 namespace {

@@ -1,4 +1,4 @@
-#include "kernels/marching_cubes_launch.h"
+#include "launch/marching_cubes.h"
 
 namespace spslam {
 namespace {

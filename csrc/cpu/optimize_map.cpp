@@ -1,4 +1,4 @@
-#include "kernels/optimize_map_launch.h"
+#include "launch/optimize_map.h"
 
 namespace spslam {
 

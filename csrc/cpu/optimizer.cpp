@@ -1,7 +1,7 @@
+#include "launch/optimizer.h"
+
 #include <algorithm>
 #include <type_traits>
-
-#include "kernels/optimizer_launch.h"
 
 namespace spslam {
 namespace {

@@ -4,7 +4,7 @@
 
 #include "core/half.h"
 #include "cpu/depth_normals.h"
-#include "kernels/pixel_sampling_launch.h"
+#include "launch/pixel_sampling.h"
 
 namespace spslam {
 namespace {

@@ -1,8 +1,10 @@
+#include "launch/prior_fusion.h"
+
 #include <algorithm>
 #include <vector>
 
 #include "cpu/point_encoder.h"
-#include "kernels/prior_fusion_launch.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace {

@@ -1,6 +1,7 @@
 #include "spslam/projective_icp.h"
 
 #include "core/parallel.h"
+#include "cpu/term_sums.h"
 #include "kernels/projective_icp.h"
 
 namespace spslam {
@@ -24,17 +25,12 @@ void projective_icp<Cpu>(Cpu, const float* points, std::int64_t num_points, cons
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     const Pose<float> current = load_pose(pose);
     const float kernel = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
-    parallel_chunks(num_points, kPointGrain, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {
-      double* own = partials + chunk * kTrackingTerms;
-      for (int t = 0; t < kTrackingTerms; ++t) own[t] = 0.0;
+    const auto add_points = [&](std::int64_t begin, std::int64_t end, double* own) {
       for (std::int64_t i = begin; i < end; ++i) {
         add_icp_residual(target, points + 3 * i, current, options.max_distance, kernel, own);
       }
-    });
-    for (int t = 0; t < kTrackingTerms; ++t) terms[t] = 0.0;
-    for (std::int64_t chunk = 0; chunk < chunk_count(num_points, kPointGrain); ++chunk) {
-      for (int t = 0; t < kTrackingTerms; ++t) terms[t] += partials[chunk * kTrackingTerms + t];
-    }
+    };
+    sum_terms<kTrackingTerms>(num_points, kPointGrain, partials, terms, add_points);
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, num_points, own_stats);
     tracking_step(terms, terms, options.damping, pose, own_stats + 2, hessian);

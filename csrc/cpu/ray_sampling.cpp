@@ -1,6 +1,8 @@
+#include "kernels/ray_sampling.h"
+
 #include <vector>
 
-#include "kernels/ray_sampling_launch.h"
+#include "launch/ray_sampling.h"
 
 namespace spslam {
 

@@ -7,6 +7,7 @@
 #include "cpu/render_step_geometry.h"
 #include "cpu/render_step_losses.h"
 #include "cpu/render_step_scatter.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace render {
@@ -18,7 +19,7 @@ constexpr std::int64_t kMaxGroups = 64;
 // Results of single rays, summed at the end in the order of the rays.
 struct RayResult {
   RayLosses<float> losses;
-  float pose[kPoseGradientSize];
+  PoseGradient pose;
 };
 
 class Step {
@@ -132,8 +133,8 @@ class Step {
 
   void store_rays(std::int64_t begin, const Chunk& chunk) const {
     for (std::int64_t i = 0; i < chunk.num_rays; ++i) {
-      const Vec3<float> force = chunk.pulls[i].force, torque = cross(chunk.rays[i].direction, chunk.pulls[i].moment);
-      results_[begin + i] = {chunk.rays[i].losses, {force.x, force.y, force.z, torque.x, torque.y, torque.z}};
+      const Ray& ray = chunk.rays[i];
+      results_[begin + i] = {ray.losses, pose_gradient(chunk.pose_gradients[i], ray.direction)};
     }
   }
 
@@ -160,7 +161,7 @@ class Step {
       const std::int32_t frame = batch_.ray_frames[r];
       double sums[kPoseGradientSize] = {};
       for (; r < batch_.num_rays && batch_.ray_frames[r] == frame; ++r) {
-        for (int k = 0; k < kPoseGradientSize; ++k) sums[k] += results_[r].pose[k];
+        for (int k = 0; k < kPoseGradientSize; ++k) sums[k] += results_[r].pose.values[k];
       }
       if (frame < 0 || frame >= batch_.num_frames) continue;
       for (int k = 0; k < kPoseGradientSize; ++k) {

@@ -5,6 +5,9 @@
 #pragma once
 
 #include "cpu/render_step_chunk.h"
+#include "kernels/interpolation.h"
+#include "kernels/ray_sampling.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam::render {
 
@@ -20,12 +23,12 @@ inline void load_rays(const RayBatch& batch, const RenderOptions& options, std::
     ray.frame = batch.ray_frames[begin + i];
     ray.valid = has_depth(ray.pixel.depth) && ray.frame >= 0 && ray.frame < batch.num_frames;
     ray.cosine = options.cosine_targets ? ray.pixel.foreshortening : 1.0f;
-    chunk.pulls[i] = {};
+    chunk.pose_gradients[i] = {};
     if (!ray.valid) continue;
     if (ray.frame != pose_frame) pose = load_pose(batch.poses + 7 * static_cast<std::int64_t>(ray.frame));
     pose_frame = ray.frame;
     ray.origin = pose.translation;
-    ray.direction = pose.rotation * pixel_ray(ray.pixel, k.fx, k.fy, k.cx, k.cy);
+    ray.direction = pose.rotation * pixel_ray(ray.pixel, k);
   }
 }
 

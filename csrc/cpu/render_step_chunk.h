@@ -5,6 +5,8 @@
 
 #include "cpu/mlp_tile.h"
 #include "kernels/pixel_record.h"
+#include "kernels/ray_pose_gradient.h"
+#include "kernels/ray_sampling.h"
 #include "kernels/volume_rendering.h"
 #include "spslam/render_step.h"
 
@@ -28,11 +30,6 @@ struct Ray {
   float inverse_bell_sum;  // 0 where nothing is rendered
   float rendered_depth, rendered_color[3];
   RayLosses<float> losses;
-};
-
-// d L / d point of a ray's samples, summed: by translation, and weighted by depth, of which the rotation follows.
-struct RayPull {
-  Vec3<float> force, moment;
 };
 
 // What this call has to compute beyond the losses.
@@ -112,7 +109,7 @@ class Chunk {
   std::int32_t samples_per_ray;
   std::int64_t num_rays;
   Ray rays[kChunkRays];
-  RayPull pulls[kChunkRays];
+  RayPoseGradient pose_gradients[kChunkRays];
 
   // All samples, ray by ray in order of depth.
   float *depth_scratch, *depths;

@@ -4,6 +4,7 @@
 #include <initializer_list>
 
 #include "cpu/render_step_geometry.h"
+#include "kernels/interpolation.h"
 
 namespace spslam::render {
 
@@ -151,7 +152,8 @@ inline void decode_color(const PackedMlp<float>& net, Chunk& chunk) {
   }
 }
 
-inline void pull_rays_by_color(const float* grad_x, std::int64_t first, std::int64_t rows, Chunk& chunk) {
+// The same of the color decoder's input.
+inline void add_color_gradients(const float* grad_x, std::int64_t first, std::int64_t rows, Chunk& chunk) {
   for (std::int64_t r = 0; r < rows; ++r) {
     const float* slopes = chunk.color_slopes + (first + r) * kColorSlopes;
     Vector<float> sums[3] = {};
@@ -159,8 +161,8 @@ inline void pull_rays_by_color(const float* grad_x, std::int64_t first, std::int
       const Vector<float> grad = load_vector<Vector<float>>(grad_x + r * kPlaneChannels + c);
       for (int k = 0; k < 3; ++k) sums[k] += grad * load_vector<Vector<float>>(slopes + k * kPlaneChannels + c);
     }
-    pull_ray(chunk, chunk.color_sample[first + r],
-             {sum_lanes<float>(sums[0]), sum_lanes<float>(sums[1]), sum_lanes<float>(sums[2])});
+    add_sample_gradient(chunk, chunk.color_sample[first + r],
+                        {sum_lanes<float>(sums[0]), sum_lanes<float>(sums[1]), sum_lanes<float>(sums[2])});
   }
 }
 
@@ -176,18 +178,12 @@ inline void color_backward(const PackedMlp<float>& net, const Plan& plan, std::i
     for (std::int64_t j = 0; j < n; ++j) grad[j] *= activation_slope(MlpActivation::kSigmoid, rgb[j]);
     for (std::int64_t j = n; j < round_up(n, kRowBlock); ++j) grad[j] = 0.0f;
   }
-  for (std::int64_t row = 0; row < n; row += kTileRows) {
-    const std::int64_t rows = row + kTileRows < n ? kTileRows : n - row;
-    const float *h1 = chunk.color_h1 + row * l.hidden_stride, *h2 = chunk.color_h2 + row * l.hidden_stride;
-    float* grad_x = plan.texels ? tables.texel + (first_row + row) * l.input_stride : chunk.grad_x;
-    mlp_tile_backward(net, round_up(rows, kRowBlock), h1, h2, chunk.grad_rgb + row, stride, chunk.g1, chunk.g2,
-                      plan.texels || plan.pose ? grad_x : nullptr);
-    if (plan.color_params) {
-      mlp_tile_add_weight_gradients(l, rows, chunk.color_x + row * l.input_stride, h1, h2, chunk.grad_rgb + row, stride,
-                                    chunk.g1, chunk.g2, partial);
-    }
-    if (plan.pose) pull_rays_by_color(grad_x, row, rows, chunk);
-  }
+  const DecoderRows decoder{n, chunk.color_x, chunk.color_h1, chunk.color_h2, chunk.grad_rgb, stride};
+  float* table = plan.texels ? tables.texel + first_row * l.input_stride : nullptr;
+  decoder_backward(net, decoder, plan.color_params ? partial : nullptr, table, plan.pose, chunk,
+                   [&](const float* grad_x, std::int64_t first, std::int64_t rows) {
+                     add_color_gradients(grad_x, first, rows, chunk);
+                   });
 }
 
 }  // namespace spslam::render

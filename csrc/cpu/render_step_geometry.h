@@ -1,8 +1,9 @@
 // Geometry in render_step on the CPU: embeddings gathered, decoded, and the way back to embeddings and positions.
 #pragma once
 
-#include "cpu/render_step_chunk.h"
+#include "cpu/render_step_decoder.h"
 #include "kernels/decoders.h"
+#include "kernels/interpolation.h"
 
 namespace spslam::render {
 
@@ -76,16 +77,14 @@ inline void decode_geometry(const PackedMlp<float>& net, float inverse_truncatio
   }
 }
 
-// Adds d L / d point of sample i, split as RayPull says.
-inline void pull_ray(Chunk& chunk, std::int64_t i, const Vec3<float>& force) {
-  RayPull& pull = chunk.pulls[chunk.ray_of[i]];
-  pull.force = pull.force + force;
-  pull.moment = pull.moment + chunk.t[i] * force;
+// Adds d L / d point of sample i to the pose gradient of its ray.
+inline void add_sample_gradient(Chunk& chunk, std::int64_t i, const Vec3<float>& by_point) {
+  add_point_gradient(by_point, chunk.t[i], chunk.pose_gradients[chunk.ray_of[i]]);
 }
 
-// d L / d point of a tile's samples, from gradient rows of the decoder's input.
-inline void pull_rays_by_geometry(const SceneView& scene, const float* grad_x, std::int64_t stride, std::int64_t first,
-                                  std::int64_t rows, Chunk& chunk) {
+// Adds d L / d point of a tile's samples, from gradient rows of the geometry decoder's input.
+inline void add_geometry_gradients(const SceneView& scene, const float* grad_x, std::int64_t stride, std::int64_t first,
+                                   std::int64_t rows, Chunk& chunk) {
   constexpr int kBytes = static_cast<int>(kFeatureBytes);
   const float inverse_voxel = 1.0f / scene.voxel_size;
   for (std::int64_t r = 0; r < rows; ++r) {
@@ -96,7 +95,7 @@ inline void pull_rays_by_geometry(const SceneView& scene, const float* grad_x, s
                               sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + kEmbeddingChannels)),
                               sum_lanes<float, kBytes>(grad * load_vector<Feature>(slopes + 2 * kEmbeddingChannels))};
     const Vec3<float> by_position{g[0], g[1], g[2]};
-    pull_ray(chunk, first + r, inverse_voxel * by_cell + scene.position_scale * by_position);
+    add_sample_gradient(chunk, first + r, inverse_voxel * by_cell + scene.position_scale * by_position);
   }
 }
 
@@ -111,18 +110,12 @@ inline void geometry_backward(const SceneView& scene, const PackedMlp<float>& ne
     chunk.grad_sdf[i] *= activation_slope(MlpActivation::kTanh, chunk.sdf[i]);
   }
   for (std::int64_t i = n; i < round_up(n, kRowBlock); ++i) chunk.grad_sdf[i] = 0.0f;
-  for (std::int64_t row = 0; row < n; row += kTileRows) {
-    const std::int64_t rows = row + kTileRows < n ? kTileRows : n - row;
-    const float *h1 = chunk.h1 + row * l.hidden_stride, *h2 = chunk.h2 + row * l.hidden_stride;
-    float* grad_x = plan.embeddings ? tables.embedding + (first_row + row) * l.input_stride : chunk.grad_x;
-    mlp_tile_backward(net, round_up(rows, kRowBlock), h1, h2, chunk.grad_sdf + row, rows, chunk.g1, chunk.g2,
-                      plan.embeddings || plan.pose ? grad_x : nullptr);
-    if (plan.geometry_params) {
-      mlp_tile_add_weight_gradients(l, rows, chunk.x + row * l.input_stride, h1, h2, chunk.grad_sdf + row, rows,
-                                    chunk.g1, chunk.g2, partial);
-    }
-    if (plan.pose) pull_rays_by_geometry(scene, grad_x, l.input_stride, row, rows, chunk);
-  }
+  const DecoderRows decoder{n, chunk.x, chunk.h1, chunk.h2, chunk.grad_sdf, 1};
+  float* table = plan.embeddings ? tables.embedding + first_row * l.input_stride : nullptr;
+  decoder_backward(net, decoder, plan.geometry_params ? partial : nullptr, table, plan.pose, chunk,
+                   [&](const float* grad_x, std::int64_t first, std::int64_t rows) {
+                     add_geometry_gradients(scene, grad_x, l.input_stride, first, rows, chunk);
+                   });
 }
 
 // Tells the tables which cells the samples inside lie in; returns the number of runs.

@@ -55,15 +55,15 @@ inline void render_color(float scale, Ray& ray, Chunk& chunk) {
 
 // The terms on the SDF itself, and their gradient.
 inline void supervise_samples(const LossWeights& scale, float truncation, Ray& ray, Chunk& chunk) {
-  const float free_scale = inverse_count<float>(ray.num_free), near_scale = inverse_count<float>(ray.num_near);
+  const SdfSupervision<float> supervision{ray.pixel.depth,
+                                          ray.cosine,
+                                          truncation,
+                                          inverse_count<float>(ray.num_near),
+                                          inverse_count<float>(ray.num_free),
+                                          scale.sdf,
+                                          scale.free_space};
   for (std::int32_t i = ray.begin; i < ray.end; ++i) {
-    const float sdf = chunk.sdf[i];
-    const SampleTarget<float> target = sample_target(ray.pixel.depth, chunk.t[i], ray.cosine, truncation, true);
-    const float near = target.near ? sdf_residual(sdf, target.distance, truncation) : 0.0f;
-    const float free = target.free ? free_space_residual(sdf) : 0.0f;
-    ray.losses.sdf += near_scale * near * near;
-    ray.losses.free_space += free_scale * free * free;
-    chunk.grad_sdf[i] = 2.0f * (scale.sdf * near_scale * truncation * near + scale.free_space * free_scale * free);
+    chunk.grad_sdf[i] = supervise_sample(supervision, chunk.sdf[i], chunk.t[i], ray.losses);
   }
 }
 

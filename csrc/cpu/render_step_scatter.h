@@ -6,6 +6,7 @@
 #pragma once
 
 #include "cpu/render_step_color.h"
+#include "kernels/interpolation.h"
 
 namespace spslam::render {
 

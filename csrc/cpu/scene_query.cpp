@@ -2,6 +2,8 @@
 
 #include "core/parallel.h"
 #include "cpu/scene_tile.h"
+#include "kernels/interpolation.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace {

@@ -5,6 +5,8 @@
 
 #include "cpu/mlp_tile.h"
 #include "kernels/decoders.h"
+#include "kernels/interpolation.h"
+#include "kernels/voxel_hash.h"
 #include "spslam/scene_view.h"
 
 namespace spslam {

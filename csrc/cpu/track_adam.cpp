@@ -1,4 +1,4 @@
-#include "kernels/track_adam_launch.h"
+#include "launch/track_adam.h"
 
 namespace spslam {
 

@@ -1,8 +1,9 @@
+#include "launch/volume_rendering.h"
+
 #include <algorithm>
 #include <vector>
 
 #include "core/parallel.h"
-#include "kernels/volume_rendering_launch.h"
 
 namespace spslam {
 namespace {

@@ -1,7 +1,8 @@
+#include "launch/voxel_hash.h"
+
 #include <algorithm>
 
 #include "cpu/key_sort.h"
-#include "kernels/voxel_hash_launch.h"
 
 namespace spslam {
 

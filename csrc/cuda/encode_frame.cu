@@ -4,7 +4,7 @@
 #include "cuda/mlp_fragments.cuh"
 #include "cuda/vertex_sums.cuh"
 #include "kernels/prior_fusion.h"
-#include "kernels/voxel_hash_launch.h"
+#include "launch/voxel_hash.h"
 
 namespace spslam {
 namespace {

@@ -1,5 +1,6 @@
 // Tracking is one kernel for all iterations: each block sums its pixels' shares of the normal equations, waits for the
-// others at a barrier of the whole grid, and then takes the step by itself, so that one barrier an iteration is enough.
+// others at a barrier of the whole grid, and then takes the step by itself, so that one barrier per iteration is
+// enough.
 #include <cooperative_groups.h>
 
 #include <algorithm>
@@ -8,10 +9,8 @@
 #include "core/for_each.h"
 #include "cuda/geometry_fragments.cuh"
 #include "cuda/warp_sums.cuh"
-#include "kernels/depth_keyframes.h"
 #include "kernels/gauss_newton.h"
-#include "kernels/reference_image.h"
-#include "spslam/gauss_newton.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam {
 namespace {
@@ -21,9 +20,9 @@ constexpr int kThreads = kWarps * kWarp;
 constexpr int kBlockPixels = kWarps * fused::kTileRows;
 // A barrier of the whole grid needs all blocks resident at once: few enough for the smallest device.
 constexpr std::int64_t kMaxTrackingBlocks = 16;
-constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kKeyframeTerms, one a lane
-static_assert(kTrackingTerms <= kPaddedTerms && kKeyframeTerms <= kPaddedTerms, "one lane a term");
-constexpr int kSets = 2;  // of terms: the map's, the views'
+constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kKeyframeTerms, one per lane
+static_assert(kTrackingTerms <= kPaddedTerms && kKeyframeTerms <= kPaddedTerms, "one lane per term");
+constexpr int kSets = 2;  // of terms: the map's, the depth keyframes'
 constexpr int kSums = kSets * kPaddedTerms;
 
 std::int64_t block_count(std::int64_t pixels) {
@@ -50,24 +49,13 @@ struct PixelSource {
   }
 };
 
-struct Measurement {
-  Intrinsics camera;
-  float truncation;
-  KernelWidths kernel;
-  float noise_crossover_depth;
-  ReferenceView reference;
-  DepthKeyframes views;
-  const DepthKeyframe* view;  // in shared memory
-  int num_keyframes;          // that take part
-};
-
-// Adds the share of a tile of pixels, of which the lane brings one, to the lane's terms of the map and of the views.
+// Adds the share of a tile of pixels, one per lane, to the lane's terms of the map and of the depth keyframes.
 template <Precision kPrecision>
 __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Measurement& measure, const Pose<float>& pose, const Pixel& pixel,
                                                int lane, float* terms, float* keyframe_terms) {
-  const Intrinsics& k = measure.camera;
-  const SurfacePoint point = surface_point(pixel, pose, k.fx, k.fy, k.cx, k.cy);
+  const GaussNewtonOptions& options = *measure.options;
+  const SurfacePoint point = surface_point(pixel, pose, options.intrinsics);
   std::int32_t voxel = kNoVoxel;
   Cell<float> cell{nullptr, {0.0f, 0.0f, 0.0f}};
   if (pixel.depth > 0.0f) {
@@ -76,23 +64,19 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   }
   Vec3<float> gradient;
   const float sdf = geometry_tile(scene, network, point.world, cell.local, voxel, lane, gradient);
-  // Two lanes bring the same pixel; one adds it, and they share the views.
+  // Two lanes bring the same pixel; one adds it, and they share the depth keyframes.
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
-  const float certainty = depth_certainty(pixel.depth, measure.noise_crossover_depth);
-  for (int v = lane % 4 / 2; v < measure.num_keyframes && pixel.depth > 0.0f; v += 2) {
-    add_depth_keyframe_residual(measure.views, measure.view[v], point.world, point.offset, measure.kernel.view, certainty,
-                            {sdf * measure.truncation, known}, keyframe_terms);
+  const float certainty = depth_certainty(pixel.depth, options.noise_crossover_depth);
+  if (pixel.depth > 0.0f) {
+    add_keyframe_residuals(measure, point, certainty, {sdf * options.truncation, known}, lane % 4 / 2, 2,
+                           keyframe_terms);
   }
-  if (adds && known) {
-    add_tracking_residual(point.offset, sdf, gradient, measure.truncation, measure.kernel, certainty, terms);
-  }
-  if (adds && measure.reference.image.height > 0) {
-    add_intensity_residual(measure.reference, pixel, point.world, point.offset, terms);
-  }
+  if (adds && known) add_map_residual(measure, point.offset, sdf, gradient, certainty, terms);
+  if (adds) add_reference_residual(measure, pixel, point, terms);
 }
 
 // The pixels of one thread in the order in which it takes them: tile after tile of this block, then those of the next
-// iteration. Each is fetched one ahead, so that its way through memory overlaps the work on the one before.
+// iteration. Each is prefetched while the one before is worked on.
 class PixelQueue {
  public:
   __device__ PixelQueue(const PixelSource& source, std::int64_t frame)
@@ -162,34 +146,28 @@ __device__ void add_partials(const double* partials, std::int64_t blocks, double
   __syncthreads();
 }
 
+// __grid_constant__: threads read the options and the scene in the parameters themselves, without copies. The 1: with
+// so few blocks, registers are worth more than a second block per multiprocessor.
 template <Precision kPrecision>
-__global__ void __launch_bounds__(kThreads)
-    track_kernel(SceneView scene, const std::int32_t* pixels, std::int64_t num_records, TrackingOptions options,
-                 double* partials, float* pose, float* stats, float* hessian) {
+__global__ void __launch_bounds__(kThreads, 1)
+    track_kernel(const __grid_constant__ SceneView scene, const std::int32_t* pixels, std::int64_t num_records,
+                 const __grid_constant__ GaussNewtonOptions options, double* partials, float* pose, float* stats,
+                 float* hessian) {
   // Devices without matrix units for tf32 compute in float32 all the same.
   constexpr Precision kUsed = fused::kArchitecture < fused::kTensorArchitecture ? Precision::kFp32 : kPrecision;
   __shared__ GeometryNetwork<kUsed> network;
   __shared__ float sums[kWarps][kSums];
   __shared__ double shares[kThreads / kSums][kSums], terms[kSums], joint[kNormalTerms];
-  __shared__ DepthKeyframe view[kMaxDepthKeyframes];
+  __shared__ EarlierFrames frames;
   __shared__ float own_pose[kPoseSize], own_stats[kTrackingStatSize], own_hessian[36];
   network.load(scene.geometry_params);
   if (threadIdx.x < kPoseSize) own_pose[threadIdx.x] = pose[threadIdx.x];
+  if (threadIdx.x < kMaxEarlierFrames) load_earlier_frame(options, threadIdx.x, frames);
   const PhiloxKey key{options.key.seed, options.key.stream, options.key.frame, 0};
   PixelQueue queue({pixels, num_records, options.num_pixels, true, key}, 0);
-  const ReferenceView reference = load_reference(options.reference);
-  if (threadIdx.x < options.views.count) view[threadIdx.x] = load_depth_keyframe(options.views, threadIdx.x);
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
-    const int num_keyframes = keyframes_in_use(options.views, iteration);
-    const Measurement measure{options.intrinsics,
-                              options.truncation,
-                              tracking_kernel(options, iteration),
-                              options.noise_crossover_depth,
-                              reference,
-                              options.views,
-                              view,
-                              num_keyframes};
+    const Measurement measure = measurement(options, &frames, iteration);
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
     double* shared_sums = partials + (iteration % 2) * gridDim.x * kSums;
@@ -197,7 +175,7 @@ __global__ void __launch_bounds__(kThreads)
     cooperative_groups::this_grid().sync();
     add_partials(shared_sums, gridDim.x, shares, terms);
     if (threadIdx.x == 0) {
-      join_keyframe_terms(terms, terms + kPaddedTerms, num_keyframes, joint);
+      join_keyframe_terms(terms, terms + kPaddedTerms, measure.num_keyframes, joint);
       tracking_step(terms, joint, options.damping, own_pose, own_stats + 2, own_hessian);
     }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
@@ -213,30 +191,24 @@ __global__ void __launch_bounds__(kThreads)
 
 // partials[frame][block][term] of given pixels.
 __global__ void __launch_bounds__(kThreads)
-    residual_kernel(SceneView scene, PixelSource source, const float* poses, Measurement measure, double* partials) {
+    residual_kernel(const __grid_constant__ SceneView scene, PixelSource source, const float* poses,
+                    const __grid_constant__ GaussNewtonOptions options, double* partials) {
   __shared__ GeometryNetwork<Precision::kFp32> network;
   __shared__ float sums[kWarps][kSums];
   network.load(scene.geometry_params);
   __syncthreads();
   const std::int64_t frame = blockIdx.y;
   PixelQueue queue(source, frame);
-  const double sum = sum_block(scene, network, measure, load_pose(poses + kPoseSize * frame), queue, sums);
+  const double sum =
+      sum_block(scene, network, measurement(options, nullptr, 0), load_pose(poses + kPoseSize * frame), queue, sums);
   if (threadIdx.x < kSums) partials[(frame * gridDim.x + blockIdx.x) * kSums + threadIdx.x] = sum;
 }
 
 __global__ void __launch_bounds__(kThreads)
-    store_kernel(const double* partials, std::int64_t blocks, std::int64_t num_pixels, float* hessian, float* gradient,
-                 float* cost, float* inliers) {
+    store_kernel(const double* partials, std::int64_t blocks, std::int64_t num_pixels, PoseEquations out) {
   __shared__ double shares[kThreads / kSums][kSums], terms[kSums];
-  const std::int64_t frame = blockIdx.x;
-  add_partials(partials + frame * blocks * kSums, blocks, shares, terms);
-  if (threadIdx.x != 0) return;
-  double h[36], g[6], total;
-  store_normal_terms<double>(terms, h, g, &total);
-  for (int i = 0; i < 36; ++i) hessian[36 * frame + i] = static_cast<float>(h[i]);
-  for (int i = 0; i < 6; ++i) gradient[6 * frame + i] = static_cast<float>(g[i]);
-  cost[frame] = static_cast<float>(tracking_cost(terms));
-  inliers[frame] = num_pixels ? static_cast<float>(terms[kNormalTerms + 1] / static_cast<double>(num_pixels)) : 0.0f;
+  add_partials(partials + blockIdx.x * blocks * kSums, blocks, shares, terms);
+  if (threadIdx.x == 0) store_pose_equations(terms, blockIdx.x, num_pixels, out);
 }
 
 }  // namespace
@@ -254,13 +226,13 @@ std::int64_t gauss_newton_workspace_size<Cuda>(Cuda, std::int64_t frames, std::i
 
 template <>
 void track_gauss_newton<Cuda>(Cuda device, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
-                              const TrackingOptions& options, void* workspace, float* pose, float* stats,
+                              const GaussNewtonOptions& options, void* workspace, float* pose, float* stats,
                               float* hessian) {
   double* partials = static_cast<double*>(workspace);
   void* arguments[] = {const_cast<SceneView*>(&scene),
                        &pixels,
                        &num_records,
-                       const_cast<TrackingOptions*>(&options),
+                       const_cast<GaussNewtonOptions*>(&options),
                        &partials,
                        &pose,
                        &stats,
@@ -274,8 +246,7 @@ void track_gauss_newton<Cuda>(Cuda device, const SceneView& scene, const std::in
 template <>
 void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::int32_t* pixels, const float* poses,
                               std::int64_t frames, std::int64_t pixels_per_frame, const Intrinsics& intrinsics,
-                              float truncation, float kernel, void* workspace, float* hessian, float* gradient,
-                              float* cost, float* inliers) {
+                              float truncation, float kernel, void* workspace, const PoseEquations& out) {
   if (frames == 0) return;
   const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
   double* partials = static_cast<double*>(workspace);
@@ -283,11 +254,10 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
     const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
-    const Measurement measure{intrinsics, truncation, {kernel, kernel, kernel}, 0.0f, {}, {}, nullptr, 0};
-    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, measure, partials);
+    residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, map_options(intrinsics, truncation, kernel),
+                                                   partials);
   }
-  store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, hessian,
-                                                                       gradient, cost, inliers);
+  store_kernel<<<static_cast<unsigned>(frames), kThreads, 0, stream>>>(partials, blocks, pixels_per_frame, out);
 }
 
 }  // namespace spslam

@@ -1,6 +1,6 @@
 #include "core/fixed_point.cuh"
 #include "core/for_each.h"
-#include "kernels/interpolation_launch.h"
+#include "launch/interpolation.h"
 
 namespace spslam {
 namespace {

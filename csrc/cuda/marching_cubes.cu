@@ -1,7 +1,7 @@
 #include <cub/block/block_scan.cuh>
 
 #include "core/cuda_check.cuh"
-#include "kernels/marching_cubes_launch.h"
+#include "launch/marching_cubes.h"
 
 namespace spslam {
 namespace {

@@ -85,7 +85,7 @@ class Tile {
         add_weight_gradients(layer, l);
         __syncthreads();
       }
-      if (l > 0 || need_input) pull_back(layer, l > 0);
+      if (l > 0 || need_input) input_gradients(layer, l > 0);
       __syncthreads();
     }
   }
@@ -188,7 +188,7 @@ class Tile {
   }
 
   // x = w^T g for the gradients g of the layer's outputs, through the ReLU if x came out of one.
-  __device__ void pull_back(const Layer& layer, bool is_rectified) {
+  __device__ void input_gradients(const Layer& layer, bool is_rectified) {
     for (int unit = kGroup * warp(); unit < layer.inputs; unit += kGroup * warps()) {
       T sums[kGroup][kLaneRows<T>] = {};
 #pragma unroll 2

@@ -2,7 +2,7 @@
 // one after the other.
 #include "cuda/fused/map_update.cuh"
 #include "cuda/fused/ray_step.h"
-#include "kernels/optimize_map_launch.h"
+#include "launch/optimize_map.h"
 
 namespace spslam {
 namespace {
@@ -11,14 +11,14 @@ namespace {
 constexpr int kUpdateBlocks = 1056;
 
 struct FusedMapBuffers {
-  float *partials, *pulls;
+  float *partials, *pose_gradients;
   std::int64_t bytes;
 
   FusedMapBuffers(void* base, const MapOptimization& call) {
     Workspace memory(base);
     partials = memory.take<float>(std::int64_t{fused::num_blocks(call.options.precision, true, call.rays.num_rays)} *
                                   fused::kPartialSize);
-    pulls = memory.take<float>(call.rays.num_rays * fused::kPullSize);
+    pose_gradients = memory.take<float>(call.rays.num_rays * fused::kPoseGradientStride);
     bytes = memory.used();
   }
 };
@@ -66,11 +66,8 @@ class MapLaunches {
 
  private:
   fused::RayStepArguments ray_arguments(std::int64_t iteration) const {
-    RaySource rays = call_.rays;
-    RenderOptions options = call_.options;
-    rays.draw.iteration += static_cast<std::uint32_t>(iteration);
-    options.key.iteration += static_cast<std::uint32_t>(iteration);
-    fused::RayStepArguments a = fused::make_arguments(call_.scene, rays, call_.intrinsics, options);
+    fused::RayStepArguments a = fused::make_arguments(call_.scene, at_iteration(call_.rays, iteration),
+                                                      call_.intrinsics, at_iteration(call_.options, iteration));
     a.pose = call_.poses.exp_avg != nullptr;
     a.geometry_params = call_.geometry_params.exp_avg != nullptr;
     a.color_params = a.color && call_.color_params.exp_avg;
@@ -78,7 +75,7 @@ class MapLaunches {
     a.texels = a.color ? table_sums(call_.texels) : fused::TableSums{};
     a.stamp = call_.first_stamp + static_cast<std::int32_t>(iteration);
     a.partials = buffers_.partials;
-    a.pulls = buffers_.pulls;
+    a.pose_gradients = buffers_.pose_gradients;
     return a;
   }
 
@@ -87,7 +84,7 @@ class MapLaunches {
     const std::int64_t step = call_.first_step + iteration;
     fused::MapUpdateArguments a{};
     a.partials = buffers_.partials;
-    a.pulls = buffers_.pulls;
+    a.pose_gradients = buffers_.pose_gradients;
     a.blocks = blocks;
     a.rays = rays.rays;
     a.fixed_row = call_.fixed_row;

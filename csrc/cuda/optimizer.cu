@@ -1,4 +1,4 @@
-#include "kernels/optimizer_launch.h"
+#include "launch/optimizer.h"
 
 namespace spslam {
 namespace {

@@ -1,4 +1,4 @@
-#include "kernels/pixel_sampling_launch.h"
+#include "launch/pixel_sampling.h"
 
 namespace spslam {
 

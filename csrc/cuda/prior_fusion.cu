@@ -3,7 +3,8 @@
 #include "core/cuda_check.cuh"
 #include "cuda/vertex_sums.cuh"
 #include "kernels/depth_normal.h"
-#include "kernels/prior_fusion_launch.h"
+#include "kernels/voxel_hash.h"
+#include "launch/prior_fusion.h"
 
 namespace spslam {
 namespace {

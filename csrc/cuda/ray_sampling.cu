@@ -1,4 +1,5 @@
-#include "kernels/ray_sampling_launch.h"
+#include "kernels/ray_sampling.h"
+#include "launch/ray_sampling.h"
 
 namespace spslam {
 

@@ -7,6 +7,7 @@
 #include "core/cuda_check.cuh"
 #include "cuda/fused/ray_step.h"
 #include "cuda/fused/ray_variants.h"
+#include "kernels/interpolation.h"
 
 namespace spslam::fused {
 namespace {

@@ -2,14 +2,14 @@
 #include "core/for_each.h"
 #include "cuda/fused/block_sums.cuh"
 #include "cuda/fused/ray_step.h"
-#include "kernels/render_step_launch.h"
+#include "launch/render_step.h"
 
 namespace spslam {
 namespace {
 
 // Scratch of the fused step.
 struct FusedBuffers {
-  float *partials, *pulls;
+  float *partials, *pose_gradients;
   std::int64_t *embeddings, *texels;  // sums of the tables' gradients
   std::int64_t num_embeddings, num_texels, bytes;
 
@@ -20,7 +20,7 @@ struct FusedBuffers {
     Workspace memory(base);
     partials = memory.take<float>(std::int64_t{fused::num_blocks(options.precision, true, rays.num_rays)} *
                                   fused::kPartialSize);
-    pulls = memory.take<float>(rays.num_rays * fused::kPullSize);
+    pose_gradients = memory.take<float>(rays.num_rays * fused::kPoseGradientStride);
     embeddings = memory.take<std::int64_t>(num_embeddings);
     texels = memory.take<std::int64_t>(num_texels);
     bytes = memory.used();
@@ -28,7 +28,7 @@ struct FusedBuffers {
 };
 
 struct FinishArguments {
-  const float *partials, *pulls;
+  const float *partials, *pose_gradients;
   int blocks;
   RaySource rays;
   LossWeights weights;
@@ -58,7 +58,7 @@ __global__ void __launch_bounds__(fused::kSumThreads) finish_kernel(const __grid
   const std::int64_t slot = std::int64_t{unit - kColumnUnits} * kSumWarps + warp;
   if (slot >= a.rays.num_slots) return;
   float grad[kPoseGradientSize];
-  sum_pulls(a.pulls, a.rays, slot, lane, grad);
+  sum_pose_gradients(a.pose_gradients, a.rays, slot, lane, grad);
   if (lane < kPoseGradientSize) a.poses[kPoseGradientSize * slot + lane] = grad[lane];
 }
 static_assert(fused::kPartialLosses % fused::kWarp + fused::kLossSums <= fused::kWarp);
@@ -84,14 +84,13 @@ void fused_step(Cuda device, const SceneView& scene, const RayBatch& batch, cons
   a.texels = {a.color && out.texels ? b.texels : nullptr, out.texel_stamps};
   a.stamp = out.stamp;
   a.partials = b.partials;
-  a.pulls = b.pulls;
+  a.pose_gradients = b.pose_gradients;
   if (b.num_embeddings)
     SPS_CUDA_CHECK(cudaMemsetAsync(b.embeddings, 0, b.num_embeddings * sizeof(std::int64_t), stream));
   if (b.num_texels) SPS_CUDA_CHECK(cudaMemsetAsync(b.texels, 0, b.num_texels * sizeof(std::int64_t), stream));
   const KernelLaunch launch = fused::ray_launch(options.precision, true, a);
-  const FinishArguments finish{b.partials,      b.pulls,    launch.blocks, rays,
-                               options.weights, out.losses, out.poses,     out.geometry_params,
-                               out.color_params};
+  const FinishArguments finish{b.partials, b.pose_gradients,    launch.blocks,   rays, options.weights, out.losses,
+                               out.poses,  out.geometry_params, out.color_params};
   const std::int64_t pose_units = out.poses ? (batch.num_frames + fused::kSumWarps - 1) / fused::kSumWarps : 0;
   const int units = fused::kColumnUnits + static_cast<int>(pose_units);
   run_launches({launch, {reinterpret_cast<const void*>(&finish_kernel), units, fused::kSumThreads, 0, finish}}, stream);

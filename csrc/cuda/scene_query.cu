@@ -1,5 +1,6 @@
 #include "core/for_each.h"
 #include "kernels/scene_element.h"
+#include "kernels/voxel_hash.h"
 #include "spslam/scene_query.h"
 
 namespace spslam {

@@ -2,7 +2,7 @@
 // one after the other.
 #include "cuda/fused/block_sums.cuh"
 #include "cuda/fused/ray_step.h"
-#include "kernels/track_adam_launch.h"
+#include "launch/track_adam.h"
 
 namespace spslam {
 namespace {
@@ -67,7 +67,7 @@ __global__ void __launch_bounds__(fused::kSumThreads) track_step_kernel(const __
   PoseSearch search = *a.search;
   step_pose_search(a.rotation, a.translation, a.losses[0], terms + kLossSums, search);
   *a.search = search;
-  for (int k = 0; k < kPoseNumbers; ++k) a.best[k] = search.best[k];
+  for (int k = 0; k < kPoseSize; ++k) a.best[k] = search.best[k];
 }
 
 KernelLaunches fused_launches(const PoseTracking& call, const FusedTrackBuffers& buffers) {
@@ -83,15 +83,13 @@ KernelLaunches fused_launches(const PoseTracking& call, const FusedTrackBuffers&
   step.best = call.best;
   KernelLaunches launches{{reinterpret_cast<const void*>(&track_start_kernel), 1, 1, 0, step}};
   for (std::int64_t iteration = 0; iteration < call.iterations; ++iteration) {
-    RaySource rays = call.rays;
-    RenderOptions options = call.options;
+    RaySource rays = at_iteration(call.rays, iteration);
     rays.poses = buffers.search->pose;
-    rays.draw.iteration += static_cast<std::uint32_t>(iteration);
-    options.key.iteration += static_cast<std::uint32_t>(iteration);
-    fused::RayStepArguments a = fused::make_arguments(call.scene, rays, call.intrinsics, options);
+    fused::RayStepArguments a =
+        fused::make_arguments(call.scene, rays, call.intrinsics, at_iteration(call.options, iteration));
     a.pose = true;
     a.partials = buffers.partials;
-    launches.push_back(fused::ray_launch(options.precision, false, a));
+    launches.push_back(fused::ray_launch(call.options.precision, false, a));
     step.blocks = launches.back().blocks;
     step.rotation = adam(call.rotation_rate, iteration + 1);
     step.translation = adam(call.translation_rate, iteration + 1);

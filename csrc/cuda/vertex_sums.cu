@@ -5,6 +5,8 @@
 
 #include "core/cuda_check.cuh"
 #include "cuda/vertex_sums.cuh"
+#include "kernels/voxel_hash.h"
+#include "launch/workspace.h"
 
 namespace spslam {
 namespace {
@@ -235,11 +237,9 @@ VertexSums lay_out_sums(void* workspace, std::int64_t n, std::int64_t max_points
   for (sums.slots = 1; sums.slots < 2 * sums.max_blocks;) sums.slots *= 2;
   sums.weight_scale = weight_scale(n);
   sums.feature_scale = sum_scale(n, kLargestFeatureBits);
-  std::size_t end = 0;
+  Workspace memory(workspace);
   const auto take = [&](auto*& array, std::int64_t count) {
-    constexpr std::size_t kAlignment = 256;
-    array = reinterpret_cast<std::remove_reference_t<decltype(array)>>(static_cast<char*>(workspace) + end);
-    end += (static_cast<std::size_t>(count) * sizeof(*array) + kAlignment - 1) / kAlignment * kAlignment;
+    array = memory.take<std::remove_pointer_t<std::decay_t<decltype(array)>>>(count);
   };
   const std::int64_t vertices = sums.max_blocks * kBlockVertices;
   take(sums.counters, 1);
@@ -254,7 +254,7 @@ VertexSums lay_out_sums(void* workspace, std::int64_t n, std::int64_t max_points
   take(sums.found_ids, vertices);
   take(sums.pairs, std::min(n, max_points) * neighborhood);
   take(sums.known, (n + kWarpSize - 1) / kWarpSize);
-  *bytes = end;
+  *bytes = static_cast<std::size_t>(memory.used());
   return sums;
 }
 

@@ -11,6 +11,7 @@
 
 #include "core/device.h"
 #include "kernels/prior_fusion.h"
+#include "kernels/voxel_hash.h"
 #include "spslam/prior_fusion.h"
 
 namespace spslam {

@@ -1,5 +1,5 @@
 #include "core/for_each.h"
-#include "kernels/volume_rendering_launch.h"
+#include "launch/volume_rendering.h"
 
 namespace spslam {
 

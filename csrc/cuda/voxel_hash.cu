@@ -2,7 +2,7 @@
 #include <cub/device/device_select.cuh>
 
 #include "core/cuda_check.cuh"
-#include "kernels/voxel_hash_launch.h"
+#include "launch/voxel_hash.h"
 
 namespace spslam {
 namespace {

@@ -9,7 +9,6 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
-#include "kernels/gauss_newton.h"
 #include "kernels/pixel_record.h"
 #include "spslam/covisibility.h"
 
@@ -43,8 +42,8 @@ SPS_INLINE Vec3<double> view_point(const std::int32_t* record, const Pose<double
   return pose.rotation * local + pose.translation;
 }
 
-// A depth thumbnail cell holds the depth of its middle pixel; pixel u lies in cell (u + 1/2) / step, so that no pixel is on the
-// border of two.
+// A depth thumbnail cell holds the depth of its middle pixel; pixel u lies in cell (u + 1/2) / step, so that no pixel
+// is on the border of two.
 SPS_INLINE bool sees_point(const FrameViews& views, std::int64_t frame, const Pose<double>& pose,
                            const Vec3<double>& point) {
   const Vec3<double> d = point - pose.translation;

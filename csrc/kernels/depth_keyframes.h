@@ -1,5 +1,5 @@
-// The maths of aligning a frame with earlier frames' depth images: how far a surface point lies from what was seen
-// there.
+// The maths of aligning a frame with depth keyframes, earlier frames' depth images: how far a surface point lies from
+// the surface that they measured.
 #pragma once
 
 #include <cmath>
@@ -8,31 +8,33 @@
 #include "core/macros.h"
 #include "core/vec.h"
 #include "kernels/earlier_frame.h"
-#include "kernels/gauss_newton.h"
+#include "kernels/robust_residual.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
 
-// And the sum of weights; of pairs where the map is known too, the map's weighted squares and sum of weights. The
-// cost's place holds the weighted squares of such pairs.
+// After the normal equations: the sum of weights and, of pairs of a pixel and a keyframe where the map is known too,
+// the map's weighted squares and sum of weights. The cost's place holds the weighted squares of such pairs.
 constexpr int kKeyframeTerms = kNormalTerms + 3;
 // Four pixels whose inverse depths spread more than this share have an edge between them.
 constexpr float kMaxInverseDepthSpread = 0.03f;
-// The map weighs this much at least and at most, against one view's pixel.
+// The least and the most weight of the map against one keyframe's pixel.
 constexpr double kMinMapShare = 1e-3, kMaxMapShare = 4.0;
 
-// Of the map and, after them, of the views.
-constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms;
-
-// An earlier frame with its pose read.
+// One of them with its pose read.
 struct DepthKeyframe {
   const std::uint16_t* image;
   Pose<float> pose;
 };
 
-SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& views, int k) {
-  return {views.images + views.image_rows[k] * views.height * views.width,
-          load_pose(views.poses + kPoseSize * views.pose_rows[k])};
+SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& keyframes, int k) {
+  return {keyframes.images + keyframes.image_rows[k] * keyframes.height * keyframes.width,
+          load_pose(keyframes.poses + kPoseSize * keyframes.pose_rows[k])};
+}
+
+// How many take part in an iteration.
+SPS_INLINE int keyframes_in_use(const DepthKeyframes& keyframes, std::int64_t iteration) {
+  return iteration >= keyframes.first_iteration ? keyframes.count : 0;
 }
 
 // The map's residual (m) at a pixel, where the map knows the surface.
@@ -41,53 +43,58 @@ struct MapResidual {
   bool known;
 };
 
-// Adds a world point's signed distance (m) from the surface that an earlier frame saw, beyond it positive, to terms of
-// type T; nothing where the point falls off the image or between pixels that have no depth or an edge. The inverse
-// depth q of a plane is linear in the image, so z q(u, v) - 1 is linear in the point, and by its slope a distance.
+// Adds a world point's signed distance (m) from the surface that a keyframe measured, positive beyond it, to terms of
+// type T; nothing where the point falls off the image or between pixels without depth or with an edge. The inverse
+// depth q of a plane is linear in the image, so z q(u, v) - 1 is linear in the point, and divided by the norm of its
+// gradient a distance.
 template <class T>
-SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& views, const DepthKeyframe& view, const Vec3<float>& world,
-                                        const Vec3<float>& offset, float kernel, float certainty,
-                                        const MapResidual& map, T* terms) {
-  const FramePlace place = place_in_frame(view.pose, views.intrinsics, views.height, views.width, world);
-  if (!place.inside) return;
-  const std::uint16_t* row = view.image + place.row * views.width + place.column;
-  const std::uint16_t d00 = row[0], d01 = row[1], d10 = row[views.width], d11 = row[views.width + 1];
+SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
+                                            const Vec3<float>& world, const Vec3<float>& offset, float kernel,
+                                            float certainty, const MapResidual& map, T* terms) {
+  const FrameProjection at =
+      project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, world);
+  if (!at.inside) return;
+  const std::uint16_t* row = keyframe.image + at.row * keyframes.width + at.column;
+  const std::uint16_t d00 = row[0], d01 = row[1], d10 = row[keyframes.width], d11 = row[keyframes.width + 1];
   if (d00 == 0 || d01 == 0 || d10 == 0 || d11 == 0) return;
-  const float q00 = 1.0f / (views.unit * d00), q01 = 1.0f / (views.unit * d01);
-  const float q10 = 1.0f / (views.unit * d10), q11 = 1.0f / (views.unit * d11);
+  const float q00 = 1.0f / (keyframes.unit * d00), q01 = 1.0f / (keyframes.unit * d01);
+  const float q10 = 1.0f / (keyframes.unit * d10), q11 = 1.0f / (keyframes.unit * d11);
   const float most = std::fmax(std::fmax(q00, q01), std::fmax(q10, q11));
   const float least = std::fmin(std::fmin(q00, q01), std::fmin(q10, q11));
   if (!(most - least < kMaxInverseDepthSpread * most)) return;
-  const BilinearValue q = bilinear_value(q00, q01, q10, q11, place.a, place.b);
-  const float x = q.by_u * views.intrinsics.fx, y = q.by_v * views.intrinsics.fy;
-  const Vec3<float> gradient{x, y, q.value - (x * place.seen.x + y * place.seen.y) * place.inverse_z};
+  const BilinearValue q = bilinear_value(q00, q01, q10, q11, at.a, at.b);
+  const float x = q.by_u * keyframes.intrinsics.fx, y = q.by_v * keyframes.intrinsics.fy;
+  const Vec3<float> gradient{x, y, q.value - (x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
   const float inverse_slope = 1.0f / std::fmax(std::sqrt(dot(gradient, gradient)), 1e-6f);
-  const float residual = (place.seen.z * q.value - 1.0f) * inverse_slope;
+  const float residual = (at.in_camera.z * q.value - 1.0f) * inverse_slope;
   const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel));
-  add_weighted_residual(offset, residual, view.pose.rotation * (inverse_slope * gradient), weight, terms);
+  add_weighted_residual(offset, residual, keyframe.pose.rotation * (inverse_slope * gradient), weight, terms);
   if (!map.known) return;
-  const T of_map = static_cast<T>(certainty) * static_cast<T>(robust_weight(map.value, kernel));
+  const T map_weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(map.value, kernel));
   const T squared = static_cast<T>(residual) * static_cast<T>(residual);
   terms[kNormalTerms - 1] += weight * squared;
   terms[kNormalTerms] += weight;
-  terms[kNormalTerms + 1] += of_map * static_cast<T>(map.value) * static_cast<T>(map.value);
-  terms[kNormalTerms + 2] += of_map;
+  terms[kNormalTerms + 1] += map_weight * static_cast<T>(map.value) * static_cast<T>(map.value);
+  terms[kNormalTerms + 2] += map_weight;
 }
 
-// What the map's equations count against the mean of the views': the square of the ratio of variances, as the map's
+// Weight of the map's equations against the mean of the keyframes': the squared ratio of the variances, as the map's
 // error, unlike a sensor's noise, is alike for neighboring pixels and does not average out. 1 without common pixels.
-SPS_INLINE double map_share(const double* views) {
-  const double of_views = views[kNormalTerms], of_map = views[kNormalTerms + 2];
-  if (!(of_views > 1e-6 && of_map > 1e-6)) return 1.0;
-  const double ratio = views[kNormalTerms - 1] / of_views / (views[kNormalTerms + 1] / of_map + 1e-12);
+SPS_INLINE double map_share(const double* keyframe_terms) {
+  const double weights = keyframe_terms[kNormalTerms], map_weights = keyframe_terms[kNormalTerms + 2];
+  if (!(weights > 1e-6 && map_weights > 1e-6)) return 1.0;
+  const double map_variance = keyframe_terms[kNormalTerms + 1] / map_weights + 1e-12;
+  const double ratio = keyframe_terms[kNormalTerms - 1] / weights / map_variance;
   const double share = ratio * ratio;
   return share < kMinMapShare ? kMinMapShare : share < kMaxMapShare ? share : kMaxMapShare;
 }
 
-// The equations that the step is solved from: those of the map times its share, and the mean of the views'.
-SPS_INLINE void join_keyframe_terms(const double* map, const double* views, int count, double* joint) {
-  const double share = count > 0 ? map_share(views) : 1.0, of_view = count > 0 ? 1.0 / count : 0.0;
-  for (int t = 0; t < kNormalTerms; ++t) joint[t] = count > 0 ? share * map[t] + of_view * views[t] : map[t];
+// The equations that the step is solved from: those of the map times its share, and the mean of the keyframes'.
+SPS_INLINE void join_keyframe_terms(const double* map_terms, const double* keyframe_terms, int count, double* joint) {
+  const double share = count > 0 ? map_share(keyframe_terms) : 1.0, mean = count > 0 ? 1.0 / count : 0.0;
+  for (int t = 0; t < kNormalTerms; ++t) {
+    joint[t] = count > 0 ? share * map_terms[t] + mean * keyframe_terms[t] : map_terms[t];
+  }
 }
 
 }  // namespace spslam

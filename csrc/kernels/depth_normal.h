@@ -40,13 +40,13 @@ struct DepthCross {
   float center, left, right, up, down;
 };
 
-SPS_INLINE Vec3<float> unproject(const DepthCamera& camera, float u, float v, float z) {
+SPS_INLINE Vec3<float> unproject(const Intrinsics& camera, float u, float v, float z) {
   return {(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z};
 }
 
 // Unit normal, turned to the camera, by central differences; 0 where a depth is invalid or differs from the pixel's by
 // the share max_jump of it, or more.
-SPS_INLINE Vec3<float> normal_of_cross(const DepthCamera& camera, float u, float v, float step_px, float max_jump,
+SPS_INLINE Vec3<float> normal_of_cross(const Intrinsics& camera, float u, float v, float step_px, float max_jump,
                                        const DepthCross& z) {
   const float horizontal_jump = std::fmax(std::fabs(z.left - z.center), std::fabs(z.right - z.center));
   const float vertical_jump = std::fmax(std::fabs(z.up - z.center), std::fabs(z.down - z.center));

@@ -1,7 +1,4 @@
-// The maths of Gauss-Newton tracking: one residual, the sums over them, and the step they give.
-//
-// A pixel's residual is the scene's SDF (m) at its back-projected surface point; the increment (dt, domega) moves the
-// camera center by dt and turns the camera by domega about it, from the left.
+// The maths of Gauss-Newton tracking: what one pixel is measured against, and the step that the sums over pixels give.
 #pragma once
 
 #include <cmath>
@@ -9,22 +6,41 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
-#include "kernels/optimizer.h"
+#include "kernels/depth_keyframes.h"
 #include "kernels/pixel_record.h"
+#include "kernels/reference_image.h"
+#include "kernels/robust_residual.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
 
-// And the sum of judging weights, the number of inliers, the sum of weights times certainties.
-constexpr int kTrackingTerms = kNormalTerms + 3;
+// Terms of the map and, after them, of the depth keyframes.
+constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms;
 // Beyond this the decoder's tanh is saturated and its slope says nothing about where the surface is.
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
 
-// Widths (m) of the robust kernel: of the weights that move the pose, and of those that tell how well it fits.
-struct KernelWidths {
-  float step, judge;
-  float view;  // of earlier frames' depth images
+// The earlier frames that a call compares with: their poses, read once.
+struct EarlierFrames {
+  Pose<float> reference;
+  DepthKeyframe keyframes[kMaxDepthKeyframes];
+};
+constexpr int kMaxEarlierFrames = 1 + kMaxDepthKeyframes;
+
+// Reads number i of kMaxEarlierFrames, if there is one: the reference image is 0, the depth keyframes follow.
+SPS_INLINE void load_earlier_frame(const GaussNewtonOptions& options, int i, EarlierFrames& frames) {
+  if (i == 0 && options.reference.height > 0) frames.reference = load_pose(options.reference.pose);
+  if (i > 0 && i <= options.depth_keyframes.count) {
+    frames.keyframes[i - 1] = load_depth_keyframe(options.depth_keyframes, i - 1);
+  }
+}
+
+// What the pixels of an iteration are measured against. It points to what all iterations and threads share.
+struct Measurement {
+  const GaussNewtonOptions* options;
+  const EarlierFrames* frames;  // not read where there are neither a reference nor depth keyframes
+  int num_keyframes;            // that take part in the iteration
+  KernelWidths kernel;
 };
 
 struct SurfacePoint {
@@ -32,58 +48,36 @@ struct SurfacePoint {
   Vec3<float> offset;  // world - camera center
 };
 
-SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pose, float fx, float fy, float cx,
-                                      float cy) {
-  const Vec3<float> offset = pose.rotation * (pixel.depth * pixel_ray(pixel, fx, fy, cx, cy));
+SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pose, const Intrinsics& intrinsics) {
+  const Vec3<float> offset = pose.rotation * (pixel.depth * pixel_ray(pixel, intrinsics));
   return {offset + pose.translation, offset};
 }
 
-// Weight of a residual by Geman and McClure: 1 / (1 + (r / kernel)^2)^2.
-SPS_INLINE float robust_weight(float residual, float kernel) {
-  const float ratio = residual / kernel;
-  const float root = 1.0f / (1.0f + ratio * ratio);
-  return root * root;
-}
-
-// Adds a residual (m) of a weight to the hessian and gradient in sums of type T, and nothing to the cost. slope is its
-// derivative by the surface point, offset the point seen from the camera center that the increment turns about.
+// Adds an inlier's residual against the map, from its normalized SDF and the SDF's gradient by the world point (1/m).
 template <class T>
-SPS_INLINE void add_weighted_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, T weight,
-                                      T* terms) {
-  const Vec3<float> torque = cross(offset, slope);
-  const T jacobian[6] = {slope.x, slope.y, slope.z, torque.x, torque.y, torque.z};
-  const T cost = terms[kNormalTerms - 1];
-  add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
-  terms[kNormalTerms - 1] = cost;
+SPS_INLINE void add_map_residual(const Measurement& measure, const Vec3<float>& offset, float sdf,
+                                 const Vec3<float>& gradient, float certainty, T* terms) {
+  const float truncation = measure.options->truncation;
+  add_robust_residual(offset, sdf * truncation, truncation * gradient, measure.kernel, certainty, terms);
 }
 
-// Adds a residual (m) of its robust weight times `certainty`. How well the pose fits, the cost and the sum of weights,
-// is told by the judging width and without the certainty.
+// Adds a point's residuals against every stride-th depth keyframe of the iteration, from `first` on.
 template <class T>
-SPS_INLINE void add_robust_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope,
-                                    const KernelWidths& kernel, float certainty, T* terms) {
-  const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel.step));
-  const T judged = static_cast<T>(robust_weight(residual, kernel.judge)), r = static_cast<T>(residual);
-  add_weighted_residual(offset, residual, slope, weight, terms);
-  terms[kNormalTerms - 1] += judged * r * r;
-  terms[kNormalTerms] += judged;
-  terms[kNormalTerms + 1] += T(1);
-  terms[kNormalTerms + 2] += weight;
+SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const SurfacePoint& point, float certainty,
+                                       const MapResidual& map, int first, int stride, T* terms) {
+  for (int k = first; k < measure.num_keyframes; k += stride) {
+    add_depth_keyframe_residual(measure.options->depth_keyframes, measure.frames->keyframes[k], point.world,
+                                point.offset, measure.kernel.keyframe, certainty, map, terms);
+  }
 }
 
-// The same of an inlier's SDF, which is normalized, and its gradient by the world point (1/m).
+// Adds a pixel's residual against the reference image, where there is one.
 template <class T>
-SPS_INLINE void add_tracking_residual(const Vec3<float>& offset, float sdf, const Vec3<float>& gradient,
-                                      float truncation, const KernelWidths& kernel, float certainty, T* terms) {
-  add_robust_residual(offset, sdf * truncation, truncation * gradient, kernel, certainty, terms);
-}
-
-// Inverse variance of a residual as a share of that at the camera: a structured-light or stereo depth's noise grows
-// with z^2, and adds to that of the map.
-SPS_INLINE float depth_certainty(float depth, float noise_crossover_depth) {
-  if (!(noise_crossover_depth > 0.0f)) return 1.0f;
-  const float ratio = depth / noise_crossover_depth, squared = ratio * ratio;
-  return 1.0f / (1.0f + squared * squared);
+SPS_INLINE void add_reference_residual(const Measurement& measure, const Pixel& pixel, const SurfacePoint& point,
+                                       T* terms) {
+  const ReferenceImage& reference = measure.options->reference;
+  if (reference.height == 0) return;
+  add_intensity_residual(reference, measure.frames->reference, pixel, point.world, point.offset, terms);
 }
 
 SPS_INLINE bool is_tracking_inlier(float depth, bool inside, float sdf) {
@@ -98,18 +92,30 @@ SPS_INLINE float annealed_kernel(float start, float end, std::int64_t iteration,
   return start * std::pow(end / start, progress < 1.0f ? progress : 1.0f);
 }
 
-// The widths in an iteration of tracking; what is judged by is that of the step where options name none.
-SPS_INLINE KernelWidths tracking_kernel(const TrackingOptions& options, std::int64_t iteration) {
+// The widths in an iteration; the score's is that of the step where options name none.
+SPS_INLINE KernelWidths tracking_kernel(const GaussNewtonOptions& options, std::int64_t iteration) {
   const float step = annealed_kernel(options.kernel_start, options.kernel_end, iteration, options.iterations);
-  const float view = options.views.count > 0 ? annealed_kernel(options.kernel_start, options.views.kernel_end,
-                                                               iteration, options.iterations)
-                                             : step;
-  return {step, options.score_kernel > 0.0f ? options.score_kernel : step, view};
+  const float keyframe =
+      options.depth_keyframes.count > 0
+          ? annealed_kernel(options.kernel_start, options.depth_keyframes.kernel_end, iteration, options.iterations)
+          : step;
+  return {step, options.score_kernel > 0.0f ? options.score_kernel : step, keyframe};
 }
 
-// How many views take part in an iteration.
-SPS_INLINE int keyframes_in_use(const DepthKeyframes& views, std::int64_t iteration) {
-  return iteration >= views.first_iteration ? views.count : 0;
+// Options under which all given pixels are measured against the map alone, with one width of the kernel.
+SPS_INLINE GaussNewtonOptions map_options(const Intrinsics& intrinsics, float truncation, float kernel) {
+  GaussNewtonOptions options{};
+  options.intrinsics = intrinsics;
+  options.iterations = 1;
+  options.truncation = truncation;
+  options.kernel_start = options.kernel_end = options.score_kernel = kernel;
+  return options;
+}
+
+// `frames` may be null where options have neither a reference nor depth keyframes.
+SPS_INLINE Measurement measurement(const GaussNewtonOptions& options, const EarlierFrames* frames,
+                                   std::int64_t iteration) {
+  return {&options, frames, keyframes_in_use(options.depth_keyframes, iteration), tracking_kernel(options, iteration)};
 }
 
 // Weighted mean squared residual, m^2.
@@ -118,9 +124,9 @@ SPS_INLINE double tracking_cost(const double* terms) {
   return weights > 1e-6 ? terms[kNormalTerms - 1] / weights : 0.0;
 }
 
-// Solves the joint normal equations and moves the pose; steps gets |dt| (m) and |domega| (rad), hessian what the map's
-// matrix would be if pixels weighed on average what they are judged by, without certainties, so that it tells how the
-// pose is held and neither how far away the surface is nor how narrow the kernel.
+// Solves the joint normal equations and moves the pose. `steps` gets |dt| (m) and |domega| (rad). `hessian` gets the
+// map's matrix as if pixels had on average their score weights and no certainties: it says how firmly the surface holds
+// the pose, whatever its distance and the width of the kernel.
 SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, float* pose, float* steps,
                               float* hessian) {
   double h[36], g[6], cost, delta[6];
@@ -146,7 +152,7 @@ SPS_INLINE void tracking_step(const double* terms, const double* joint, double d
   for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(share * h[i]);
 }
 
-// What an iteration's sums say of the pose before its step; columns 0, 1 and 4 of its statistics.
+// Cost, inlier share and mean score weight of the pose before its step: columns 0, 1 and 4 of its statistics.
 SPS_INLINE void tracking_fit(const double* terms, std::int64_t num_pixels, float* stats) {
   const double count = static_cast<double>(num_pixels > 0 ? num_pixels : 1);
   stats[0] = static_cast<float>(tracking_cost(terms));
@@ -154,7 +160,19 @@ SPS_INLINE void tracking_fit(const double* terms, std::int64_t num_pixels, float
   stats[4] = static_cast<float>(terms[kNormalTerms] / count);
 }
 
-// The pose after `before` and `last` if the camera goes on as it went, T1 T0^-1 T1, its w not negative.
+// Writes the sums over a frame's pixels as its normal equations.
+SPS_INLINE void store_pose_equations(const double* terms, std::int64_t frame, std::int64_t num_pixels,
+                                     const PoseEquations& out) {
+  double h[36], g[6], cost;
+  store_normal_terms<double>(terms, h, g, &cost);
+  for (int i = 0; i < 36; ++i) out.hessian[36 * frame + i] = static_cast<float>(h[i]);
+  for (int i = 0; i < 6; ++i) out.gradient[6 * frame + i] = static_cast<float>(g[i]);
+  out.cost[frame] = static_cast<float>(tracking_cost(terms));
+  const double share = num_pixels ? terms[kNormalTerms + 1] / static_cast<double>(num_pixels) : 0.0;
+  out.inliers[frame] = static_cast<float>(share);
+}
+
+// The pose after `before` and `last` at constant speed, T1 T0^-1 T1, its w not negative.
 SPS_INLINE void constant_speed_pose(const float* before, const float* last, float* next) {
   const Quaternion<double> q0 = normalized(Quaternion<double>{before[0], before[1], before[2], before[3]});
   const Quaternion<double> q1 = normalized(Quaternion<double>{last[0], last[1], last[2], last[3]});

@@ -6,6 +6,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "spslam/types/tri_plane_layout.h"
 
 namespace spslam {
 
@@ -124,18 +125,6 @@ SPS_INLINE PlaneGradient<T> plane_gradient(const PlaneCell<T>& cell, const T (&v
   return {cell.slope_u * lerp(values[1] - values[0], values[3] - values[2], cell.v),
           cell.slope_v * lerp(values[2] - values[0], values[3] - values[1], cell.u)};
 }
-
-// Where one plane of texels lies: rows [offset, offset + size_u * size_v) of the table, v fastest; texel (iu, iv) of
-// the world is row offset + (iu - origin_u) * size_v + (iv - origin_v).
-struct PlaneLayout {
-  std::int64_t offset;
-  std::int32_t origin_u, origin_v, size_u, size_v;
-};
-
-// The xy, xz and yz planes.
-struct TriPlaneLayout {
-  PlaneLayout planes[3];
-};
 
 template <class T>
 SPS_INLINE T plane_u(const Vec3<T>& point, int plane) {

@@ -9,6 +9,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 
@@ -49,8 +50,8 @@ SPS_INLINE void pack_pixel(std::int32_t u, std::int32_t v, float depth, const st
 }
 
 // Direction of a pixel's ray in camera axes, with z = 1, so that a sample's depth is its factor.
-SPS_INLINE Vec3<float> pixel_ray(const Pixel& pixel, float fx, float fy, float cx, float cy) {
-  return {(pixel.u - cx) / fx, (pixel.v - cy) / fy, 1.0f};
+SPS_INLINE Vec3<float> pixel_ray(const Pixel& pixel, const Intrinsics& k) {
+  return {(pixel.u - k.cx) / k.fx, (pixel.v - k.cy) / k.fy, 1.0f};
 }
 
 }  // namespace spslam

@@ -1,4 +1,4 @@
-// The maths of point-to-plane ICP with projective association: one point, and the plane it is held against.
+// The maths of point-to-plane ICP with projective association: the distance of one point from the plane it falls on.
 #pragma once
 
 #include <cmath>

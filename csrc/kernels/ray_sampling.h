@@ -6,22 +6,12 @@
 
 #include "core/macros.h"
 #include "core/philox.h"
+#include "spslam/types/ray_sampling.h"
 
 namespace spslam {
 
 // Random numbers drawn at a time on the host: full vectors, whatever the number of samples.
 constexpr std::int32_t kDrawLanes = 16;
-
-// Samples s = 0 .. num_uniform-1 are stratified between near and far times the measured depth, the num_surface that
-// follow within the truncation distance of it.
-template <class T>
-struct RaySampling {
-  std::int32_t num_uniform, num_surface;
-  T near, far;   // shares of the measured depth
-  T truncation;  // m
-
-  SPS_INLINE std::int32_t num_samples() const { return num_uniform + num_surface; }
-};
 
 // Depth of uniform sample i, drawn with u in [0, 1). Ascending in i.
 template <class T>

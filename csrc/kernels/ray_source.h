@@ -1,4 +1,4 @@
-// Where the rays of a step come from: a list, or pixels drawn from the records of chosen frames.
+// The slot, row and pixel record of each ray of a step.
 #pragma once
 
 #include <cstdint>
@@ -6,19 +6,9 @@
 #include "core/macros.h"
 #include "core/philox.h"
 #include "kernels/pixel_record.h"
+#include "spslam/types/ray_source.h"
 
 namespace spslam {
-
-// Each ray belongs to a slot, each slot to a row of poses and of records.
-struct RaySource {
-  const std::int32_t* records;    // [rows, records_per_row, 3], or [num_rays, 3] where nothing is drawn
-  std::int64_t records_per_row;   // a ray's record is drawn from these; 0: record r is ray r's
-  PhiloxKey draw;                 // of that
-  const std::int32_t* ray_slots;  // [num_rays] not decreasing; null: the slots share the rays evenly
-  const std::int64_t* slot_rows;  // [num_slots]; null: slot i is row i
-  std::int64_t num_rays, num_slots;
-  const float* poses;  // [rows, 7]
-};
 
 SPS_INLINE std::int64_t ray_slot(const RaySource& source, std::int64_t ray) {
   return source.ray_slots ? source.ray_slots[ray] : ray * source.num_slots / source.num_rays;

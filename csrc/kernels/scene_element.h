@@ -4,6 +4,8 @@
 #include <cstdint>
 
 #include "kernels/decoders.h"
+#include "kernels/interpolation.h"
+#include "kernels/voxel_hash.h"
 #include "spslam/scene_view.h"
 
 namespace spslam {

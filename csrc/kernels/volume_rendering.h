@@ -124,6 +124,26 @@ struct RayLosses {
   T rgb, depth, free_space, sdf;
 };
 
+// What the samples of one ray are compared with on the SDF itself (10, 11).
+template <class T>
+struct SdfSupervision {
+  T target_depth, cosine, truncation;
+  T near_share, free_share;    // 1 / number of samples of the kind
+  T near_weight, free_weight;  // of the terms
+};
+
+// Adds the SDF and free-space terms of a sample inside the volume to the ray's losses, without weights; returns their
+// weighted gradient by the SDF.
+template <class T>
+SPS_INLINE T supervise_sample(const SdfSupervision<T>& ray, T sdf, T t, RayLosses<T>& losses) {
+  const SampleTarget<T> target = sample_target(ray.target_depth, t, ray.cosine, ray.truncation, true);
+  const T near = target.near ? sdf_residual(sdf, target.distance, ray.truncation) : T(0);
+  const T free = target.free ? free_space_residual(sdf) : T(0);
+  losses.sdf += ray.near_share * near * near;
+  losses.free_space += ray.free_share * free * free;
+  return 2 * (ray.near_weight * ray.near_share * ray.truncation * near + ray.free_weight * ray.free_share * free);
+}
+
 // Mean squared color error over the channels (8).
 template <class T>
 SPS_INLINE T color_loss(const T* color, const T* target) {

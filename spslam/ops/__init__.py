@@ -3,15 +3,9 @@
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.covisibility import frame_overlap, select_covisible_frames
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
+from spslam.ops.earlier_frames import LUMA_WEIGHTS, DepthKeyframes, ReferenceImage
 from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
-from spslam.ops.gauss_newton import (
-    LUMA_WEIGHTS,
-    DepthKeyframes,
-    ReferenceImage,
-    gauss_newton_poses,
-    predict_pose,
-    track_gauss_newton,
-)
+from spslam.ops.gauss_newton import GaussNewtonOptions, gauss_newton_poses, predict_pose, track_gauss_newton
 from spslam.ops.hash_table import VoxelHash, VoxelLimitError
 from spslam.ops.interpolation import bilinear_interpolate, tri_plane_interpolate, trilinear_interpolate
 from spslam.ops.launch_graph import LaunchGraph
@@ -47,6 +41,7 @@ __all__ = [
     "DepthKeyframes",
     "EncodedFrame",
     "FrameFusion",
+    "GaussNewtonOptions",
     "Intrinsics",
     "LaunchGraph",
     "MapMoments",

@@ -44,9 +44,9 @@ def render_step(generator, device, n):
 
 def track(generator, device, n):
     scene = make_scene(generator, random_decoder=True, device=device)
-    steps = dict(
-        num_pixels=32, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4, noise_crossover_depth=1.0
-    )
+    widths = dict(kernel_start=0.08, kernel_end=0.02, damping=1e-4, noise_crossover_depth=1.0)
+    key = {name: value for name, value in KEY.items() if name != "iteration"}
+    options = ops.GaussNewtonOptions(num_pixels=32, iterations=2, truncation=TRUNCATION, **widths, **key)
     cells = torch.stack([uniform(generator, 6, 8), 1 + 0.05 * uniform(generator, 6, 8)], -1).to(device)
     reference = ops.ReferenceImage(cells, POSE.to(device), ops.Intrinsics(7.5, 7.5, 3.5, 2.5), weight=0.05, kernel=0.1)
     return dict(
@@ -55,9 +55,7 @@ def track(generator, device, n):
         pixels=pixel_records(generator, max(n, 1)).to(device),
         pose=POSE.to(device),
         intrinsics=INTRINSICS,
-        truncation=TRUNCATION,
-        **steps,
-        **{name: value for name, value in KEY.items() if name != "iteration"},
+        options=options,
     )
 
 

@@ -1,5 +1,7 @@
 """Gauss-Newton tracking: normal equations against autograd, recovery of a known pose, determinism."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -36,7 +38,7 @@ def test_recovers_the_pose(device, generator, shift_m, angle_deg):
     scene = make_scene(generator, random_decoder=False, device=device)
     records = corner_pixels(POSE, generator).to(device)
     start = moved_pose(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
-    pose, stats, hessian = ops.track_gauss_newton(scene, records, pose7(start, device), INTRINSICS, **OPTIONS, frame=4)
+    pose, stats, hessian = ops.track_gauss_newton(scene, records, pose7(start, device), INTRINSICS, OPTIONS)
     found = pose7_to_matrix(pose.cpu().double().numpy())
     assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 2e-3
     assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.1
@@ -56,10 +58,11 @@ def test_devices_agree(device, generator, tf32, num_pixels):
     """Whole and part tiles, one a warp and several."""
     scene = make_scene(generator, random_decoder=False, device=device)
     records, start = corner_pixels(POSE, generator), pose7(moved_pose(POSE, 0.01, 0.02))
-    options = {**OPTIONS, "num_pixels": num_pixels}
+    options = replace(OPTIONS, num_pixels=num_pixels)
     on_cpu = make_scene(torch.Generator().manual_seed(0), random_decoder=False)
-    want = ops.track_gauss_newton(on_cpu, records, start, INTRINSICS, **options, frame=4)
-    got = ops.track_gauss_newton(scene, records.to(device), start.to(device), INTRINSICS, **options, frame=4, tf32=tf32)
+    want = ops.track_gauss_newton(on_cpu, records, start, INTRINSICS, options)
+    options = replace(options, tf32=tf32)
+    got = ops.track_gauss_newton(scene, records.to(device), start.to(device), INTRINSICS, options)
     pose, stats, hessian = (tensor.cpu() for tensor in got)
     torch.testing.assert_close(pose, want[0], **(TF32_POSE if tf32 else FLOAT32_POSE))
     bound = TF32_SUMS if tf32 else FLOAT32_SUMS
@@ -73,10 +76,10 @@ def test_same_bits_every_time(device, generator):
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator).to(device)
     start = pose7(moved_pose(POSE, 0.01, 0.02), device)
-    options = {**OPTIONS, "num_pixels": 3000}
-    first = ops.track_gauss_newton(scene, records, start, INTRINSICS, **options, frame=0)
+    options = replace(OPTIONS, num_pixels=3000)
+    first = ops.track_gauss_newton(scene, records, start, INTRINSICS, options)
     for _ in range(9):
-        again = ops.track_gauss_newton(scene, records, start, INTRINSICS, **options, frame=0)
+        again = ops.track_gauss_newton(scene, records, start, INTRINSICS, options)
         assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
@@ -84,7 +87,7 @@ def test_support_is_the_mean_weight(device, generator):
     """At the true pose every mapped pixel weighs one; off the map none does."""
     scene = make_scene(generator, random_decoder=False, device=device)
     records = corner_pixels(POSE, generator).to(device)
-    _, stats, _ = ops.track_gauss_newton(scene, records, pose7(POSE, device), INTRINSICS, **OPTIONS, frame=0)
+    _, stats, _ = ops.track_gauss_newton(scene, records, pose7(POSE, device), INTRINSICS, OPTIONS)
     inliers, support = stats[-1, 1].item(), stats[-1, 4].item()
     assert 0.95 * inliers < support <= inliers + 1e-6
 
@@ -106,7 +109,7 @@ def test_same_bits_for_any_number_of_threads(generator):
     try:
         for count in (1, 2, 3):
             torch.ops.spslam.set_num_threads(count)
-            results.append(ops.track_gauss_newton(scene, records, start, INTRINSICS, **OPTIONS, frame=0))
+            results.append(ops.track_gauss_newton(scene, records, start, INTRINSICS, OPTIONS))
     finally:
         torch.ops.spslam.set_num_threads(threads)
     for other in results[1:]:
@@ -119,7 +122,7 @@ def test_outside_the_map_nothing_moves(device, generator):
     far[:3, 3] += 50
     records = corner_pixels(POSE, generator).to(device)
     start = pose7(far, device)
-    pose, stats, _ = ops.track_gauss_newton(scene, records, start, INTRINSICS, **OPTIONS, frame=0)
+    pose, stats, _ = ops.track_gauss_newton(scene, records, start, INTRINSICS, OPTIONS)
     assert torch.allclose(pose, start, atol=1e-6)
     assert bool((stats[:, 1] == 0).all())
 
@@ -135,20 +138,22 @@ def test_arguments_are_named(generator):
     scene = make_scene(generator, random_decoder=False)
     records = corner_pixels(POSE, generator)
     with pytest.raises(ValueError, match="track_gauss_newton: iterations must be at least 1, got 0"):
-        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **{**OPTIONS, "iterations": 0}, frame=0)
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, replace(OPTIONS, iterations=0))
+    with pytest.raises(ValueError, match="track_gauss_newton: kernel_end must be positive, got -0.1"):
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, replace(OPTIONS, kernel_end=-0.1))
     with pytest.raises(ValueError, match="track_gauss_newton: score_kernel must be positive, got 0"):
-        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **OPTIONS, frame=0, score_kernel=0)
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, replace(OPTIONS, score_kernel=0))
     with pytest.raises(ValueError, match=r"predict_pose: before must have shape \[7\], got \[8\]"):
         ops.predict_pose(torch.zeros(8), torch.zeros(7))
     with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):
-        ops.track_gauss_newton(scene, records[:0], pose7(POSE), INTRINSICS, **OPTIONS, frame=0)
+        ops.track_gauss_newton(scene, records[:0], pose7(POSE), INTRINSICS, OPTIONS)
 
 
 def test_opcheck(device, generator):
     scene = make_scene(generator, random_decoder=False)
     records, pose = corner_pixels(POSE, generator, 50), pose7(POSE)
-    arguments = (records, pose, list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.03, 1e-4, 0, 1, 0, 1.0)
-    call = (*scene.arguments(), *arguments, None, None, [], 0.3, 0.4, None, None, [], [], 1.0, 1.0, 0)
+    options = replace(OPTIONS, num_pixels=32, iterations=2, noise_crossover_depth=1.0)
+    call = (*scene.arguments(), records, pose, *options.arguments(INTRINSICS), [], [], [], [], [])
     opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)
     opcheck(torch.ops.spslam.predict_pose.default, (pose, pose), device)
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)

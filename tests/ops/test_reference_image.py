@@ -1,4 +1,6 @@
-"""Tracking beyond the plain surface: pixels weighed by depth, a kernel to judge by, colors of an earlier frame."""
+"""Tracking beyond the plain surface: weights by depth, a kernel for the statistics, colors of an earlier frame."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +10,6 @@ from spslam import ops
 from spslam.geometry import pose7_to_matrix, rotation_angle
 from tests.ops.scenes import INTRINSICS, corner_pixels, make_scene
 from tests.ops.tracking_scene import (
-    KEY,
     ONE_STEP,
     OPTIONS,
     POSE,
@@ -31,10 +32,8 @@ def test_far_pixels_weigh_less(device, generator, noise_crossover_depth):
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     depth = camera_points(drawn)[:, 2]
     certain = weight / (1 + (depth / noise_crossover_depth) ** 4) if noise_crossover_depth else weight
-    _, stats, hessian = ops.track_gauss_newton(
-        scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, noise_crossover_depth=noise_crossover_depth,
-        tf32=False,
-    )  # fmt: skip
+    options = replace(ONE_STEP, noise_crossover_depth=noise_crossover_depth, tf32=False)
+    _, stats, hessian = ops.track_gauss_newton(scene, records.to(device), pose7(POSE, device), INTRINSICS, options)
     want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * weight.sum() / certain.sum()
     assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=2e-3 * want.abs().max())
     assert stats[0, 0].item() == pytest.approx(float((weight * residual**2).sum() / weight.sum()), rel=1e-3)
@@ -42,32 +41,32 @@ def test_far_pixels_weigh_less(device, generator, noise_crossover_depth):
 
 
 @pytest.mark.parametrize("noise_crossover_depth", [0.0, 2.0])
-def test_a_pose_is_judged_by_a_kernel_of_its_own(device, generator, noise_crossover_depth):
+def test_statistics_have_a_kernel_of_their_own(device, generator, noise_crossover_depth):
     """The step is that of the iteration's kernel; the fit and the size of the equations are those of the other."""
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
     drawn = drawn_pixels(records)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
-    judged = surface_equations(scene, drawn, 0.05)[2]
+    score_weight = surface_equations(scene, drawn, 0.05)[2]
     depth = camera_points(drawn)[:, 2]
     certain = weight / (1 + (depth / noise_crossover_depth) ** 4) if noise_crossover_depth else weight
     arguments = scene, records.to(device), pose7(POSE, device), INTRINSICS
-    options = dict(**ONE_STEP, **KEY, noise_crossover_depth=noise_crossover_depth, tf32=False)
-    pose, plain, _ = ops.track_gauss_newton(*arguments, **options)
-    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, **options, score_kernel=0.05)
+    options = replace(ONE_STEP, noise_crossover_depth=noise_crossover_depth, tf32=False)
+    pose, plain, _ = ops.track_gauss_newton(*arguments, options)
+    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, replace(options, score_kernel=0.05))
     assert torch.equal(pose, same_pose)
     assert torch.equal(plain[:, 1:4], stats[:, 1:4])
-    assert stats[0, 0].item() == pytest.approx(float((judged * residual**2).sum() / judged.sum()), rel=1e-3)
-    assert stats[0, 4].item() == pytest.approx(float(judged.mean()), rel=2e-3)
-    want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * judged.sum() / certain.sum()
+    assert stats[0, 0].item() == pytest.approx(float((score_weight * residual**2).sum() / score_weight.sum()), rel=1e-3)
+    assert stats[0, 4].item() == pytest.approx(float(score_weight.mean()), rel=2e-3)
+    want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * score_weight.sum() / certain.sum()
     assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=2e-3 * want.abs().max())
 
 
-def test_the_iterations_own_kernel_judges_where_none_is_named(device, generator):
+def test_statistics_take_the_iterations_own_kernel_where_none_is_named(device, generator):
     scene = make_scene(generator, random_decoder=True, device=device)
     arguments = scene, corner_pixels(POSE, generator, 400).to(device), pose7(POSE, device), INTRINSICS
-    plain = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY)
-    named = ops.track_gauss_newton(*arguments, **ONE_STEP, **KEY, score_kernel=ONE_STEP["kernel_end"])
+    plain = ops.track_gauss_newton(*arguments, ONE_STEP)
+    named = ops.track_gauss_newton(*arguments, replace(ONE_STEP, score_kernel=ONE_STEP.kernel_end))
     assert all(torch.equal(one, other) for one, other in zip(plain, named, strict=True))
 
 
@@ -134,7 +133,7 @@ def test_color_equations_are_those_of_autograd(device, generator):
     records = _painted(corner_pixels(POSE, generator, 400))
     jacobian, weight = _intensity_equations(reference, drawn_pixels(records))
     _, stats, hessian = ops.track_gauss_newton(
-        scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, reference=reference
+        scene, records.to(device), pose7(POSE, device), INTRINSICS, ONE_STEP, reference=reference
     )
     want = torch.einsum("n,ni,nj->ij", weight, jacobian, jacobian)
     assert weight.gt(0).double().mean() > 0.5
@@ -153,7 +152,7 @@ def test_colors_count_by_their_luma(device, generator):
     reference, scene = _reference(moved_pose(POSE, 0.01, 0.03), device), ops.SceneView.empty(device=device)
     (pose, _, hessian), (want_pose, _, want) = (
         ops.track_gauss_newton(
-            scene, records.to(device), pose7(POSE, device), INTRINSICS, **ONE_STEP, **KEY, reference=reference
+            scene, records.to(device), pose7(POSE, device), INTRINSICS, ONE_STEP, reference=reference
         )
         for records in (colored, gray)
     )
@@ -168,7 +167,7 @@ def test_colors_alone_find_the_pose(device, generator):
     start = moved_pose(POSE, 0.01 * np.array([0.6, -0.64, 0.48]), np.radians(1.0))
     pose, _, _ = ops.track_gauss_newton(
         ops.SceneView.empty(device=device), records, pose7(start, device), INTRINSICS,
-        **{**OPTIONS, "iterations": 20}, frame=4, reference=reference,
+        replace(OPTIONS, iterations=20), reference=reference,
     )  # fmt: skip
     found = pose7_to_matrix(pose.cpu().double().numpy())
     # Cells of two pixels, seen from 1 m at a focal length of 60: a tenth of a cell.
@@ -188,11 +187,8 @@ def test_devices_agree_with_a_reference(device, generator):
                 records.to(place),
                 start.to(place),
                 INTRINSICS,
-                **OPTIONS,
-                frame=4,
-                noise_crossover_depth=1.0,
+                replace(OPTIONS, noise_crossover_depth=1.0, tf32=False),
                 reference=_reference(POSE, place),
-                tf32=False,
             )  # fmt: skip
         )
     want, got = results
@@ -210,12 +206,12 @@ def test_bad_references_are_named(generator):
         (good._replace(cells=good.cells[..., 0]), r"reference.cells must have shape \[H, W, 2\]"),
     ):
         with pytest.raises(ValueError, match=f"track_gauss_newton: {message}"):
-            ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, **OPTIONS, frame=0, reference=bad)
+            ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, OPTIONS, reference=bad)
 
 
 def test_opcheck_with_a_reference(generator):
     scene, reference = make_scene(generator, random_decoder=False), _reference(POSE)
-    arguments = (corner_pixels(POSE, generator, 50), pose7(POSE), list(INTRINSICS), 32, 2, 0.08, 0.08, 0.02, 0.02, 1e-4)
-    image = (reference.cells, reference.pose, list(reference.intrinsics), 0.3, 0.4)
-    call = (*scene.arguments(), *arguments, 0, 1, 0, 1.0, *image, None, None, [], [], 1.0, 1.0, 0)
+    options = replace(OPTIONS, num_pixels=32, iterations=2)
+    arguments = corner_pixels(POSE, generator, 50), pose7(POSE), *options.arguments(INTRINSICS)
+    call = (*scene.arguments(), *arguments, *reference.arguments(), [], [], [])
     torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)

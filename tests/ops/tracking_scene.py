@@ -1,5 +1,7 @@
 """What the tests of tracking share: a pose before the corner, and the equations that autograd finds there."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -8,20 +10,27 @@ from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from tests.ops.scenes import INTRINSICS, POSES, TRUNCATION
 
 POSE = POSES[0]  # all three walls of the corner fill the view
-OPTIONS = dict(
-    num_pixels=1024, iterations=8, truncation=0.16, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=3, stream=1
+OPTIONS = ops.GaussNewtonOptions(
+    num_pixels=1024,
+    iterations=8,
+    truncation=0.16,
+    kernel_start=0.08,
+    kernel_end=0.02,
+    damping=1e-4,
+    seed=3,
+    stream=ops.Stream.TRACKING_PIXELS,
+    frame=4,
 )
-
 # A single undamped step, whose kernel and pixels are known.
-ONE_STEP = dict(
-    num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0, seed=3
+ONE_STEP = replace(
+    OPTIONS, num_pixels=600, iterations=1, truncation=TRUNCATION, kernel_start=0.03, kernel_end=0.03, damping=0.0
 )
-KEY = dict(stream=1, frame=4)
 
 
 def drawn_pixels(records):
     """The pixels that the first iteration of ONE_STEP takes."""
-    return records[ops.sample_indices(3, KEY["stream"], KEY["frame"], 0, ONE_STEP["num_pixels"], len(records))]
+    key = ONE_STEP.seed, ONE_STEP.stream, ONE_STEP.frame
+    return records[ops.sample_indices(*key, 0, ONE_STEP.num_pixels, len(records))]
 
 
 def pose7(matrix, device="cpu"):

@@ -31,8 +31,8 @@ struct RayStepArguments {
   TableSums embeddings, texels;
   float fixed_point_scale;
   std::int32_t stamp;
-  float* partials;  // [blocks, kPartialSize], or kTrackingPartialSize where the scene is frozen
-  float* pulls;     // [num_rays, kPullSize]; null where the scene is frozen
+  float* partials;        // [blocks, kPartialSize], or kTrackingPartialSize where the scene is frozen
+  float* pose_gradients;  // [num_rays, kPoseGradientStride]; null where the scene is frozen
 };
 
 // Sums of one block: parameters of both decoders, then the four loss terms.
@@ -42,6 +42,6 @@ constexpr int kPartialLosses = kNumParams, kPartialSize = (kPartialLosses + kLos
 // The same where the scene is frozen: the loss terms, then d L / d pose.
 constexpr int kTrackingSums = kLossSums + kPoseGradientSize, kTrackingPartialSize = 16;
 // d L / d pose of one ray, padded.
-constexpr int kPullSize = 8;
+constexpr int kPoseGradientStride = 8;
 
 }  // namespace spslam::fused

@@ -4,6 +4,7 @@
 #include "cuda/fused/arguments.cuh"
 #include "cuda/fused/column_sums.cuh"
 #include "cuda/fused/fragment.cuh"
+#include "kernels/ray_source.h"
 
 namespace spslam::fused {
 
@@ -23,16 +24,16 @@ __device__ __forceinline__ void store_losses(float sum, int first, int lane, con
 }
 
 // d L / d pose of a slot, over its rays in order, in all lanes of a warp.
-__device__ __forceinline__ void sum_pulls(const float* pulls, const RaySource& rays, std::int64_t slot, int lane,
-                                          float (&grad)[kPoseGradientSize]) {
-  constexpr int kRaysAtOnce = kWarp / kPullSize;
+__device__ __forceinline__ void sum_pose_gradients(const float* pose_gradients, const RaySource& rays,
+                                                   std::int64_t slot, int lane, float (&grad)[kPoseGradientSize]) {
+  constexpr int kRaysAtOnce = kWarp / kPoseGradientStride;
   const std::int64_t begin = first_ray_of_slot(rays, slot), end = first_ray_of_slot(rays, slot + 1);
-  const int column = lane % kPullSize;
+  const int column = lane % kPoseGradientStride;
   float sum = 0.0f;
-  for (std::int64_t r = begin + lane / kPullSize; r < end; r += kRaysAtOnce) {
-    if (column < kPoseGradientSize) sum += __ldcg(pulls + kPullSize * r + column);
+  for (std::int64_t r = begin + lane / kPoseGradientStride; r < end; r += kRaysAtOnce) {
+    if (column < kPoseGradientSize) sum += __ldcg(pose_gradients + kPoseGradientStride * r + column);
   }
-  for (int offset = kPullSize; offset < kWarp; offset *= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
+  for (int offset = kPoseGradientStride; offset < kWarp; offset *= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
   for (int k = 0; k < kPoseGradientSize; ++k) grad[k] = __shfl_sync(kAllLanes, sum, k);
 }
 

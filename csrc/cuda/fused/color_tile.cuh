@@ -5,6 +5,7 @@
 
 #include "cuda/fused/stage.cuh"
 #include "cuda/fused/warp_ray.cuh"
+#include "kernels/interpolation.h"
 
 namespace spslam::fused {
 
@@ -154,9 +155,9 @@ __device__ __forceinline__ void color_backward(const float* image, const ColorTi
 }
 
 // The lane's share of d L / d point of row r. Reads the texels again: to keep their slopes would take 48 registers.
-__device__ __forceinline__ Vec3<float> color_pull(const RayStepArguments& a, const PlanePlaces& places,
-                                                  const float (&grad_x)[4][4], int r, int lane) {
-  Vec3<float> pull{0.0f, 0.0f, 0.0f};
+__device__ __forceinline__ Vec3<float> color_point_gradient(const RayStepArguments& a, const PlanePlaces& places,
+                                                            const float (&grad_x)[4][4], int r, int lane) {
+  Vec3<float> by_point{0.0f, 0.0f, 0.0f};
   const int row = lane_row(lane) + 8 * r;
 #pragma unroll
   for (int plane = 0; plane < 3; ++plane) {
@@ -174,9 +175,9 @@ __device__ __forceinline__ Vec3<float> color_pull(const RayStepArguments& a, con
         sum.v += g * lerp(t[2] - t[0], t[3] - t[1], at.x);
       }
     }
-    add_plane_gradient(PlaneGradient<float>{at.z * sum.u, at.w * sum.v}, a.inverse_cell, plane, pull);
+    add_plane_gradient(PlaneGradient<float>{at.z * sum.u, at.w * sum.v}, a.inverse_cell, plane, by_point);
   }
-  return pull;
+  return by_point;
 }
 
 }  // namespace spslam::fused

@@ -161,6 +161,10 @@ __device__ __forceinline__ float sum_warp(float v) {
   return v;
 }
 
+__device__ __forceinline__ Vec3<float> sum_warp(const Vec3<float>& v) {
+  return {sum_warp(v.x), sum_warp(v.y), sum_warp(v.z)};
+}
+
 __device__ __forceinline__ float min_warp(float v) {
 #pragma unroll
   for (int offset = kWarp / 2; offset; offset /= 2) v = fminf(v, __shfl_xor_sync(kAllLanes, v, offset));

@@ -5,6 +5,7 @@
 
 #include "cuda/fused/stage.cuh"
 #include "cuda/fused/warp_ray.cuh"
+#include "kernels/interpolation.h"
 
 namespace spslam::fused {
 
@@ -112,8 +113,8 @@ __device__ __forceinline__ void geometry_backward(const float* image, const Geom
 }
 
 // The lane's share of d L / d point of row r.
-__device__ __forceinline__ Vec3<float> geometry_pull(const RayStepArguments& a, const GeometryTile& tile,
-                                                     const float (&grad_x)[2][4], int r, int lane) {
+__device__ __forceinline__ Vec3<float> geometry_point_gradient(const RayStepArguments& a, const GeometryTile& tile,
+                                                               const float (&grad_x)[2][4], int r, int lane) {
   const int quad = lane_quad(lane);
   float by_axis[3];
 #pragma unroll

@@ -4,6 +4,7 @@
 #include "cuda/fused/block_sums.cuh"
 #include "kernels/optimizer.h"
 #include "kernels/pose_adam.h"
+#include "kernels/ray_source.h"
 
 namespace spslam::fused {
 
@@ -21,7 +22,7 @@ struct TableTarget {
 };
 
 struct MapUpdateArguments {
-  const float *partials, *pulls;
+  const float *partials, *pose_gradients;
   int blocks;  // of the ray kernel
   RaySource rays;
   std::int64_t fixed_row;
@@ -59,9 +60,9 @@ __device__ __forceinline__ void step_pose(const MapUpdateArguments& a, std::int6
   const std::int64_t row = slot_row(a.rays, slot);
   if (row == a.fixed_row) return;
   float gradient[kPoseGradientSize];
-  sum_pulls(a.pulls, a.rays, slot, lane, gradient);
+  sum_pose_gradients(a.pose_gradients, a.rays, slot, lane, gradient);
   if (lane != 0) return;
-  const std::int64_t at = kPoseNumbers * row;
+  const std::int64_t at = kPoseSize * row;
   pose_adam(a.poses.coefficients, a.poses.coefficients, gradient, a.poses.param + at, a.poses.exp_avg + at,
             a.poses.exp_avg_sq + at);
 }

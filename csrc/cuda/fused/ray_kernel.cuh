@@ -21,7 +21,7 @@ constexpr int shared_memory_of(int architecture) {
 // Sums over the rays of a warp.
 struct WarpSums {
   RayLosses<float> losses;
-  float pull[kPoseGradientSize];  // where there is but one pose
+  float pose_gradient[kPoseGradientSize];  // where there is but one pose
 };
 
 // A block's shared memory: decoders, warps, and staged tiles where the scene is optimized.
@@ -107,11 +107,10 @@ __device__ void run_rays(const RayStepArguments& a, BlockMemory<kPrecision, kTra
       while (ray.pending()) ray.backward();
     }
     if (a.pose && exists) {
-      float pull[kPoseGradientSize];
-      ray.pull(pull);
+      const PoseGradient gradient = ray.pose_gradient();
       for (int k = 0; k < kPoseGradientSize; ++k) {
-        if (kTrain && lane == 0) a.pulls[kPullSize * r + k] = pull[k];
-        if (!kTrain) sums.pull[k] += pull[k];
+        if (kTrain && lane == 0) a.pose_gradients[kPoseGradientStride * r + k] = gradient.values[k];
+        if (!kTrain) sums.pose_gradient[k] += gradient.values[k];
       }
     }
   }

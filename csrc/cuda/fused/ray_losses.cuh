@@ -83,23 +83,22 @@ __device__ __forceinline__ void supervise_ray(const RayStepArguments& a, const W
     losses.depth += depth_loss(rendering.depth, ray.pixel.depth);
     if (a.color) losses.rgb += color_loss(color, ray.pixel.color);
   }
-  const float truncation = a.sampling.truncation;
-  const float free_scale = inverse_count<float>(ray.num_free), near_scale = inverse_count<float>(ray.num_near);
+  const SdfSupervision<float> supervision{ray.pixel.depth,
+                                          ray.cosine,
+                                          a.sampling.truncation,
+                                          inverse_count<float>(ray.num_near),
+                                          inverse_count<float>(ray.num_free),
+                                          a.scale.sdf,
+                                          a.scale.free_space};
 #pragma unroll
   for (int k = 0; k < 2; ++k) {
     const int i = lane + kWarp * k;
     if (i >= ray.inside) continue;
-    const float sdf = scratch.sdf[i], t = scratch.place[i].w;
-    const SampleTarget<float> target = sample_target(ray.pixel.depth, t, ray.cosine, truncation, true);
-    const float near = target.near ? sdf_residual(sdf, target.distance, truncation) : 0.0f;
-    const float free = target.free ? free_space_residual(sdf) : 0.0f;
-    losses.sdf += near_scale * near * near;
-    losses.free_space += free_scale * free * free;
+    const float t = scratch.place[i].w;
     const float grad_weight =
         grad_depth * t + grad_color[0] * rgb[k].x + grad_color[1] * rgb[k].y + grad_color[2] * rgb[k].z;
-    scratch.grad_sdf[i] =
-        2.0f * (a.scale.sdf * near_scale * truncation * near + a.scale.free_space * free_scale * free) +
-        weight_backward(grad_weight, mean, rendering.bell_slope[k], rendering.inverse_sum);
+    scratch.grad_sdf[i] = supervise_sample(supervision, scratch.sdf[i], t, losses) +
+                          weight_backward(grad_weight, mean, rendering.bell_slope[k], rendering.inverse_sum);
   }
   __syncwarp();
 }

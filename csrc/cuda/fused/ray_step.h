@@ -13,7 +13,7 @@ bool covers(const SceneView& scene, const RenderOptions& options);
 // Blocks of a launch over that many rays, each of which leaves one partial sum; 0 rays take one.
 int num_blocks(Precision precision, bool train, std::int64_t num_rays);
 
-// Arguments that a step's own do not tell: gradients, partials and pulls are left empty.
+// Arguments that a step's own do not tell: gradients, partials and pose_gradients are left empty.
 RayStepArguments make_arguments(const SceneView& scene, const RaySource& rays, const Intrinsics& camera,
                                 const RenderOptions& options);
 

@@ -7,6 +7,7 @@
 #include "cuda/fused/geometry_tile.cuh"
 #include "cuda/fused/ray_losses.cuh"
 #include "cuda/fused/table_scatter.cuh"
+#include "kernels/ray_pose_gradient.h"
 
 namespace spslam::fused {
 
@@ -34,7 +35,7 @@ class RayWarp {
     RayScratch& scratch = memory_.scratch;
     geometry_left_ = color_left_ = 0;
     ray_ = load_ray(a, r);
-    force_ = moment_ = {0.0f, 0.0f, 0.0f};
+    pose_gradient_ = {};
     if (!ray_.valid) return;
     place_samples(a, r, ray_.pixel.depth, lane_, scratch);
     find_samples_inside(a, lane_, ray_, scratch);
@@ -70,12 +71,10 @@ class RayWarp {
     return staged;
   }
 
-  // d L / d pose: by translation, and by a turn about the camera's center. In all lanes.
-  __device__ __forceinline__ void pull(float (&out)[kPoseGradientSize]) const {
-    const Vec3<float> force{sum_warp(force_.x), sum_warp(force_.y), sum_warp(force_.z)};
-    const Vec3<float> moment{sum_warp(moment_.x), sum_warp(moment_.y), sum_warp(moment_.z)};
-    const Vec3<float> torque = cross(ray_.direction, moment);
-    out[0] = force.x, out[1] = force.y, out[2] = force.z, out[3] = torque.x, out[4] = torque.y, out[5] = torque.z;
+  // d L / d pose, in all lanes.
+  __device__ __forceinline__ PoseGradient pose_gradient() const {
+    return spslam::pose_gradient({sum_warp(pose_gradient_.translation), sum_warp(pose_gradient_.moment)},
+                                 ray_.direction);
   }
 
  private:
@@ -110,11 +109,6 @@ class RayWarp {
     __syncwarp();
   }
 
-  __device__ __forceinline__ void add_pull(const Vec3<float>& force, float t) {
-    force_ = force_ + force;
-    moment_ = moment_ + t * force;
-  }
-
   // The last tile is still in the registers; the others are decoded again.
   __device__ __forceinline__ void geometry_back(int tile) {
     RayScratch& scratch = memory_.scratch;
@@ -133,7 +127,7 @@ class RayWarp {
 #pragma unroll
       for (int r = 0; r < 2; ++r) {
         const int i = min(base + lane_row(lane_) + 8 * r, ray_.inside - 1);
-        add_pull(geometry_pull(a, geometry_, grad_x, r, lane_), scratch.place[i].w);
+        add_point_gradient(geometry_point_gradient(a, geometry_, grad_x, r, lane_), scratch.place[i].w, pose_gradient_);
       }
     }
     if constexpr (kTrain) {
@@ -162,7 +156,8 @@ class RayWarp {
 #pragma unroll
       for (int r = 0; r < 2; ++r) {
         const int k = min(base + lane_row(lane_) + 8 * r, rendered_ - 1);
-        add_pull(color_pull(a, memory_.places, grad_x, r, lane_), scratch.place[scratch.rendered[k]].w);
+        add_point_gradient(color_point_gradient(a, memory_.places, grad_x, r, lane_),
+                           scratch.place[scratch.rendered[k]].w, pose_gradient_);
       }
     }
     if constexpr (kTrain) {
@@ -180,7 +175,7 @@ class RayWarp {
   GeometryTile geometry_;
   ColorTile color_;
   float grad_color_[3];
-  Vec3<float> force_, moment_;
+  RayPoseGradient pose_gradient_;
 };
 
 }  // namespace spslam::fused

@@ -6,6 +6,7 @@
 
 #include "cuda/fused/color_tile.cuh"
 #include "cuda/fused/geometry_tile.cuh"
+#include "kernels/interpolation.h"
 
 namespace spslam::fused {
 

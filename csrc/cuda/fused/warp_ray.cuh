@@ -3,8 +3,11 @@
 
 #include "cuda/fused/arguments.cuh"
 #include "cuda/fused/fragment.cuh"
+#include "kernels/interpolation.h"
 #include "kernels/ray_sampling.h"
+#include "kernels/ray_source.h"
 #include "kernels/volume_rendering.h"
+#include "kernels/voxel_hash.h"
 
 namespace spslam::fused {
 
@@ -37,7 +40,7 @@ __device__ __forceinline__ WarpRay load_ray(const RayStepArguments& a, std::int6
   ray.cosine = a.cosine_targets ? ray.pixel.foreshortening : 1.0f;
   const Pose<float> pose = load_pose(a.rays.poses + 7 * row);
   ray.origin = pose.translation;
-  ray.direction = pose.rotation * pixel_ray(ray.pixel, a.camera.fx, a.camera.fy, a.camera.cx, a.camera.cy);
+  ray.direction = pose.rotation * pixel_ray(ray.pixel, a.camera);
   return ray;
 }
 

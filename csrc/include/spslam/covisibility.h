@@ -5,13 +5,14 @@
 
 #include "core/device.h"
 #include "core/philox.h"
-#include "spslam/gauss_newton.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 
-// Frames as far as co-visibility goes: their poses, and depth at the middle of each cell of a depth thumbnail over the image.
+// Frames as far as co-visibility goes: their poses, and depth at the middle of each cell of a depth thumbnail over the
+// image.
 struct FrameViews {
-  const float* poses;             // [num_frames, 7]
+  const float* poses;                     // [num_frames, 7]
   const std::uint16_t* depth_thumbnails;  // [num_frames, rows, columns] bits of float16, m; 0 where unknown
   std::int64_t num_frames, rows, columns;
   Intrinsics intrinsics;  // of the image, px

@@ -9,11 +9,10 @@
 
 namespace spslam {
 
-constexpr int kPoseSize = 7;  // unit quaternion (w, x, y, z), translation (m)
-// cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean judging weight over all pixels
+// cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean score weight over all pixels
 constexpr int kTrackingStatSize = 5;
 
-// What red, green and blue count for in an intensity (Rec. 601), in thousandths: whole numbers, so that means over many
+// Weights of red, green and blue in an intensity (Rec. 601), in thousandths: whole numbers, so that means over many
 // pixels can be summed exactly. Python reads them by the op luma_weights.
 constexpr std::int64_t kLumaWeights[3] = {299, 587, 114};
 
@@ -29,7 +28,7 @@ struct ReferenceImage {
 
 constexpr int kMaxDepthKeyframes = 8;
 
-// Depth images of earlier frames, which tracking holds surface points against; none where count is 0.
+// Depth images of earlier frames, which tracking aligns surface points with; none where count is 0.
 struct DepthKeyframes {
   const std::uint16_t* images;  // [R, height, width] depth in `unit`, 0 where unknown
   const float* poses;           // [F, 7] T_world_camera
@@ -39,21 +38,21 @@ struct DepthKeyframes {
   float kernel_end;              // m, width of the robust kernel at the last iterations
   std::int64_t first_iteration;  // from which on they take part
   int count;
-  std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each view
+  std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each keyframe
 };
 
-struct TrackingOptions {
+struct GaussNewtonOptions {
   Intrinsics intrinsics;
   std::int64_t num_pixels, iterations;
   float truncation;                // m
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
   float score_kernel;              // m, width of the kernel of cost and mean weight; 0: the iteration's own
   double damping;
-  PhiloxKey key;      // its iteration is replaced by the running one
-  float noise_crossover_depth;  // m, where the noise of depth, growing with z^2, doubles a residual's variance; 0: noise alike
-  ReferenceImage reference;
-  DepthKeyframes views;
+  PhiloxKey key;                // its iteration is replaced by the running one
+  float noise_crossover_depth;  // m, where depth noise that grows with z^2 equals that of the map; 0: constant noise
   bool tf32;  // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
+  ReferenceImage reference;
+  DepthKeyframes depth_keyframes;
 };
 
 // next [7]: the pose after `before` [7] and `last` [7] at constant speed.
@@ -68,14 +67,20 @@ std::int64_t gauss_newton_workspace_size(Device device, std::int64_t frames, std
 // [iterations, kTrackingStatSize]; hessian [36] of the last iteration, before damping.
 template <class Device>
 void track_gauss_newton(Device device, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
-                        const TrackingOptions& options, void* workspace, float* pose, float* stats, float* hessian);
+                        const GaussNewtonOptions& options, void* workspace, float* pose, float* stats, float* hessian);
 
-// Normal equations of F frames with N pixels each: pixels [F, N, 3], poses [F, 7]; hessian [F, 36], gradient [F, 6],
-// cost [F] (weighted mean squared residual, m^2), inliers [F] (share of the pixels).
+// Normal equations of F frames' poses.
+struct PoseEquations {
+  float* hessian;   // [F, 36]
+  float* gradient;  // [F, 6]
+  float* cost;      // [F] weighted mean squared residual, m^2
+  float* inliers;   // [F] share of the pixels
+};
+
+// Of F frames with N pixels each: pixels [F, N, 3], poses [F, 7]; kernel is the width of the robust kernel, m.
 template <class Device>
 void gauss_newton_poses(Device device, const SceneView& scene, const std::int32_t* pixels, const float* poses,
                         std::int64_t frames, std::int64_t pixels_per_frame, const Intrinsics& intrinsics,
-                        float truncation, float kernel, void* workspace, float* hessian, float* gradient, float* cost,
-                        float* inliers);
+                        float truncation, float kernel, void* workspace, const PoseEquations& out);
 
 }  // namespace spslam

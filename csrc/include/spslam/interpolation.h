@@ -7,7 +7,7 @@
 #include <cstdint>
 
 #include "core/device.h"
-#include "kernels/interpolation.h"
+#include "spslam/types/tri_plane_layout.h"
 
 namespace spslam {
 

@@ -3,8 +3,8 @@
 
 #include <cstdint>
 
-#include "kernels/ray_source.h"
 #include "spslam/render_step.h"
+#include "spslam/types/ray_source.h"
 
 namespace spslam {
 

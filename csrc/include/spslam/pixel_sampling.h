@@ -5,6 +5,7 @@
 
 #include "core/device.h"
 #include "core/philox.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 
@@ -17,21 +18,22 @@ struct RgbdImage {
 };
 
 struct PixelSampling {
-  std::int64_t count;          // pixels to draw
-  float min_depth, max_depth;  // m; others, 0 and not finite ones are not drawn
-  std::int32_t step_px;        // of the normals' differences
-  float max_jump;              // of depth beside a normal, as a share
-  std::int32_t thumbnail_step;   // px; the first depth thumbnail pixel lies at half of it
-  std::int32_t depth_image_step;      // px; the first of the view lies at 0; 0: no view
-  float depth_image_unit;             // m, of the view's depth
+  std::int64_t count;             // pixels to draw
+  float min_depth, max_depth;     // m; others, 0 and not finite ones are not drawn
+  std::int32_t step_px;           // of the normals' differences
+  float max_jump;                 // of depth beside a normal, as a share
+  std::int32_t thumbnail_step;    // px; the first depth thumbnail pixel lies at half of it
+  std::int32_t depth_image_step;  // px; the first of the view lies at 0; 0: no view
+  float depth_image_unit;         // m, of the view's depth
 };
 
 // Where the results go.
 struct SampledPixels {
-  std::int32_t* records;   // [count, 3], see kernels/pixel_record.h
-  float* normals;          // [count, 3], camera axes, towards the camera; 0 where unknown
+  std::int32_t* records;           // [count, 3], see kernels/pixel_record.h
+  float* normals;                  // [count, 3], camera axes, towards the camera; 0 where unknown
   std::uint16_t* depth_thumbnail;  // [thumbnail_size(height), thumbnail_size(width)] float16 depth (m), 0 where invalid
-  std::uint16_t* view;     // [depth_image_size(height), depth_image_size(width)] depth in units, 0 where invalid or too far
+  std::uint16_t*
+      view;  // [depth_image_size(height), depth_image_size(width)] depth in units, 0 where invalid or too far
 };
 
 constexpr std::int32_t thumbnail_size(std::int32_t size, std::int32_t step) {
@@ -52,6 +54,6 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
 // at `pose`: seven numbers, unit quaternion (w, x, y, z) and translation of T_world_camera, on the device.
 template <class Device>
 void unproject_pixels(Device device, const std::int32_t* records, const float* camera_normals, std::int64_t n,
-                      const float* pose, float fx, float fy, float cx, float cy, float* points, float* normals);
+                      const float* pose, const Intrinsics& intrinsics, float* points, float* normals);
 
 }  // namespace spslam

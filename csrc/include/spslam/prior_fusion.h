@@ -6,6 +6,7 @@
 
 #include "core/device.h"
 #include "spslam/decoders.h"
+#include "spslam/types/camera.h"
 
 namespace spslam {
 
@@ -15,16 +16,11 @@ constexpr int kEncoderHidden = 64;
 constexpr MlpShape kEncoder{kEncoderInputs, kEncoderHidden, kPriorFeatures, MlpActivation::kNone};
 constexpr std::int64_t kEncoderParameters = kEncoder.num_params();
 
-// A pinhole camera, px.
-struct DepthCamera {
-  float fx, fy, cx, cy;
-};
-
 // A depth image (m); 0, negative and not finite are invalid.
 struct DepthImage {
   const float* depth;
   std::int32_t width, height;
-  DepthCamera camera;
+  Intrinsics camera;
 };
 
 // Unit normals in camera axes, turned to the camera, of pixels (u, v); 0 where the surface is not smooth around one.

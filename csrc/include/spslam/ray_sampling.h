@@ -5,7 +5,7 @@
 
 #include "core/device.h"
 #include "core/philox.h"
-#include "kernels/ray_sampling.h"
+#include "spslam/types/ray_sampling.h"
 
 namespace spslam {
 

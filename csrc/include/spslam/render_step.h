@@ -5,8 +5,8 @@
 
 #include "core/device.h"
 #include "core/philox.h"
-#include "kernels/ray_sampling.h"
 #include "spslam/scene_view.h"
+#include "spslam/types/ray_sampling.h"
 
 namespace spslam {
 

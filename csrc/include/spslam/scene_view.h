@@ -3,9 +3,10 @@
 
 #include <cstdint>
 
-#include "kernels/interpolation.h"
-#include "kernels/voxel_hash.h"
 #include "spslam/decoders.h"
+#include "spslam/types/camera.h"
+#include "spslam/types/tri_plane_layout.h"
+#include "spslam/types/voxel_table.h"
 
 namespace spslam {
 
@@ -31,11 +32,6 @@ struct SceneView {
   float position_scale;          // 1/m
   float plane_cell_size;         // m
   TriPlaneLayout planes;
-};
-
-// Pinhole intrinsics, px.
-struct Intrinsics {
-  float fx, fy, cx, cy;
 };
 
 }  // namespace spslam

@@ -4,9 +4,19 @@
 #include "core/for_each.h"
 #include "kernels/pose_adam.h"
 #include "kernels/ray_source.h"
-#include "kernels/render_step_buffers.h"
+#include "launch/render_step_buffers.h"
 
 namespace spslam {
+
+// A call's random keys in an iteration.
+inline RaySource at_iteration(RaySource source, std::int64_t iteration) {
+  source.draw.iteration += static_cast<std::uint32_t>(iteration);
+  return source;
+}
+inline RenderOptions at_iteration(RenderOptions options, std::int64_t iteration) {
+  options.key.iteration += static_cast<std::uint32_t>(iteration);
+  return options;
+}
 
 // All members are public: nvcc takes no device lambda from a private function.
 struct DrawnRays {
@@ -16,7 +26,7 @@ struct DrawnRays {
   DrawnRays(Workspace& memory, const RaySource& source)
       : pixels(memory.take<std::int32_t>(kPixelWords * source.num_rays)),
         slots(memory.take<std::int32_t>(source.num_rays)),
-        poses(memory.take<float>(kPoseNumbers * source.num_slots)) {}
+        poses(memory.take<float>(kPoseSize * source.num_slots)) {}
 
   RayBatch batch(const RaySource& source, const Intrinsics& intrinsics) const {
     return {pixels, slots, source.num_rays, poses, source.num_slots, intrinsics};
@@ -33,8 +43,8 @@ struct DrawnRays {
       out.slots[r] = static_cast<std::int32_t>(slot);
     });
     for_each(device, source.num_slots, [=] SPS_HOST_DEVICE(std::int64_t slot) {
-      const float* pose = source.poses + kPoseNumbers * slot_row(source, slot);
-      for (int k = 0; k < kPoseNumbers; ++k) out.poses[kPoseNumbers * slot + k] = pose[k];
+      const float* pose = source.poses + kPoseSize * slot_row(source, slot);
+      for (int k = 0; k < kPoseSize; ++k) out.poses[kPoseSize * slot + k] = pose[k];
     });
   }
 };

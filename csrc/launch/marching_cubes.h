@@ -5,6 +5,7 @@
 
 #include "core/for_each.h"
 #include "kernels/marching_cubes.h"
+#include "launch/workspace.h"
 #include "spslam/marching_cubes.h"
 #include "spslam/voxel_hash.h"
 
@@ -19,11 +20,9 @@ inline MarchingCubesWork marching_cubes_layout(std::int64_t count, int n, void* 
   work.capacity = 2;
   while (work.capacity < 2 * count) work.capacity *= 2;
   work.words = (3 * samples_per_cell(n) + 63) / 64;
-  std::int64_t end = 0;
+  Workspace memory(workspace);
   const auto take = [&](auto*& array, std::int64_t length) {
-    constexpr std::int64_t kAlignment = 256;
-    array = reinterpret_cast<std::decay_t<decltype(array)>>(static_cast<char*>(workspace) + end);
-    end += (length * static_cast<std::int64_t>(sizeof(*array)) + kAlignment - 1) / kAlignment * kAlignment;
+    array = memory.take<std::remove_pointer_t<std::decay_t<decltype(array)>>>(length);
   };
   take(work.faults, 1);
   take(work.hash_keys, work.capacity);
@@ -36,7 +35,7 @@ inline MarchingCubesWork marching_cubes_layout(std::int64_t count, int n, void* 
   take(work.edge_ranks, count * work.words);
   take(work.vertex_offsets, count + 1);
   take(work.face_offsets, count + 1);
-  *bytes = end;
+  *bytes = memory.used();
   return work;
 }
 

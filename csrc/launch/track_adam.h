@@ -1,8 +1,8 @@
 // A tracking call put together from the launches of its parts, for any device.
 #pragma once
 
-#include "kernels/drawn_rays_launch.h"
-#include "kernels/optimizer_launch.h"
+#include "launch/drawn_rays.h"
+#include "launch/optimizer.h"
 #include "spslam/track_adam.h"
 
 namespace spslam {
@@ -24,12 +24,9 @@ struct TrackAdamLaunch {
   void run() {
     start();
     for (std::int64_t iteration = 0; iteration < call_.iterations; ++iteration) {
-      RaySource source = source_;
-      RenderOptions options = call_.options;
-      source.draw.iteration += static_cast<std::uint32_t>(iteration);
-      options.key.iteration += static_cast<std::uint32_t>(iteration);
-      rays_.draw(device_, source);
-      render_step(device_, call_.scene, batch(), options, gradients(iteration), step_workspace_);
+      rays_.draw(device_, at_iteration(source_, iteration));
+      render_step(device_, call_.scene, batch(), at_iteration(call_.options, iteration), gradients(iteration),
+                  step_workspace_);
       step(iteration);
     }
     finish();
@@ -67,7 +64,7 @@ struct TrackAdamLaunch {
   void finish() {
     const PoseSearch* search = search_;
     float* best = call_.best;
-    for_each(device_, kPoseNumbers, [=] SPS_HOST_DEVICE(std::int64_t i) { best[i] = search->best[i]; });
+    for_each(device_, kPoseSize, [=] SPS_HOST_DEVICE(std::int64_t i) { best[i] = search->best[i]; });
   }
 
   const Device device_;

@@ -3,6 +3,7 @@
 
 #include "core/for_each.h"
 #include "kernels/prior_fusion.h"
+#include "kernels/voxel_hash.h"
 #include "spslam/prior_fusion.h"
 
 namespace spslam {

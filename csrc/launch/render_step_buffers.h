@@ -1,6 +1,7 @@
 // Scratch memory of render_step where it is put together from the launches of the single ops.
 #pragma once
 
+#include "launch/workspace.h"
 #include "spslam/decoders.h"
 #include "spslam/interpolation.h"
 #include "spslam/render_step.h"
@@ -17,26 +18,6 @@ inline std::int64_t plane_rows(const TriPlaneLayout& layout) {
   }
   return rows;
 }
-
-// Hands out pieces of scratch memory; with a null base it only counts.
-class Workspace {
- public:
-  explicit Workspace(void* base) : base_(static_cast<char*>(base)) {}
-
-  template <class T>
-  T* take(std::int64_t count) {
-    constexpr std::int64_t kAlignment = 256;
-    T* piece = base_ ? reinterpret_cast<T*>(base_ + used_) : nullptr;
-    used_ += (count * static_cast<std::int64_t>(sizeof(T)) + kAlignment - 1) / kAlignment * kAlignment;
-    return piece;
-  }
-
-  std::int64_t used() const { return used_; }
-
- private:
-  char* base_;
-  std::int64_t used_ = 0;
-};
 
 // Scratch of one step: R rays, N = R * S samples.
 struct RenderStepBuffers {
@@ -59,7 +40,7 @@ struct RenderStepBuffers {
   float* mlp_workspace;
   float* grad_table;
   std::int64_t* scatter_words;
-  float* pulls;  // [R, 6]
+  float* pose_gradients;  // [R, 6]
 
   template <class Device>
   RenderStepBuffers(Device device, void* base, const SceneView& scene, const RayBatch& rays,
@@ -90,7 +71,7 @@ struct RenderStepBuffers {
                                               mlp_backward_workspace_size(device, kColorDecoder, n)));
     grad_table = memory.take<float>(table_size);
     scatter_words = memory.take<std::int64_t>(scatter_workspace_words<Device>(table_size));
-    pulls = memory.take<float>(kPoseGradientSize * r);
+    pose_gradients = memory.take<float>(kPoseGradientSize * r);
     bytes = memory.used();
   }
 };

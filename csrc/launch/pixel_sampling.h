@@ -9,11 +9,12 @@ namespace spslam {
 
 template <class Device>
 void unproject_pixels(Device device, const std::int32_t* records, const float* camera_normals, std::int64_t n,
-                      const float* pose, float fx, float fy, float cx, float cy, float* points, float* normals) {
+                      const float* pose, const Intrinsics& intrinsics, float* points, float* normals) {
+  const Intrinsics camera = intrinsics;
   for_each(device, n, [=] SPS_HOST_DEVICE(std::int64_t i) {
     const Pose<float> T_world_camera = load_pose(pose);
     const Pixel pixel = unpack_pixel(records + kPixelWords * i);
-    const Vec3<float> in_camera = pixel.depth * pixel_ray(pixel, fx, fy, cx, cy);
+    const Vec3<float> in_camera = pixel.depth * pixel_ray(pixel, camera);
     const float* n = camera_normals + 3 * i;
     const Vec3<float> point = T_world_camera.rotation * in_camera + T_world_camera.translation;
     const Vec3<float> normal = T_world_camera.rotation * Vec3<float>{n[0], n[1], n[2]};
@@ -26,8 +27,8 @@ void unproject_pixels(Device device, const std::int32_t* records, const float* c
   });
 }
 
-#define SPS_INSTANTIATE_PIXEL_SAMPLING(Device)                                                                         \
-  template void unproject_pixels<Device>(Device, const std::int32_t*, const float*, std::int64_t, const float*, float, \
-                                         float, float, float, float*, float*);
+#define SPS_INSTANTIATE_PIXEL_SAMPLING(Device)                                                                  \
+  template void unproject_pixels<Device>(Device, const std::int32_t*, const float*, std::int64_t, const float*, \
+                                         const Intrinsics&, float*, float*);
 
 }  // namespace spslam

@@ -3,8 +3,12 @@
 #pragma once
 
 #include "core/for_each.h"
+#include "kernels/interpolation.h"
 #include "kernels/pixel_record.h"
-#include "kernels/render_step_buffers.h"
+#include "kernels/ray_pose_gradient.h"
+#include "kernels/ray_sampling.h"
+#include "kernels/voxel_hash.h"
+#include "launch/render_step_buffers.h"
 #include "spslam/ray_sampling.h"
 
 namespace spslam {
@@ -45,7 +49,7 @@ struct RenderStepLaunch {
       const Intrinsics& k = rays.intrinsics;
       const Pose<float> pose = known ? load_pose(rays.poses + 7 * static_cast<std::int64_t>(frame)) : Pose<float>{};
       b.origin[r] = pose.translation;
-      b.direction[r] = pose.rotation * pixel_ray(pixel, k.fx, k.fy, k.cx, k.cy);
+      b.direction[r] = pose.rotation * pixel_ray(pixel, k);
       b.depth[r] = known && has_depth(pixel.depth) ? pixel.depth : 0.0f;
       b.foreshortening[r] = pixel.foreshortening;
       for (int c = 0; c < 3; ++c) b.target_color[3 * r + c] = pixel.color[c];
@@ -178,25 +182,24 @@ struct RenderStepLaunch {
     const float inverse_voxel = inverse_voxel_, position_scale = scene_.position_scale;
     constexpr std::int64_t kInput = kGeometryDecoder.input;
     for_each(device_, rays.num_rays, [=] SPS_HOST_DEVICE(std::int64_t r) {
-      Vec3<float> force{}, moment{};
+      RayPoseGradient sums{};
       for (std::int64_t i = r * samples; i < (r + 1) * samples; ++i) {
         if (!b.valid[i]) continue;
         const float *cell = b.grad_local + 3 * i, *x = b.grad_x + kInput * i, *color = b.grad_points + 3 * i;
-        const Vec3<float> pull = inverse_voxel * Vec3<float>{cell[0], cell[1], cell[2]} +
-                                 position_scale * Vec3<float>{x[0], x[1], x[2]} +
-                                 Vec3<float>{color[0], color[1], color[2]};
-        force = force + pull;
-        moment = moment + b.t[i] * pull;
+        const Vec3<float> by_point = inverse_voxel * Vec3<float>{cell[0], cell[1], cell[2]} +
+                                     position_scale * Vec3<float>{x[0], x[1], x[2]} +
+                                     Vec3<float>{color[0], color[1], color[2]};
+        add_point_gradient(by_point, b.t[i], sums);
       }
-      const Vec3<float> torque = cross(b.direction[r], moment);
-      const float pulls[kPoseGradientSize] = {force.x, force.y, force.z, torque.x, torque.y, torque.z};
-      for (int k = 0; k < kPoseGradientSize; ++k) b.pulls[kPoseGradientSize * r + k] = pulls[k];
+      const PoseGradient gradient = pose_gradient(sums, b.direction[r]);
+      for (int k = 0; k < kPoseGradientSize; ++k) b.pose_gradients[kPoseGradientSize * r + k] = gradient.values[k];
     });
     float* poses = out_.poses;
     for_each(device_, rays.num_frames * kPoseGradientSize, [=] SPS_HOST_DEVICE(std::int64_t i) {
       double sum = 0.0;
       for (std::int64_t r = 0; r < rays.num_rays; ++r) {
-        if (rays.ray_frames[r] == i / kPoseGradientSize) sum += b.pulls[kPoseGradientSize * r + i % kPoseGradientSize];
+        if (rays.ray_frames[r] != i / kPoseGradientSize) continue;
+        sum += b.pose_gradients[kPoseGradientSize * r + i % kPoseGradientSize];
       }
       poses[i] = static_cast<float>(sum);
     });

@@ -1,9 +1,10 @@
 // A mapping call put together from the launches of its parts, for any device.
 #pragma once
 
-#include "kernels/drawn_rays_launch.h"
-#include "kernels/optimizer_launch.h"
 #include "kernels/pose_adam.h"
+#include "kernels/ray_source.h"
+#include "launch/drawn_rays.h"
+#include "launch/optimizer.h"
 #include "spslam/optimize_map.h"
 
 namespace spslam {
@@ -23,12 +24,9 @@ struct OptimizeMapLaunch {
 
   void run() {
     for (std::int64_t iteration = 0; iteration < call_.iterations; ++iteration) {
-      RaySource source = call_.rays;
-      RenderOptions options = call_.options;
-      source.draw.iteration += static_cast<std::uint32_t>(iteration);
-      options.key.iteration += static_cast<std::uint32_t>(iteration);
-      rays_.draw(device_, source);
-      render_step(device_, call_.scene, batch(), options, gradients(iteration), step_workspace_);
+      rays_.draw(device_, at_iteration(call_.rays, iteration));
+      render_step(device_, call_.scene, batch(), at_iteration(call_.options, iteration), gradients(iteration),
+                  step_workspace_);
       step_scene(iteration);
       if (call_.poses.exp_avg) step_poses(iteration);
     }
@@ -89,7 +87,7 @@ struct OptimizeMapLaunch {
     const float* gradients = grad_poses_;
     const std::int64_t fixed = call_.fixed_row;
     for_each(device_, source.num_slots, [=] SPS_HOST_DEVICE(std::int64_t slot) {
-      const std::int64_t row = slot_row(source, slot), at = kPoseNumbers * row;
+      const std::int64_t row = slot_row(source, slot), at = kPoseSize * row;
       if (row == fixed) return;
       pose_adam(c, c, gradients + kPoseGradientSize * slot, poses.param + at, poses.exp_avg + at,
                 poses.exp_avg_sq + at);

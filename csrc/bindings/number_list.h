@@ -1,0 +1,46 @@
+// Numbers that an op takes as one list, so that a further one is an entry of an enum and no further parameter.
+#pragma once
+
+#include "bindings/common.h"
+
+namespace spslam::bindings {
+
+// A list of numbers whose places the enum `Place` names, the last of it kCount. Python fills it in the same order.
+template <class Place, class T>
+class NumberList {
+ public:
+  NumberList(const char* function, const char* argument, const std::vector<T>& values) : values_(values) {
+    SPS_CHECK(values.size() == static_cast<std::size_t>(Place::kCount), function, ": ", argument, " must have ",
+              static_cast<int>(Place::kCount), " numbers, got ", values.size());
+  }
+
+  T operator[](Place place) const { return values_[static_cast<std::size_t>(place)]; }
+
+  template <class U>
+  U as(Place place) const {
+    return static_cast<U>((*this)[place]);
+  }
+
+ private:
+  const std::vector<T>& values_;
+};
+
+template <class Place>
+using Scalars = NumberList<Place, double>;
+template <class Place>
+using Integers = NumberList<Place, std::int64_t>;
+
+// The camera at the places kFx to kCy.
+template <class Place>
+Intrinsics load_intrinsics(const Scalars<Place>& scalars) {
+  return {scalars.template as<float>(Place::kFx), scalars.template as<float>(Place::kFy),
+          scalars.template as<float>(Place::kCx), scalars.template as<float>(Place::kCy)};
+}
+
+// The key of the places kSeed, kStream and kFrame, and an iteration.
+template <class Place>
+PhiloxKey load_key(const Integers<Place>& integers, std::int64_t iteration) {
+  return philox_key(integers[Place::kSeed], integers[Place::kStream], integers[Place::kFrame], iteration);
+}
+
+}  // namespace spslam::bindings

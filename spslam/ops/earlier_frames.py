@@ -1,0 +1,89 @@
+"""Earlier frames that `track_gauss_newton` compares a frame with, besides the map."""
+
+from typing import NamedTuple
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+from spslam.ops._checks import check, check_tensor
+from spslam.ops.scene_view import Intrinsics, check_intrinsics
+
+# Weights of red, green and blue in a reference's intensity (Rec. 601), in thousandths; the kernel's own.
+LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
+
+_MAX_DEPTH_KEYFRAMES = 8
+
+
+class ReferenceImage(NamedTuple):
+    """A small gray image of an earlier frame, to compare colors with.
+
+    Attributes:
+        cells: float32 [H, W, 2] intensity in [0, 1] (`LUMA_WEIGHTS`) and depth (m, 0 where unknown). A point is
+            compared where it falls between four cells whose depth agrees with its own to a tenth.
+        pose: float32 [7] T_world_camera of the frame, unit quaternion (w, x, y, z) and translation (m).
+        intrinsics: in cells: those of s x s pixels have focal lengths f / s and principal point (c + 1/2) / s - 1/2.
+        weight: m that an intensity difference of 1 counts as.
+        kernel: width of the robust kernel, intensity.
+    """
+
+    cells: torch.Tensor
+    pose: torch.Tensor
+    intrinsics: Intrinsics
+    weight: float
+    kernel: float
+
+    def check(self, function: str, like: torch.Tensor) -> None:
+        """Raises TypeError or ValueError, naming `function`, where something does not fit."""
+        check_tensor(function, "reference.cells", self.cells, ("H", "W", 2), torch.float32, like=like)
+        check_tensor(function, "reference.pose", self.pose, (7,), torch.float32, like=like)
+        check_intrinsics(function, self.intrinsics, "reference.intrinsics")
+        check(self.weight >= 0, function, "reference.weight", "be at least 0", self.weight)
+        check(self.kernel > 0, function, "reference.kernel", "be positive", self.kernel)
+
+    def arguments(self) -> tuple[list[torch.Tensor], list[float]]:
+        """What the schema takes: the enum ReferenceScalar in csrc/bindings/gauss_newton.cpp."""
+        return [self.cells, self.pose], [*self.intrinsics, self.weight, self.kernel]
+
+
+class DepthKeyframes(NamedTuple):
+    """Depth images of earlier frames, to align a frame's surface with.
+
+    Attributes:
+        images: uint16 [R, H, W] depth in `unit`, 0 where unknown. A point is compared where it falls between four
+            pixels with depth whose inverses spread less than 3 %.
+        unit: m.
+        poses: float32 [F, 7] T_world_camera, unit quaternions (w, x, y, z) and translations (m).
+        rows: of each keyframe, at most 8, the row of its image and the row of its pose.
+        intrinsics: of the images, px.
+        kernel_end: last width of the robust kernel of these distances, m; the first is that of the map's.
+        first_iteration: from which on they take part; the map alone has the larger basin of convergence.
+    """
+
+    images: torch.Tensor
+    unit: float
+    poses: torch.Tensor
+    rows: tuple[tuple[int, int], ...]
+    intrinsics: Intrinsics
+    kernel_end: float
+    first_iteration: int = 0
+
+    def check(self, function: str, like: torch.Tensor) -> None:
+        """Raises TypeError or ValueError, naming `function`, where something does not fit."""
+        name = "depth_keyframes"
+        check_tensor(function, f"{name}.images", self.images, ("R", "H", "W"), torch.uint16, like=like)
+        check_tensor(function, f"{name}.poses", self.poses, ("F", 7), torch.float32, like=like)
+        check_intrinsics(function, self.intrinsics, f"{name}.intrinsics")
+        check(self.unit > 0, function, f"{name}.unit", "be positive", self.unit)
+        check(self.kernel_end > 0, function, f"{name}.kernel_end", "be positive", self.kernel_end)
+        check(self.first_iteration >= 0, function, f"{name}.first_iteration", "be at least 0", self.first_iteration)
+        count, most = len(self.rows), _MAX_DEPTH_KEYFRAMES
+        check(count <= most, function, f"{name}.rows", f"be at most {most}", count)
+        for image, pose in self.rows:
+            inside = 0 <= image < len(self.images) and 0 <= pose < len(self.poses)
+            check(inside, function, f"{name}.rows", "name images and poses that are there", (image, pose))
+
+    def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
+        """What the schema takes: the enums KeyframeScalar and KeyframeInteger in csrc/bindings/gauss_newton.cpp."""
+        rows = [row for pair in self.rows for row in pair]
+        scalars = [*self.intrinsics, self.unit, self.kernel_end]
+        return [self.images, self.poses], scalars, [self.first_iteration, *rows]
