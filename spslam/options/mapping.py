@@ -63,7 +63,7 @@ class LossOptions(Section):
 class MappingOptions(Section):
     """Joint optimization of the map and the poses of selected frames (section III.D).
 
-    With 0 `iterations` and 0 `first_iterations` nothing is optimized: frames are encoded and fused, and of these options
+    With 0 `iterations` and 0 `first_iterations` nothing is optimized: frames are encoded and fused. Of these options
     only `every` has an effect.
     """
 

@@ -57,7 +57,7 @@ class TrackingOptions(Section):
         gt=0,
     )
     depth_keyframes: bool = option(
-        "Gauss-Newton: also align with the depth images of the last frame, of one 10 to 19 and one 40 to 49 frames earlier"
+        "Gauss-Newton: also align with the depth images of the last frame, one 10 to 19 and one 40 to 49 frames earlier"
     )
     depth_keyframe_kernel_m: float = option(
         "Gauss-Newton: width of the robust kernel of distances to these depth images in the last iteration",

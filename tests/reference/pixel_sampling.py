@@ -13,7 +13,7 @@ def usable_depth(depth: np.ndarray, min_depth: float, max_depth: float) -> np.nd
 
 
 def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSampling, seed, stream, frame):
-    """Records int32 [P, 3], normals float32 [P, 3], depth_thumbnail float16, view uint16, and the number of valid pixels."""
+    """Records int32 [P, 3], normals float32 [P, 3], thumbnail float16, depth image uint16, and the valid pixels."""
     depth = usable_depth(depth, sampling.min_depth, sampling.max_depth)
     valid = np.flatnonzero(depth)
     count = sampling.count if len(valid) else 0
