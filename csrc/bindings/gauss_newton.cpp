@@ -72,7 +72,8 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0,
             "track_gauss_newton: pixels must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == kPoseSize, "track_gauss_newton: pose must have 7 elements");
-  SPS_CHECK(num_pixels >= 1 && iterations >= 1, "track_gauss_newton: num_pixels and iterations must be >= 1");
+  check_count("track_gauss_newton", "num_pixels", num_pixels);
+  check_count("track_gauss_newton", "iterations", iterations);
   DeviceScope scope(pixels);
   const SceneArgument scene(tensors, scalars, layout);
   pixels = torch::stable::contiguous(pixels);
@@ -116,6 +117,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
   pixels = torch::stable::contiguous(pixels);
   poses = torch::stable::contiguous(poses);
   const std::int64_t frames = pixels.size(0), count = pixels.size(1);
+  check_count("gauss_newton_poses", "pixels of a frame", count, 0);
   Tensor hessian = empty(poses, {frames, 6, 6}, ScalarType::Float);
   Tensor gradient = empty(poses, {frames, 6}, ScalarType::Float);
   Tensor cost = empty(poses, {frames}, ScalarType::Float);
