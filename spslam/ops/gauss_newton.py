@@ -23,6 +23,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 # What red, green and blue count for in a reference's intensity (Rec. 601), in thousandths; the kernel's own.
@@ -31,6 +32,7 @@ LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
 _MAX_DEPTH_KEYFRAMES = 8
 
 
+@public_op()
 def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     """The pose after two given ones if the camera goes on as it went, T1 T0^-1 T1; reads nothing back to the host.
 
@@ -97,6 +99,7 @@ class DepthKeyframes(NamedTuple):
     first_iteration: int = 0
 
 
+@public_op()
 def track_gauss_newton(
     scene: SceneView,
     pixels: torch.Tensor,
@@ -254,6 +257,7 @@ def _check_keyframes(name: str, views: DepthKeyframes, like: torch.Tensor) -> No
         check(inside, name, "views.rows", "name images and poses that are there", (image, pose))
 
 
+@public_op()
 def gauss_newton_poses(
     scene: SceneView,
     pixels: torch.Tensor,
