@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "arrays.h"
-#include "kernels/voxel_hash.h"
+#include "spslam/kernels/voxel_hash.h"
 
 namespace spslam::numpy {
 namespace {
