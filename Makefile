@@ -52,6 +52,16 @@ example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, wi
 	$(RUN) cmake -S examples/cpp -B build/example-cpp -G Ninja -DCMAKE_PREFIX_PATH=$(CURDIR)/build/prefix
 	$(RUN) cmake --build build/example-cpp
 	$(RUN) ctest --test-dir build/example-cpp --output-on-failure
+	$(RUN) cmake -S tests/cpp -B build/cpp-installed -G Ninja -DCMAKE_PREFIX_PATH=$(CURDIR)/build/prefix
+	$(RUN) cmake --build build/cpp-installed
+	$(RUN) ctest --test-dir build/cpp-installed --output-on-failure
+	$(RUN) cmake -S tests/cpp -B build/cpp-sources -G Ninja -DSPSLAM_SOURCE=$(CURDIR) -DSPSLAM_CPU_ISAS=baseline
+	$(RUN) cmake --build build/cpp-sources -j $(JOBS)
+	$(RUN) ctest --test-dir build/cpp-sources --output-on-failure
+	@if command -v pkg-config > /dev/null; then \
+	  flags=$$(PKG_CONFIG_PATH=build/prefix/lib/pkgconfig:build/prefix/lib64/pkgconfig pkg-config --cflags --libs spslam) && \
+	  $(CXX) -std=c++17 -o build/use-spslam tests/cpp/use_spslam.cpp $$flags && build/use-spslam; \
+	  else echo "pkg-config is not installed: spslam.pc goes untested"; fi
 
 test-numpy: dev ## install bindings/numpy and test it against the torch ops
 	SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install $(PIP) --no-deps \
@@ -72,7 +82,7 @@ lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(RUN) clang-format --dry-run --Werror $$(git ls-files 'csrc/*.h' 'csrc/*.cpp' 'csrc/*.cu' 'csrc/*.cuh' \
-	  'examples/*.h' 'examples/*.cpp' 'bindings/*.h' 'bindings/*.cpp')
+	  'examples/*.h' 'examples/*.cpp' 'tests/*.cpp' 'bindings/*.h' 'bindings/*.cpp')
 	$(PYTHON) -m mypy
 
 # torch first and pinned: a plain 'torch' may bring gigabytes of CUDA libraries. The package is installed as a link to

@@ -1,7 +1,16 @@
 # The libraries: torch-free kernels for each instruction set and for CUDA, and a torch op library over each.
 include(CheckLanguage)
 include(GNUInstallDirs)
-find_package(Threads REQUIRED)
+
+# Finds a package once for all folders: what links the kernels may lie in another than this.
+function(spslam_find package target)
+  if(NOT TARGET ${target})
+    find_package(${package} REQUIRED)
+    set_target_properties(${target} PROPERTIES IMPORTED_GLOBAL TRUE)
+  endif()
+endfunction()
+
+spslam_find(Threads Threads::Threads)
 
 if(SPSLAM_CUDA STREQUAL "AUTO")
   check_language(CUDA)
@@ -14,6 +23,11 @@ endif()
 if(NOT CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|AMD64)$")
   set(SPSLAM_CPU_ISAS baseline)
 endif()
+if(Spslam_CPU_ISA)
+  set(SPSLAM_DEFAULT_ISA ${Spslam_CPU_ISA})
+else()
+  list(GET SPSLAM_CPU_ISAS 0 SPSLAM_DEFAULT_ISA)
+endif()
 message(STATUS "spslam: CPU ${SPSLAM_CPU_ISAS} | CUDA ${SPSLAM_CUDA} | torch ${SPSLAM_TORCH_DIR}")
 
 if(SPSLAM_CUDA)
@@ -22,30 +36,42 @@ if(SPSLAM_CUDA)
   set(CMAKE_CUDA_RUNTIME_LIBRARY Static)
   set(CMAKE_CUDA_STANDARD 17)
   enable_language(CUDA)
-  find_package(CUDAToolkit REQUIRED)
+  spslam_find(CUDAToolkit CUDA::cudart_static)
 endif()
 
+include(SpslamHeaders)
 file(GLOB SPSLAM_CPU_SOURCES CONFIGURE_DEPENDS csrc/core/*.cpp csrc/cpu/*.cpp)
 file(GLOB SPSLAM_CUDA_SOURCES CONFIGURE_DEPENDS csrc/cuda/*.cu)
 file(GLOB SPSLAM_BINDING_SOURCES CONFIGURE_DEPENDS csrc/bindings/*.cpp)
 
+# From here the sources are included, by those who link a library what is installed.
+function(spslam_source_includes target)
+  target_include_directories(${target} PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc/include
+    ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
+endfunction()
+
 function(spslam_kernel_includes target)
-  target_include_directories(${target} PUBLIC
-    $<BUILD_INTERFACE:${CMAKE_CURRENT_SOURCE_DIR}/csrc/include>
-    $<BUILD_INTERFACE:${CMAKE_CURRENT_SOURCE_DIR}/csrc>
+  spslam_source_includes(${target})
+  target_include_directories(${target} INTERFACE $<BUILD_INTERFACE:${SPSLAM_INCLUDE_DIR}>
     $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}>)
 endfunction()
 
-# Makes a kernel library available as Spslam::<name>, here and, of export set `set`, where it is installed.
+# Makes a kernel library available as Spslam::<name>, here and, of export set `set`, where it is installed. Within
+# another project it is built where that links it.
 function(spslam_export target name set)
   add_library(Spslam::${name} ALIAS ${target})
   set_target_properties(${target} PROPERTIES EXPORT_NAME ${name})
-  install(TARGETS ${target} EXPORT ${set} ARCHIVE DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT development)
+  if(SPSLAM_INSTALL)
+    install(TARGETS ${target} EXPORT ${set} ARCHIVE DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT development)
+  else()
+    set_target_properties(${target} PROPERTIES EXCLUDE_FROM_ALL TRUE)
+  endif()
 endfunction()
 
 # Links `name` as a torch op library: LibTorch's stable ABI, no Python symbol, no undefined symbol.
 function(spslam_op_library name)
   add_library(${name} MODULE ${SPSLAM_BINDING_SOURCES})
+  spslam_source_includes(${name})
   target_include_directories(${name} SYSTEM PRIVATE ${SPSLAM_TORCH_DIR}/include)
   target_compile_definitions(${name} PRIVATE TORCH_TARGET_VERSION=${SPSLAM_TORCH_TARGET})
   # Messages name files from here on, not the folders of the machine that built them.
@@ -87,6 +113,12 @@ foreach(isa IN LISTS SPSLAM_CPU_ISAS)
     target_link_libraries(${ops} PRIVATE ${kernels})
   endif()
 endforeach()
+
+# As find_package(Spslam) has it: see SpslamConfig.cmake.in.
+if(NOT SPSLAM_DEFAULT_ISA IN_LIST SPSLAM_CPU_ISAS)
+  message(FATAL_ERROR "Spslam_CPU_ISA must be one of ${SPSLAM_CPU_ISAS}, got ${SPSLAM_DEFAULT_ISA}")
+endif()
+add_library(Spslam::cpu ALIAS spslam_cpu_${SPSLAM_DEFAULT_ISA})
 
 if(SPSLAM_CUDA)
   add_library(spslam_cuda STATIC ${SPSLAM_CUDA_SOURCES})

@@ -16,6 +16,7 @@
 
 #include <cstdint>
 #include <exception>
+#include <initializer_list>
 #include <optional>
 #include <sstream>
 #include <stdexcept>
@@ -45,6 +46,40 @@ template <class... Words>
   do {                                                     \
     if (!(condition)) spslam::bindings::fail(__VA_ARGS__); \
   } while (false)
+
+// Most rays, points or iterations of a call: their products with sizes of records stay within 64 bits.
+constexpr std::int64_t kMaxCount = std::int64_t{1} << 30;
+
+// Whether a tensor has that shape, -1 standing for any size. Sizes are compared one by one: of a tensor without memory,
+// such as one of 0 columns, they may be of any size, and so may their products.
+inline bool has_shape(const Tensor& tensor, std::initializer_list<std::int64_t> shape) {
+  if (tensor.dim() != static_cast<std::int64_t>(shape.size())) return false;
+  std::int64_t axis = 0;
+  for (const std::int64_t size : shape) {
+    if (size != -1 && tensor.size(axis) != size) return false;
+    ++axis;
+  }
+  return true;
+}
+
+inline bool same_shape(const Tensor& tensor, const Tensor& other) {
+  if (tensor.dim() != other.dim()) return false;
+  for (std::int64_t axis = 0; axis < tensor.dim(); ++axis) {
+    if (tensor.size(axis) != other.size(axis)) return false;
+  }
+  return true;
+}
+
+// A number that kernels hold in 32 bits.
+inline std::int32_t to_int32(const char* function, const char* argument, std::int64_t value) {
+  SPS_CHECK(value >= INT32_MIN && value <= INT32_MAX, function, ": ", argument, " must fit 32 bits, got ", value);
+  return static_cast<std::int32_t>(value);
+}
+
+inline void check_count(const char* function, const char* argument, std::int64_t count, std::int64_t least = 1) {
+  SPS_CHECK(count >= least && count <= kMaxCount, function, ": ", argument, " must be in [", least, ", 2^30], got ",
+            count);
+}
 
 #ifdef SPS_CUDA
 #define SPS_DISPATCH_KEY CUDA

@@ -51,6 +51,10 @@ Tensor select_covisible_frames(Tensor records, std::int64_t current, Tensor pose
   SPS_CHECK(current >= 0 && current < poses.size(0), "select_covisible_frames: current must be a row of poses");
   DeviceScope scope(poses);
   const KeyframesArgument argument("select_covisible_frames", poses, depth_thumbnails, intrinsics, thumbnail_step);
+  check_count("select_covisible_frames", "num_points", num_points, 0);
+  SPS_CHECK(num_covisible >= 0 && count >= 0 && threshold >= 0.0 && threshold <= 1.0,
+            "select_covisible_frames: num_covisible and count must be at least 0, threshold in [0, 1]");
+  SPS_CHECK(candidates.dim() == 1, "select_covisible_frames: candidates must have shape [M]");
   records = torch::stable::contiguous(records);
   candidates = torch::stable::contiguous(candidates);
   const std::int64_t num_candidates = candidates.numel();

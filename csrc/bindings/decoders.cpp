@@ -8,7 +8,10 @@ namespace {
 MlpShape mlp_shape(const char* function, const Tensor& input, const Tensor& params, std::int64_t hidden,
                    std::int64_t output, std::int64_t activation) {
   SPS_CHECK(activation >= 0 && activation <= 2, function, ": activation must be 0, 1 or 2, got ", activation);
-  SPS_CHECK(input.dim() == 2 && hidden >= 1 && output >= 1, function, ": input must have shape [N, inputs]");
+  SPS_CHECK(has_shape(input, {-1, -1}), function, ": input must have shape [N, inputs]");
+  check_count(function, "inputs", input.size(1), 0);
+  check_count(function, "hidden", hidden);
+  check_count(function, "output", output);
   const MlpShape shape{input.size(1), hidden, output, static_cast<MlpActivation>(activation)};
   SPS_CHECK(params.numel() == shape.num_params() && params.scalar_type() == input.scalar_type(), function,
             ": params must have ", shape.num_params(), " elements of input's dtype, got ", params.numel());
@@ -36,7 +39,7 @@ std::tuple<Tensor, Tensor> mlp_backward(Tensor grad, Tensor input, Tensor params
                                         bool need_grad_params) {
   const MlpShape shape = mlp_shape("mlp_backward", input, params, hidden, output, activation);
   const std::int64_t n = input.size(0);
-  SPS_CHECK(grad.numel() == n * output, "mlp_backward: grad must have shape [N, output]");
+  SPS_CHECK(has_shape(grad, {n, output}), "mlp_backward: grad must have shape [N, output]");
   grad = torch::stable::contiguous(grad);
   input = torch::stable::contiguous(input);
   params = torch::stable::contiguous(params);

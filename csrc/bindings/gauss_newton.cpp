@@ -106,8 +106,8 @@ GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<I
   options.key = load_key(integers, 0);
   options.noise_crossover_depth = scalars.as<float>(Scalar::kNoiseCrossoverDepth);
   options.tf32 = integers.as<bool>(Integer::kTf32);
-  SPS_CHECK(options.num_pixels >= 1 && options.iterations >= 1, kName,
-            ": num_pixels and iterations must be at least 1");
+  check_count(kName, "num_pixels", options.num_pixels);
+  check_count(kName, "iterations", options.iterations);
   return options;
 }
 
@@ -154,6 +154,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
   pixels = torch::stable::contiguous(pixels);
   poses = torch::stable::contiguous(poses);
   const std::int64_t frames = pixels.size(0), count = pixels.size(1);
+  check_count("gauss_newton_poses", "pixels of a frame", count, 0);
   Tensor hessian = empty(poses, {frames, 6, 6}, ScalarType::Float);
   Tensor gradient = empty(poses, {frames, 6}, ScalarType::Float);
   Tensor cost = empty(poses, {frames}, ScalarType::Float);

@@ -1,6 +1,6 @@
 #include "spslam/interpolation.h"
 
-#include "bindings/common.h"
+#include "bindings/plane_layout.h"
 
 namespace spslam::bindings {
 namespace {
@@ -57,7 +57,7 @@ std::tuple<Tensor, Tensor> trilinear_interpolate_backward(Tensor grad, Tensor em
   corner_ids = contiguous(corner_ids);
   local_coords = contiguous(local_coords);
   const std::int64_t points = corner_ids.size(0), channels = embeddings.size(1);
-  SPS_CHECK(grad.numel() == points * channels, "trilinear_interpolate_backward: grad must have shape [N, C]");
+  SPS_CHECK(has_shape(grad, {points, channels}), "trilinear_interpolate_backward: grad must have shape [N, C]");
   Gradients out(embeddings, local_coords, need_embeddings, need_local_coords);
   dispatch_floating("trilinear_interpolate_backward", embeddings, [&](auto zero) {
     using T = decltype(zero);
@@ -99,7 +99,7 @@ std::tuple<Tensor, Tensor> bilinear_interpolate_backward(Tensor grad, Tensor tex
   texels = contiguous(texels);
   uv = contiguous(uv);
   const std::int64_t points = uv.size(0), channels = texels.size(2);
-  SPS_CHECK(grad.numel() == points * channels, "bilinear_interpolate_backward: grad must have shape [N, C]");
+  SPS_CHECK(has_shape(grad, {points, channels}), "bilinear_interpolate_backward: grad must have shape [N, C]");
   Gradients out(texels, uv, need_texels, need_uv);
   dispatch_floating("bilinear_interpolate_backward", texels, [&](auto zero) {
     using T = decltype(zero);
@@ -114,17 +114,7 @@ std::tuple<Tensor, Tensor> bilinear_interpolate_backward(Tensor grad, Tensor tex
 TriPlaneLayout checked_layout(const Tensor& texels, const Tensor& points, const Sizes& layout) {
   SPS_CHECK(texels.dim() == 2 && points.dim() == 2 && points.size(1) == 3,
             "tri_plane_interpolate: shapes must be [P, C], [N, 3]");
-  SPS_CHECK(layout.size() == 15, "tri_plane_interpolate: layout must have 15 numbers");
-  TriPlaneLayout out;
-  for (int plane = 0; plane < 3; ++plane) {
-    const std::int64_t* p = layout.data() + 5 * plane;
-    SPS_CHECK(p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[3] < INT32_MAX && p[4] < INT32_MAX &&
-                  p[0] + p[3] * p[4] <= texels.size(0),
-              "tri_plane_interpolate: layout must lie within the texels");
-    out.planes[plane] = {p[0], static_cast<std::int32_t>(p[1]), static_cast<std::int32_t>(p[2]),
-                         static_cast<std::int32_t>(p[3]), static_cast<std::int32_t>(p[4])};
-  }
-  return out;
+  return load_plane_layout("tri_plane_interpolate", layout, texels.size(0));
 }
 
 Tensor tri_plane_interpolate(Tensor texels, Tensor points, double cell_size, Sizes layout) {
@@ -148,7 +138,7 @@ std::tuple<Tensor, Tensor> tri_plane_interpolate_backward(Tensor grad, Tensor te
   grad = contiguous(grad);
   texels = contiguous(texels);
   points = contiguous(points);
-  SPS_CHECK(grad.numel() == points.size(0) * texels.size(1),
+  SPS_CHECK(has_shape(grad, {points.size(0), texels.size(1)}),
             "tri_plane_interpolate_backward: grad must have shape [N, C]");
   Gradients out(texels, points, need_texels, need_points);
   dispatch_floating("tri_plane_interpolate_backward", texels, [&](auto zero) {

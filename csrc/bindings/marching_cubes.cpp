@@ -7,9 +7,12 @@ namespace {
 
 // The third output says what is wrong with the coordinates: see MarchingCubesCounts.
 std::tuple<Tensor, Tensor, std::int64_t> marching_cubes(Tensor cell_coords, Tensor values, double level) {
-  SPS_CHECK(values.dim() == 4 && values.size(1) >= 2 && values.size(1) == values.size(2) &&
-                values.size(2) == values.size(3) && cell_coords.numel() == 3 * values.size(0),
+  constexpr std::int64_t kMaxSamples = 1025;  // an axis: a cell's samples are counted in 32 bits
+  SPS_CHECK(has_shape(values, {-1, -1, -1, -1}) && values.size(1) == values.size(2) &&
+                values.size(2) == values.size(3) && has_shape(cell_coords, {values.size(0), 3}),
             "marching_cubes: cell_coords and values must have shapes [M, 3] and [M, n + 1, n + 1, n + 1]");
+  SPS_CHECK(values.size(1) >= 2 && values.size(1) <= kMaxSamples, "marching_cubes: values must have 2 to ", kMaxSamples,
+            " samples an axis, got ", values.size(1));
   DeviceScope scope(values);
   cell_coords = contiguous(cell_coords);
   values = contiguous(values);

@@ -73,8 +73,12 @@ void optimize_map_(std::vector<Tensor> scene_tensors, std::vector<double> scene_
             ": records must have shape [F, P, 3] with P >= 1");
   SPS_CHECK(poses.dim() == 2 && poses.size(0) == records.size(0) && poses.size(1) == 7, kName,
             ": poses must have shape [F, 7]");
-  SPS_CHECK(frames.numel() >= 1 && num_pixels >= 1, kName, ": frames and num_pixels must not be empty");
-  SPS_CHECK(iterations >= 1 && first_step >= 1, kName, ": iterations and first_step must be at least 1");
+  SPS_CHECK(frames.dim() == 1 && frames.numel() >= 1, kName, ": frames must have shape [n] with n >= 1");
+  check_count(kName, "num_pixels", num_pixels);
+  check_count(kName, "iterations", iterations);
+  check_count(kName, "first_step", first_step);
+  to_int32(kName, "first_stamp", first_stamp);
+  to_int32(kName, "last stamp", first_stamp + iterations - 1);
   SPS_CHECK(rates.size() == 5, kName, ": rates must be five numbers");
   check_size(losses, kLossTerms * iterations, "losses");
   DeviceScope scope(poses);

@@ -9,8 +9,8 @@ void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, 
                   std::int64_t stamp, double lr, double beta1, double beta2, double eps, std::int64_t step) {
   DeviceScope scope(param);
   const std::int64_t count = param.numel();
-  SPS_CHECK(grad.numel() == count && exp_avg.numel() == count && exp_avg_sq.numel() == count,
-            "sparse_adam_: grad, exp_avg and exp_avg_sq must have as many entries as param");
+  SPS_CHECK(same_shape(grad, param) && same_shape(exp_avg, param) && same_shape(exp_avg_sq, param),
+            "sparse_adam_: grad, exp_avg and exp_avg_sq must have the shape of param");
   SPS_CHECK(step >= 1, "sparse_adam_: step must be at least 1, got ", step);
   if (count == 0) return;
   std::optional<Tensor> flat_stamps;
@@ -20,8 +20,9 @@ void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, 
   dispatch_floating("sparse_adam_", param, [&](auto zero) {
     using T = decltype(zero);
     sparse_adam(scope.context, AdamStep{lr, beta1, beta2, eps, step}, rows, count / rows,
-                flat_stamps.has_value() ? data<std::int32_t>(*flat_stamps) : nullptr, static_cast<std::int32_t>(stamp),
-                mutable_data<T>(param), mutable_data<T>(grad), mutable_data<T>(exp_avg), mutable_data<T>(exp_avg_sq));
+                flat_stamps.has_value() ? data<std::int32_t>(*flat_stamps) : nullptr,
+                to_int32("sparse_adam_", "stamp", stamp), mutable_data<T>(param), mutable_data<T>(grad),
+                mutable_data<T>(exp_avg), mutable_data<T>(exp_avg_sq));
   });
 }
 
@@ -29,8 +30,10 @@ std::tuple<Tensor, Tensor, Tensor> normal_equations(Tensor residuals, Tensor jac
   DeviceScope scope(residuals);
   SPS_CHECK(residuals.dim() == 2, "normal_equations: residuals must have shape [F, N]");
   const std::int64_t frames = residuals.size(0), count = residuals.size(1);
-  SPS_CHECK(jacobians.numel() == frames * count * 6 && weights.numel() == frames * count,
+  SPS_CHECK(has_shape(jacobians, {frames, count, 6}) && same_shape(weights, residuals),
             "normal_equations: jacobians and weights must fit residuals");
+  check_count("normal_equations", "frames", frames, 0);
+  check_count("normal_equations", "residuals of a frame", count, 0);
   residuals = contiguous(residuals);
   jacobians = contiguous(jacobians);
   weights = contiguous(weights);
@@ -49,7 +52,7 @@ std::tuple<Tensor, Tensor, Tensor> normal_equations(Tensor residuals, Tensor jac
 
 Tensor solve_normal_equations(Tensor hessian, Tensor gradient, double damping, double absolute_damping) {
   DeviceScope scope(hessian);
-  SPS_CHECK(gradient.dim() == 2 && gradient.size(1) == 6 && hessian.numel() == gradient.size(0) * 36,
+  SPS_CHECK(has_shape(gradient, {-1, 6}) && has_shape(hessian, {gradient.size(0), 6, 6}),
             "solve_normal_equations: hessian and gradient must have shapes [F, 6, 6] and [F, 6]");
   hessian = contiguous(hessian);
   gradient = contiguous(gradient);

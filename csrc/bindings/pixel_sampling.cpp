@@ -11,7 +11,7 @@ Tensor rows_of_three(const Tensor& like) {
 
 std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tensor pose, double fx, double fy,
                                             double cx, double cy) {
-  SPS_CHECK(records.numel() == 3 * records.size(0) && normals.numel() == records.numel() && pose.numel() == 7,
+  SPS_CHECK(has_shape(records, {-1, 3}) && same_shape(normals, records) && has_shape(pose, {7}),
             "unproject_pixels: records, normals and pose must have shapes [P, 3], [P, 3] and [7]");
   records = contiguous(records);
   normals = contiguous(normals);
@@ -35,7 +35,7 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
                                                      std::int64_t seed, std::int64_t stream, std::int64_t frame) {
   constexpr std::int64_t kMaxSide = 65535;  // a record has 16 bits a coordinate
   SPS_CHECK(depth.dim() == 2 && depth.size(0) <= kMaxSide && depth.size(1) <= kMaxSide &&
-                depth.numel() < (std::int64_t{1} << 31) && color.numel() == 3 * depth.numel(),
+                depth.numel() < (std::int64_t{1} << 31) && has_shape(color, {depth.size(0), depth.size(1), 3}),
             "sample_frame_pixels: depth and color must have shapes [H, W] and [H, W, 3], H and W below 2^16");
   SPS_CHECK(count >= 0 && count <= (std::int64_t{1} << 30) && step_px >= 1 && step_px <= kMaxSide &&
                 thumbnail_step >= 1 && thumbnail_step <= kMaxSide && depth_image_step >= 0 &&

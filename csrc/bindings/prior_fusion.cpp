@@ -13,8 +13,9 @@ void fuse_prior_(Tensor embeddings, Tensor weights, Tensor voxel_ids, Tensor fea
   features = contiguous(features);
   feature_weights = contiguous(feature_weights);
   const std::int64_t count = voxel_ids.numel();
-  SPS_CHECK(features.numel() == 8 * count && feature_weights.numel() == count && embeddings.dim() == 2 &&
-                embeddings.size(1) == 8 && weights.numel() == embeddings.size(0),
+  SPS_CHECK(has_shape(voxel_ids, {count}) && has_shape(features, {count, kPriorFeatures}) &&
+                has_shape(feature_weights, {count}) && has_shape(embeddings, {-1, kPriorFeatures}) &&
+                has_shape(weights, {embeddings.size(0)}),
             "fuse_prior_: embeddings and features must have 8 channels and a row a weight");
   DeviceScope scope(embeddings);
   fuse_prior(scope.context, data<std::int32_t>(voxel_ids), data<float>(features), data<float>(feature_weights), count,
@@ -24,6 +25,13 @@ void fuse_prior_(Tensor embeddings, Tensor weights, Tensor voxel_ids, Tensor fea
 
 Tensor depth_normals(Tensor depth, Tensor pixels, double fx, double fy, double cx, double cy, std::int64_t step_px,
                      double max_jump) {
+  constexpr std::int64_t kMaxStep = 65535;
+  SPS_CHECK(has_shape(depth, {-1, -1}) && has_shape(pixels, {-1, 2}),
+            "depth_normals: depth and pixels must have shapes [H, W] and [N, 2]");
+  check_count("depth_normals", "height", depth.size(0), 0);
+  check_count("depth_normals", "width", depth.size(1), 0);
+  SPS_CHECK(step_px >= 1 && step_px <= kMaxStep, "depth_normals: step_px must be in [1, ", kMaxStep, "], got ",
+            step_px);
   depth = contiguous(depth);
   pixels = contiguous(pixels);
   DeviceScope scope(depth);
@@ -36,6 +44,11 @@ Tensor depth_normals(Tensor depth, Tensor pixels, double fx, double fy, double c
   spslam::depth_normals(scope.context, image, data<std::int32_t>(pixels), pixels.size(0),
                         static_cast<std::int32_t>(step_px), static_cast<float>(max_jump), mutable_data<float>(normals));
   return normals;
+}
+
+void check_points(const char* function, const Tensor& points, const Tensor& normals) {
+  SPS_CHECK(has_shape(points, {-1, 3}) && same_shape(normals, points), function,
+            ": points and normals must have shape [N, 3]");
 }
 
 EncoderSettings checked_settings(const char* function, const Tensor& params, double voxel_size,
@@ -52,6 +65,7 @@ std::tuple<Tensor, Tensor, Tensor> encode_points(Tensor points, Tensor normals, 
                                                  bool tf32) {
   const EncoderSettings settings =
       checked_settings("encode_points", encoder_params, voxel_size, neighborhood, min_pair_weight, tf32);
+  check_points("encode_points", points, normals);
   points = contiguous(points);
   normals = contiguous(normals);
   encoder_params = contiguous(encoder_params);
@@ -73,13 +87,15 @@ FeatureVolume checked_volume(const Tensor& hash_keys, const Tensor& hash_values,
                              const Tensor& corner_ids, const Tensor& embeddings, const Tensor& weights,
                              std::int64_t num_voxels, std::int64_t max_voxels) {
   const std::int64_t rows = weights.numel(), slots = hash_keys.numel();
-  SPS_CHECK(voxel_coords.numel() == 3 * rows && corner_ids.numel() == 8 * rows && embeddings.numel() == 8 * rows,
+  SPS_CHECK(has_shape(weights, {rows}) && has_shape(voxel_coords, {rows, 3}) && has_shape(corner_ids, {rows, 8}) &&
+                has_shape(embeddings, {rows, kPriorFeatures}),
             "encode_frame_: the volume's tensors must have as many rows each");
   SPS_CHECK(slots >= 2 && (slots & (slots - 1)) == 0 && hash_values.numel() == slots,
             "encode_frame_: hash_keys must have a power of two of slots, got ", slots);
   SPS_CHECK(0 <= num_voxels && num_voxels <= max_voxels && max_voxels <= rows && max_voxels <= slots / 2,
             "encode_frame_: num_voxels, max_voxels and the volume's room must not decrease in this order, got ",
             num_voxels, ", ", max_voxels, " and ", rows);
+  to_int32("encode_frame_", "max_voxels", max_voxels);
   return {mutable_data<std::int64_t>(hash_keys),
           mutable_data<std::int32_t>(hash_values),
           slots,
@@ -106,6 +122,7 @@ std::int64_t encode_frame_(Tensor hash_keys, Tensor hash_values, Tensor voxel_co
       static_cast<float>(max_weight),
       fuse_known};
   SPS_CHECK(bounds.numel() == 6, "encode_frame_: bounds must have 6 numbers, got ", bounds.numel());
+  check_points("encode_frame_", points, normals);
   points = contiguous(points);
   normals = contiguous(normals);
   encoder_params = contiguous(encoder_params);
@@ -125,6 +142,7 @@ std::int64_t encode_frame_(Tensor hash_keys, Tensor hash_values, Tensor voxel_co
 }
 
 Tensor random_embeddings(Tensor voxel_coords, std::int64_t seed, double scale) {
+  SPS_CHECK(has_shape(voxel_coords, {-1, 3}), "random_embeddings: voxel_coords must have shape [M, 3]");
   voxel_coords = contiguous(voxel_coords);
   DeviceScope scope(voxel_coords);
   const Tensor embeddings = empty(voxel_coords, {voxel_coords.size(0), kPriorFeatures}, ScalarType::Float);

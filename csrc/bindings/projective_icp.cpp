@@ -10,10 +10,10 @@ std::tuple<Tensor, Tensor, Tensor> projective_icp(Tensor points, Tensor vertices
                                                   double max_distance, double kernel_start, double kernel_end,
                                                   double damping) {
   SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "projective_icp: points must have shape [N, 3]");
-  SPS_CHECK(vertices.dim() == 3 && vertices.size(2) == 3 && normals.numel() == vertices.numel(),
+  SPS_CHECK(has_shape(vertices, {-1, -1, 3}) && same_shape(normals, vertices),
             "projective_icp: vertices and normals must have shape [H, W, 3]");
   SPS_CHECK(pose.numel() == kPoseSize, "projective_icp: pose must have 7 elements");
-  SPS_CHECK(iterations >= 1, "projective_icp: iterations must be >= 1");
+  check_count("projective_icp", "iterations", iterations);
   DeviceScope scope(points);
   points = torch::stable::contiguous(points);
   vertices = torch::stable::contiguous(vertices);

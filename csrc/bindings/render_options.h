@@ -19,8 +19,8 @@ inline RenderOptions load_options(const char* function, std::int64_t num_uniform
                                   double far, double truncation, bool cosine_targets,
                                   const std::vector<double>& weights, const PhiloxKey& key, std::int64_t precision) {
   constexpr std::int64_t kMaxSamples = 1 << 16;
-  SPS_CHECK(num_uniform >= 0 && num_surface >= 0 && num_uniform + num_surface >= 1 &&
-                num_uniform + num_surface <= kMaxSamples,
+  SPS_CHECK(num_uniform >= 0 && num_uniform <= kMaxSamples && num_surface >= 0 && num_surface <= kMaxSamples &&
+                num_uniform + num_surface >= 1 && num_uniform + num_surface <= kMaxSamples,
             function, ": the samples of a ray must be from 1 to ", kMaxSamples);
   SPS_CHECK(weights.size() == 4, function, ": weights must be rgb, depth, free_space, sdf");
   SPS_CHECK(precision == 0 || precision == 1, function, ": precision must be 0 (tf32) or 1 (fp32)");

@@ -24,7 +24,9 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
                  OptionalTensor texel_stamps, OptionalTensor grad_geometry, OptionalTensor grad_color,
                  std::int64_t stamp, std::int64_t precision) {
   const std::int64_t num_rays = ray_frames.numel();
-  SPS_CHECK(pixels.numel() == 3 * num_rays, "render_step: pixels must have shape [R, 3]");
+  SPS_CHECK(has_shape(ray_frames, {num_rays}) && has_shape(pixels, {num_rays, 3}),
+            "render_step: ray_frames and pixels must have shapes [R] and [R, 3]");
+  check_count("render_step", "rays", num_rays, 0);
   SPS_CHECK(poses.dim() == 2 && poses.size(1) == 7, "render_step: poses must have shape [F, 7]");
   DeviceScope scope(losses);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
@@ -51,7 +53,7 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
       output<std::int32_t>(texel_stamps, num_texels, "texel_stamps"),
       output<float>(grad_geometry, kGeometryDecoder.num_params(), "grad_geometry"),
       output<float>(grad_color, kColorDecoder.num_params(), "grad_color"),
-      static_cast<std::int32_t>(stamp)};
+      to_int32("render_step", "stamp", stamp)};
   const std::int64_t bytes = render_step_workspace_size(scope.context, view, rays, options, gradients);
   Tensor workspace = empty(losses, {bytes}, ScalarType::Byte);
   spslam::render_step(scope.context, view, rays, options, gradients, workspace.mutable_data_ptr());

@@ -12,7 +12,9 @@ namespace spslam::bindings {
 namespace {
 
 void set_num_threads_op(std::int64_t count) {
-  SPS_CHECK(count >= 1, "set_num_threads: count must be at least 1, got ", count);
+  constexpr std::int64_t kMaxThreads = 4096;
+  SPS_CHECK(count >= 1 && count <= kMaxThreads, "set_num_threads: count must be in [1, ", kMaxThreads, "], got ",
+            count);
   spslam::set_num_threads(static_cast<int>(count));
 }
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "bindings/common.h"
+#include "bindings/plane_layout.h"
 #include "spslam/scene_view.h"
 
 namespace spslam::bindings {
@@ -14,17 +15,17 @@ class SceneArgument {
  public:
   SceneArgument(const std::vector<Tensor>& tensors, const std::vector<double>& scalars,
                 const std::vector<std::int64_t>& layout) {
-    SPS_CHECK(tensors.size() == 7 && scalars.size() == 6 && layout.size() == 15,
-              "spslam: a scene must be 7 tensors, 6 scalars and 15 integers");
+    SPS_CHECK(tensors.size() == 7 && scalars.size() == 6, "spslam: a scene must be 7 tensors and 6 scalars");
     for (const Tensor& tensor : tensors) tensors_.push_back(torch::stable::contiguous(tensor));
     const Tensor &keys = tensors_[0], &values = tensors_[1], &corners = tensors_[2], &embeddings = tensors_[3],
                  &geometry = tensors_[4], &texels = tensors_[5], &color = tensors_[6];
     const std::int64_t capacity = keys.numel();
     SPS_CHECK(capacity > 0 && (capacity & (capacity - 1)) == 0 && values.numel() == capacity,
               "spslam: hash_keys and hash_values must have the same power of two of elements");
-    view.num_voxels = embeddings.numel() / kEmbeddingChannels;
-    SPS_CHECK(corners.numel() == kCellCorners * view.num_voxels,
-              "spslam: corner_ids and embeddings must have the same rows");
+    view.num_voxels = corners.dim() == 2 ? corners.size(0) : -1;
+    SPS_CHECK(has_shape(corners, {-1, kCellCorners}) && has_shape(embeddings, {view.num_voxels, kEmbeddingChannels}),
+              "spslam: corner_ids and embeddings must have shapes [V, 8]");
+    SPS_CHECK(has_shape(texels, {-1, kPlaneChannels}), "spslam: texels must have shape [P, 32]");
     SPS_CHECK(geometry.numel() == kGeometryDecoder.num_params() && color.numel() == kColorDecoder.num_params(),
               "spslam: decoder parameters of the wrong length");
     view.table = {data<std::int64_t>(keys), data<std::int32_t>(values), capacity - 1};
@@ -37,22 +38,12 @@ class SceneArgument {
     for (int k = 0; k < 3; ++k) view.origin[k] = static_cast<float>(scalars[1 + k]);
     view.position_scale = static_cast<float>(scalars[4]);
     view.plane_cell_size = static_cast<float>(scalars[5]);
-    load_layout(layout, texels.numel() / kPlaneChannels);
+    view.planes = load_plane_layout("spslam", layout, texels.size(0));
   }
 
   SceneView view;
 
  private:
-  void load_layout(const std::vector<std::int64_t>& layout, std::int64_t rows) {
-    for (int plane = 0; plane < 3; ++plane) {
-      const std::int64_t* p = layout.data() + 5 * plane;
-      SPS_CHECK(p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[0] + p[3] * p[4] <= rows,
-                "spslam: plane_layout must lie within texels");
-      view.planes.planes[plane] = {p[0], static_cast<std::int32_t>(p[1]), static_cast<std::int32_t>(p[2]),
-                                   static_cast<std::int32_t>(p[3]), static_cast<std::int32_t>(p[4])};
-    }
-  }
-
   std::vector<Tensor> tensors_;
 };
 

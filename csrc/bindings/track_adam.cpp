@@ -17,7 +17,8 @@ std::tuple<Tensor, Tensor> track_adam(std::vector<Tensor> scene_tensors, std::ve
   SPS_CHECK(records.dim() == 2 && records.size(0) >= 1 && records.size(1) == 3, kName,
             ": records must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == 7, kName, ": pose must have 7 elements");
-  SPS_CHECK(num_pixels >= 1 && iterations >= 1, kName, ": num_pixels and iterations must be at least 1");
+  check_count(kName, "num_pixels", num_pixels);
+  check_count(kName, "iterations", iterations);
   DeviceScope scope(pose);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   records = contiguous(records);

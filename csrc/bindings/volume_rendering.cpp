@@ -25,13 +25,14 @@ struct Samples {
   }
 };
 
-void check_numel(const char* function, const Tensor& tensor, std::int64_t numel) {
-  SPS_CHECK(tensor.numel() == numel, function, ": a tensor has ", tensor.numel(), " elements instead of ", numel);
+void check_shape(const char* function, const char* argument, const Tensor& tensor,
+                 std::initializer_list<std::int64_t> shape) {
+  SPS_CHECK(has_shape(tensor, shape), function, ": ", argument, " must fit the shape of sdf");
 }
 
 std::tuple<Tensor, Tensor, Tensor> volume_render(Tensor sdf, Tensor color, Tensor t, Tensor valid, double truncation) {
   const Samples samples("volume_render", sdf, t, valid);
-  check_numel("volume_render", color, 3 * sdf.numel());
+  check_shape("volume_render", "color", color, {samples.rays(), samples.count(), 3});
   DeviceScope scope(sdf);
   color = contiguous(color);
   const ScalarType dtype = sdf.scalar_type();
@@ -50,11 +51,11 @@ std::tuple<Tensor, Tensor, Tensor> volume_render_backward(Tensor grad_color, Ten
                                                           Tensor t, Tensor valid, Tensor weights, double truncation) {
   const char* name = "volume_render_backward";
   const Samples samples(name, sdf, t, valid);
-  check_numel(name, color, 3 * sdf.numel());
-  check_numel(name, weights, sdf.numel());
-  check_numel(name, grad_color, 3 * samples.rays());
-  check_numel(name, grad_depth, samples.rays());
-  if (grad_weights) check_numel(name, *grad_weights, sdf.numel());
+  check_shape(name, "color", color, {samples.rays(), samples.count(), 3});
+  check_shape(name, "weights", weights, {samples.rays(), samples.count()});
+  check_shape(name, "grad_color", grad_color, {samples.rays(), 3});
+  check_shape(name, "grad_depth", grad_depth, {samples.rays()});
+  if (grad_weights) check_shape(name, "grad_weights", *grad_weights, {samples.rays(), samples.count()});
   DeviceScope scope(sdf);
   color = contiguous(color);
   weights = contiguous(weights);
@@ -82,9 +83,12 @@ struct Targets {
   bool cosine_targets;
 
   void make_contiguous(const char* function, std::int64_t rays) {
-    check_numel(function, color, 3 * rays);
-    check_numel(function, target_color, 3 * rays);
-    for (Tensor* tensor : {&depth, &rendered, &target_depth, &cosine}) check_numel(function, *tensor, rays);
+    check_shape(function, "color", color, {rays, 3});
+    check_shape(function, "target_color", target_color, {rays, 3});
+    check_shape(function, "depth", depth, {rays});
+    check_shape(function, "rendered", rendered, {rays});
+    check_shape(function, "target_depth", target_depth, {rays});
+    check_shape(function, "cosine", cosine, {rays});
     for (Tensor* tensor : {&color, &depth, &rendered, &target_color, &target_depth, &cosine}) {
       *tensor = contiguous(*tensor);
     }
@@ -121,7 +125,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rendering_losses_backward(Tensor grad
                                                                      double truncation, bool cosine_targets) {
   const char* name = "rendering_losses_backward";
   const Samples samples(name, sdf, t, valid);
-  check_numel(name, grad, 4);
+  SPS_CHECK(has_shape(grad, {4}), name, ": grad must have shape [4]");
   DeviceScope scope(sdf);
   Targets targets{color, depth, rendered, target_color, target_depth, cosine, truncation, cosine_targets};
   targets.make_contiguous(name, samples.rays());

@@ -1,11 +1,12 @@
 #include "core/parallel.h"
 
-#include <unistd.h>
+#include <pthread.h>
 
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <mutex>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -20,7 +21,7 @@ namespace {
 // up.
 class ThreadPool {
  public:
-  ~ThreadPool() { stop(); }
+  explicit ThreadPool(int count) : count_(count) {}
 
   void resize(int count) {
     std::lock_guard<std::mutex> running(loop_mutex_);
@@ -65,30 +66,25 @@ class ThreadPool {
   static constexpr int kSpins = 4000;
 
   void start() {
-    if (owner_ != getpid()) {  // the threads of the parent do not exist in a forked child
-      for (std::thread& worker : workers_) worker.detach();
-      workers_.clear();
-      owner_ = getpid();
-    }
     if (!workers_.empty()) return;
     stopping_ = false;
     const std::uint32_t seen = loop_.generation;
-    for (int i = 1; i < count_; ++i) workers_.emplace_back([this, seen] { work(seen); });
+    try {
+      for (int i = 1; i < count_; ++i) workers_.emplace_back([this, seen] { work(seen); });
+    } catch (const std::system_error&) {
+      // The system gives no more threads: the loop runs on those there are, the caller at least.
+    }
   }
 
   void stop() {
-    if (owner_ == getpid()) {
-      {
-        std::lock_guard<std::mutex> lock(mutex_);
-        stopping_ = true;
-        loop_ = Loop{loop_.generation + 1, 0, nullptr, nullptr};
-        next_.store(static_cast<std::uint64_t>(loop_.generation) << kChunkBits, std::memory_order_release);
-      }
-      wake_.notify_all();
-      for (std::thread& worker : workers_) worker.join();
-    } else {
-      for (std::thread& worker : workers_) worker.detach();
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      stopping_ = true;
+      loop_ = Loop{loop_.generation + 1, 0, nullptr, nullptr};
+      next_.store(static_cast<std::uint64_t>(loop_.generation) << kChunkBits, std::memory_order_release);
     }
+    wake_.notify_all();
+    for (std::thread& worker : workers_) worker.join();
     workers_.clear();
   }
 
@@ -149,8 +145,7 @@ class ThreadPool {
 #endif
   }
 
-  int count_ = static_cast<int>(std::thread::hardware_concurrency() ? std::thread::hardware_concurrency() : 1);
-  pid_t owner_ = getpid();
+  std::atomic<int> count_;
   std::vector<std::thread> workers_;
   std::mutex loop_mutex_, mutex_;
   std::condition_variable wake_, finished_;
@@ -163,11 +158,32 @@ class ThreadPool {
 
 thread_local bool ThreadPool::inside_loop_ = false;
 
-// Never destroyed: joining threads while the process's other static objects go away is a known way to hang at exit.
-ThreadPool& pool() {
-  static ThreadPool* instance = new ThreadPool;
-  return *instance;
+int default_count() {
+  const unsigned cores = std::thread::hardware_concurrency();
+  return cores ? static_cast<int>(cores) : 1;
 }
+
+// Made at the first use. Without the lock of a static local variable, which another thread may hold at a fork. Never
+// destroyed: joining threads while the process's other static objects go away is a known way to hang at exit.
+std::atomic<ThreadPool*> current_pool{nullptr};
+
+ThreadPool& pool() {
+  ThreadPool* existing = current_pool.load(std::memory_order_acquire);
+  if (existing) return *existing;
+  ThreadPool* const made = new ThreadPool(default_count());
+  if (current_pool.compare_exchange_strong(existing, made, std::memory_order_acq_rel)) return *made;
+  delete made;
+  return *existing;
+}
+
+// A forked child has a copy of the pool but none of its threads, and its locks as they were at that moment, held by
+// whoever ran a loop. So the child gets a pool of its own and never touches the copy, which is not freed.
+void renew_pool_in_child() {
+  const ThreadPool* parents = current_pool.load(std::memory_order_acquire);
+  if (parents) current_pool.store(new ThreadPool(parents->size()), std::memory_order_release);
+}
+
+[[maybe_unused]] const int fork_handler = pthread_atfork(nullptr, nullptr, renew_pool_in_child);
 
 }  // namespace
 

@@ -83,8 +83,10 @@ inline void find_cells(const SceneView& scene, Chunk& chunk) {
   const VoxelTable& table = scene.table;
   for (std::int64_t c = 0; c < chunk.num_cells; ++c) {
     ChunkCell& cell = chunk.cells[c];
+    const std::int64_t first = cell.slot;
     while (table.keys[cell.slot] != cell.key && table.keys[cell.slot] != kEmptyVoxelKey) {
       cell.slot = (cell.slot + 1) & table.mask;
+      if (cell.slot == first) break;  // a table without an empty slot
     }
     const bool found = table.keys[cell.slot] == cell.key;
     cell.voxel_id = found ? 0 : kNoVoxel;

@@ -59,8 +59,11 @@ __device__ void enter_voxel(const FeatureVolume& volume, std::int64_t key, std::
   unsigned long long* keys = reinterpret_cast<unsigned long long*>(volume.hash_keys);
   constexpr unsigned long long kEmpty = static_cast<unsigned long long>(kEmptyVoxelKey);
   std::int64_t slot = voxel_slot(key, mask);
-  while (atomicCAS(keys + slot, kEmpty, static_cast<unsigned long long>(key)) != kEmpty) slot = (slot + 1) & mask;
-  volume.hash_values[slot] = id;
+  for (std::int64_t probes = 0; probes < volume.hash_capacity; ++probes, slot = (slot + 1) & mask) {
+    if (atomicCAS(keys + slot, kEmpty, static_cast<unsigned long long>(key)) != kEmpty) continue;
+    volume.hash_values[slot] = id;
+    break;
+  }
   const VoxelCoord coord = unpack_voxel(key);
   std::int32_t* row = volume.voxel_coords + 3 * static_cast<std::int64_t>(id);
   row[0] = coord.x;
@@ -113,7 +116,7 @@ __device__ void update_corner_row_together(const FuseFrame& frame, std::int32_t 
   const bool new_before = __ballot_sync(together, corner < k && own >= first_new) != 0;
   const std::int32_t row = __shfl_sync(together, own, first_lane);
   // A new vertex writes its own row, and older ones that it completes and of which it is the first new corner.
-  if (k != 0 && (!complete || new_before)) return;
+  if (row == kNoVoxel || (k != 0 && (!complete || new_before))) return;
   frame.volume.corner_ids[static_cast<std::int64_t>(kCellCorners) * row + corner] = complete ? own : kNoVoxel;
 }
 

@@ -12,7 +12,7 @@ constexpr std::uint64_t kNotAbsent = ~std::uint64_t{0};
 
 struct Counters {
   std::int64_t unique;
-  unsigned long long out_of_range;
+  unsigned long long out_of_range, empty_slots;
   std::uint64_t last;
 };
 
@@ -41,6 +41,17 @@ struct Workspace {
   std::size_t scratch_bytes, total_bytes;
 };
 
+// Adds the empty slots of a table to `count`, one addition for every kSlotsPerThread slots.
+void count_empty_slots(Cuda device, const std::int64_t* hash_keys, std::int64_t capacity, unsigned long long* count) {
+  constexpr std::int64_t kSlotsPerThread = 64;
+  const std::int64_t threads = (capacity + kSlotsPerThread - 1) / kSlotsPerThread;
+  for_each(device, threads, [=] __device__(std::int64_t i) {
+    unsigned long long empty = 0;
+    for (std::int64_t slot = i; slot < capacity; slot += threads) empty += hash_keys[slot] == kEmptyVoxelKey;
+    atomicAdd(count, empty);
+  });
+}
+
 }  // namespace
 
 template <>
@@ -52,7 +63,7 @@ template <>
 AbsentVoxels voxel_hash_absent<Cuda>(Cuda device, const std::int64_t* hash_keys, const std::int32_t* hash_values,
                                      std::int64_t capacity, const std::int32_t* voxel_coords, std::int64_t n,
                                      void* workspace, std::int64_t* absent_keys) {
-  if (n == 0) return {0, 0};
+  if (n == 0) return {0, 0, 0};
   const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
   const Workspace space(workspace, n);
   SPS_CUDA_CHECK(cudaMemsetAsync(space.counters, 0, sizeof(Counters), stream));
@@ -70,12 +81,14 @@ AbsentVoxels voxel_hash_absent<Cuda>(Cuda device, const std::int64_t* hash_keys,
   bytes = space.scratch_bytes;
   SPS_CUDA_CHECK(cub::DeviceSelect::Unique(
       space.scratch, bytes, space.sorted, reinterpret_cast<std::uint64_t*>(absent_keys), &counters->unique, n, stream));
+  count_empty_slots(device, hash_keys, capacity, &counters->empty_slots);
   const std::uint64_t* sorted = space.sorted;
   for_each(device, 1, [=] __device__(std::int64_t) { counters->last = sorted[n - 1]; });
   Counters host;
   SPS_CUDA_CHECK(cudaMemcpyAsync(&host, counters, sizeof(host), cudaMemcpyDeviceToHost, stream));
   SPS_CUDA_CHECK(cudaStreamSynchronize(stream));
-  return {host.unique - (host.last == kNotAbsent), static_cast<std::int64_t>(host.out_of_range)};
+  return {host.unique - (host.last == kNotAbsent), static_cast<std::int64_t>(host.out_of_range),
+          static_cast<std::int64_t>(host.empty_slots)};
 }
 
 template <>
@@ -86,10 +99,11 @@ void voxel_hash_assign<Cuda>(Cuda device, std::int64_t* hash_keys, std::int32_t*
   for_each(device, n, [=] __device__(std::int64_t i) {
     const unsigned long long key = static_cast<unsigned long long>(keys[i]);
     std::int64_t slot = voxel_slot(keys[i], mask);
-    while (atomicCAS(reinterpret_cast<unsigned long long*>(hash_keys) + slot, kEmpty, key) != kEmpty) {
-      slot = (slot + 1) & mask;
+    for (std::int64_t probes = 0; probes < capacity; ++probes, slot = (slot + 1) & mask) {
+      if (atomicCAS(reinterpret_cast<unsigned long long*>(hash_keys) + slot, kEmpty, key) != kEmpty) continue;
+      hash_values[slot] = first_id + static_cast<std::int32_t>(i);
+      return;
     }
-    hash_values[slot] = first_id + static_cast<std::int32_t>(i);
   });
 }
 

@@ -55,13 +55,18 @@ SPS_INLINE std::int64_t voxel_slot(std::int64_t key, std::int64_t mask) {
   return static_cast<std::int64_t>(h >> 32) & mask;
 }
 
-// Id of a packed coordinate, or kNoVoxel. Ends because a table is at most half full.
+// Id of a packed coordinate, or kNoVoxel. In a table that is at most half full, as all should be, a probe soon meets an
+// empty slot; in one without any it ends where it began.
 SPS_INLINE std::int32_t find_voxel_key(const VoxelTable& table, std::int64_t key) {
-  for (std::int64_t slot = voxel_slot(key, table.mask);; slot = (slot + 1) & table.mask) {
+  const std::int64_t first = voxel_slot(key, table.mask);
+  std::int64_t slot = first;
+  do {
     const std::int64_t found = table.keys[slot];
     if (found == key) return table.values[slot];
     if (found == kEmptyVoxelKey) return kNoVoxel;
-  }
+    slot = (slot + 1) & table.mask;
+  } while (slot != first);
+  return kNoVoxel;
 }
 
 // Id of a coordinate, or kNoVoxel where it is absent or out of range.

@@ -23,6 +23,7 @@ from spslam.ops.track_adam import track_adam
 from spslam.ops.volume_rendering import rendering_losses, volume_render
 from spslam.ops.voxel_hash import (
     new_voxel_hash,
+    voxel_hash_absent,
     voxel_hash_build_,
     voxel_hash_find,
     voxel_hash_insert,
@@ -93,6 +94,7 @@ __all__ = [
     "trilinear_interpolate",
     "unproject_pixels",
     "volume_render",
+    "voxel_hash_absent",
     "voxel_hash_build_",
     "voxel_hash_find",
     "voxel_hash_insert",

@@ -8,8 +8,12 @@ import pathlib
 
 import torch
 
+from spslam.ops._checks import check
+from spslam.ops._public import public_op
+
 _FOLDER = pathlib.Path(__file__).resolve().parent.parent
 _LIBRARY_OF_ISA = {"avx512": "_ops_cpu_avx512.so", "avx2": "_ops_cpu_avx2.so", "baseline": "_ops_cpu.so"}
+_MAX_THREADS = 4096
 _ISAS_OF_CAPABILITY = {"AVX512": ("avx512", "avx2", "baseline"), "AVX2": ("avx2", "baseline")}
 
 
@@ -57,24 +61,26 @@ CPU_ISA: str = _load_cpu()
 CUDA_OFF_REASON: str | None = _load_cuda()
 
 
+@public_op()
 def set_num_threads(count: int) -> None:
     """Lets the CPU kernels use `count` threads, the calling one included. Results do not depend on it.
 
     At import it is torch's number of threads. Not to be called while another thread runs a kernel.
 
     Args:
-        count: at least 1.
+        count: 1 to 4096. Where the system gives fewer, kernels run on those there are.
 
     Raises:
-        ValueError: `count` below 1.
+        TypeError: `count` is no integer.
+        ValueError: `count` out of range.
 
     Example:
         >>> set_num_threads(2)
         >>> get_num_threads()
         2
     """
-    if count < 1:
-        raise ValueError(f"set_num_threads: count must be at least 1, got {count}")
+    check(count >= 1, "set_num_threads", "count", "be at least 1", count)
+    check(count <= _MAX_THREADS, "set_num_threads", "count", f"be at most {_MAX_THREADS}", count)
     torch.ops.spslam.set_num_threads(count)
 
 
@@ -88,4 +94,4 @@ def get_num_threads() -> int:
     return torch.ops.spslam.get_num_threads()
 
 
-set_num_threads(torch.get_num_threads())
+set_num_threads(min(torch.get_num_threads(), _MAX_THREADS))

@@ -8,10 +8,12 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.ray_sampling import Stream
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
+@public_op(as_given=("depth_thumbnails",))
 def frame_overlap(
     points: torch.Tensor,
     poses: torch.Tensor,
@@ -48,6 +50,7 @@ def frame_overlap(
     return torch.ops.spslam.frame_overlap(points, poses, depth_thumbnails, list(intrinsics), thumbnail_step)
 
 
+@public_op(as_given=("depth_thumbnails",))
 def select_covisible_frames(
     records: torch.Tensor,
     current: int,

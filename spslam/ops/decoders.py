@@ -5,8 +5,9 @@ from enum import IntEnum
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._autograd import forbid_second_derivatives
+from spslam.ops._autograd import register_gradient
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
 
@@ -18,6 +19,7 @@ class Activation(IntEnum):
     SIGMOID = 2
 
 
+@public_op()
 def mlp_num_params(inputs: int, hidden: int, outputs: int) -> int:
     """Length of the flat parameter vector of `mlp`: H (I + 1) + H (H + 1) + O (H + 1).
 
@@ -33,6 +35,7 @@ def mlp_num_params(inputs: int, hidden: int, outputs: int) -> int:
     return hidden * (inputs + 1) + hidden * (hidden + 1) + outputs * (hidden + 1)
 
 
+@public_op()
 def mlp(
     input: torch.Tensor, params: torch.Tensor, hidden: int, output: int, activation: int = Activation.NONE
 ) -> torch.Tensor:
@@ -98,7 +101,6 @@ def _mlp_backward(ctx, grad):
     return grad_input if need_input else None, grad_params if need_params else None, None, None, None
 
 
-torch.library.register_autograd("spslam::mlp", _mlp_backward, setup_context=_setup_context)
-forbid_second_derivatives("mlp")
+register_gradient("mlp", _mlp_backward, _setup_context)
 register_rows_vmap("mlp", (0,))
 register_each_vmap("mlp_backward")

@@ -7,6 +7,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, FEATURES
 
 
@@ -95,6 +96,7 @@ class EncodedFrame(NamedTuple):
     bounds: torch.Tensor
 
 
+@public_op()
 def encode_frame_(
     volume: VolumeBuffers,
     num_voxels: int,

@@ -23,10 +23,12 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.earlier_frames import DepthKeyframes, ReferenceImage
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 
+@public_op()
 def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     """The pose after two given ones at constant speed, T1 T0^-1 T1; reads nothing back to the host.
 
@@ -115,6 +117,7 @@ class GaussNewtonOptions:
 _ITERATIONS = 1  # among the integers
 
 
+@public_op()
 def track_gauss_newton(
     scene: SceneView,
     pixels: torch.Tensor,
@@ -185,6 +188,7 @@ def track_gauss_newton(
     )
 
 
+@public_op()
 def gauss_newton_poses(
     scene: SceneView,
     pixels: torch.Tensor,

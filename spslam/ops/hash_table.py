@@ -2,8 +2,10 @@
 
 import torch
 
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.voxel_hash import (
+    absent_voxels,
     new_voxel_hash,
     voxel_hash_build_,
     voxel_hash_find,
@@ -63,6 +65,7 @@ class VoxelHash:
         tensor([[0.2500]])
     """
 
+    @public_op(name="VoxelHash")
     def __init__(self, capacity: int = 1024, device: torch.device | str = "cpu", max_voxels: int | None = None):
         check(capacity >= 1, "VoxelHash", "capacity", "be at least 1", capacity)
         check(max_voxels is None or max_voxels >= 1, "VoxelHash", "max_voxels", "be at least 1", max_voxels)
@@ -105,15 +108,9 @@ class VoxelHash:
             VoxelLimitError: more than `max_voxels` would exist. The set is then as before.
             RuntimeError: a coordinate out of range. The set is then as before.
         """
-        voxel_ids = self.find(voxel_coords)
-        absent = voxel_coords[voxel_ids < 0]
-        if absent.shape[0] == 0:
-            return voxel_ids
-        self.reserve(self._voxels_with(absent))
-        new = voxel_hash_insert(self.hash_keys, self.hash_values, absent, self.num_voxels)
-        first_new, self.num_voxels = self.num_voxels, self.num_voxels + new.shape[0]
-        self.coords_buffer[first_new : self.num_voxels] = new
-        voxel_hash_update_corner_ids(self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, first_new)
+        new = absent_voxels("VoxelHash.insert", self.hash_keys, self.hash_values, voxel_coords)
+        if new.shape[0] > 0:
+            self._enter(new)
         return self.find(voxel_coords)
 
     def build(self, voxel_coords: torch.Tensor) -> None:
@@ -147,12 +144,17 @@ class VoxelHash:
 
     def find(self, voxel_coords: torch.Tensor) -> torch.Tensor:
         """Ids int32 [N] of coordinates int32 [N, 3], -1 where absent; see `voxel_hash_find`."""
+        check_tensor("VoxelHash.find", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=self.hash_keys)
         return voxel_hash_find(self.hash_keys, self.hash_values, voxel_coords)
 
+    @public_op(name="VoxelHash.lookup")
     def lookup(self, points: torch.Tensor, voxel_size: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Corner ids int32 [N, 8] and local coordinates [N, 3] of points [N, 3] (m); see `voxel_hash_lookup`."""
+        check_tensor("VoxelHash.lookup", "points", points, ["N", 3], FLOATING, like=self.hash_keys)
+        check(voxel_size > 0, "VoxelHash.lookup", "voxel_size", "be positive", voxel_size)
         return voxel_hash_lookup(self.hash_keys, self.hash_values, self.corner_ids, points, voxel_size)
 
+    @public_op(name="VoxelHash.reserve")
     def reserve(self, rows: int) -> None:
         """Makes room for `rows` vertices, the next power of two of them; the ids and their rows stay.
 
@@ -175,13 +177,14 @@ class VoxelHash:
         if self.max_voxels is not None and rows > self.max_voxels:
             raise VoxelLimitError(rows, self.max_voxels)
 
-    def _voxels_with(self, absent: torch.Tensor) -> int:
-        """Voxels after an insertion, or a bound of it that needs no more room: repetitions are counted once only where
-        it matters."""
-        bound = self.num_voxels + absent.shape[0]
-        if bound <= self.capacity and (self.max_voxels is None or bound <= self.max_voxels):
-            return bound
-        return self.num_voxels + torch.unique(absent, dim=0).shape[0]
+    def _enter(self, new: torch.Tensor) -> None:
+        """Gives the next ids to coordinates that are distinct, sorted and absent."""
+        first_new = self.num_voxels
+        self.reserve(first_new + new.shape[0])
+        voxel_hash_insert(self.hash_keys, self.hash_values, new, first_new)
+        self.num_voxels = first_new + new.shape[0]
+        self.coords_buffer[first_new : self.num_voxels] = new
+        voxel_hash_update_corner_ids(self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, first_new)
 
     def _clear(self) -> None:
         self.num_voxels = 0

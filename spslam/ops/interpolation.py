@@ -11,11 +11,15 @@ from collections.abc import Sequence
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._autograd import forbid_second_derivatives
+from spslam.ops._autograd import register_gradient
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
+_FARTHEST_TEXEL = 2**30
 
+
+@public_op()
 def trilinear_interpolate(
     embeddings: torch.Tensor, corner_ids: torch.Tensor, local_coords: torch.Tensor
 ) -> torch.Tensor:
@@ -49,6 +53,7 @@ def trilinear_interpolate(
     return torch.ops.spslam.trilinear_interpolate(embeddings, corner_ids, local_coords)
 
 
+@public_op()
 def bilinear_interpolate(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
     """Values of an image or plane between its texels.
 
@@ -77,6 +82,7 @@ def bilinear_interpolate(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor
     return torch.ops.spslam.bilinear_interpolate(texels, uv)
 
 
+@public_op()
 def tri_plane_interpolate(
     texels: torch.Tensor, points: torch.Tensor, cell_size: float, layout: Sequence[int]
 ) -> torch.Tensor:
@@ -111,13 +117,15 @@ def tri_plane_interpolate(
     return torch.ops.spslam.tri_plane_interpolate(texels, points, cell_size, list(layout))
 
 
-def check_plane_layout(function: str, layout: Sequence[int], num_rows: int) -> None:
+def check_plane_layout(function: str, layout: Sequence[int], num_rows: int, argument: str = "layout") -> None:
     """Checks that a tri-plane layout is 15 integers that stay inside a table of `num_rows` texels."""
-    check(len(layout) == 15, function, "layout", "have 15 numbers", len(layout))
+    check(len(layout) == 15, function, argument, "have 15 numbers", len(layout))
     for plane in range(3):
-        offset, _, _, size_u, size_v = layout[5 * plane : 5 * plane + 5]
+        offset, origin_u, origin_v, size_u, size_v = numbers = list(layout[5 * plane : 5 * plane + 5])
         fits = offset >= 0 and size_u >= 0 and size_v >= 0 and offset + size_u * size_v <= num_rows
-        check(fits, function, "layout", f"lie within the {num_rows} texels", list(layout[5 * plane : 5 * plane + 5]))
+        check(fits, function, argument, f"lie within the {num_rows} texels", numbers)
+        near = max(abs(origin_u), abs(origin_v), size_u, size_v) <= _FARTHEST_TEXEL
+        check(near, function, argument, "have origins and sizes within 2^30", numbers)
 
 
 @torch.library.register_fake("spslam::trilinear_interpolate")
@@ -199,7 +207,6 @@ for _op, _save, _backward, _rows in (
     ("bilinear_interpolate", _save_bilinear, _bilinear_backward, (1,)),
     ("tri_plane_interpolate", _save_tri_plane, _tri_plane_backward, (1,)),
 ):
-    torch.library.register_autograd(f"spslam::{_op}", _backward, setup_context=_save)
-    forbid_second_derivatives(_op)
+    register_gradient(_op, _backward, _save)
     register_rows_vmap(_op, _rows)
     register_each_vmap(f"{_op}_backward")

@@ -4,10 +4,12 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 
 _OUT_OF_RANGE = 1  # kCoordOutOfRange in csrc/include/spslam/marching_cubes.h
 
 
+@public_op()
 def marching_cubes(
     cell_coords: torch.Tensor, values: torch.Tensor, level: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:

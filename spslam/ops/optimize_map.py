@@ -6,6 +6,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import Stream
 from spslam.ops.render_step import RenderOptions
@@ -93,6 +94,7 @@ class MapMoments:
 _PARAMETERS = ("embeddings", "texels", "geometry_params", "color_params", "poses")
 
 
+@public_op(as_given=("param",))
 def new_gradient_sums(param: torch.Tensor) -> torch.Tensor:
     """Zeros for the sums of a parameter's gradients.
 
@@ -115,6 +117,7 @@ def new_gradient_sums(param: torch.Tensor) -> torch.Tensor:
     return torch.zeros(param.shape, dtype=_gradient_dtype(param.device), device=param.device)
 
 
+@public_op(as_given=("poses",))
 def optimize_map_(
     scene: SceneView,
     records: torch.Tensor,

@@ -4,9 +4,11 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_rows_vmap
 
 
+@public_op(as_given=("param", "grad", "exp_avg", "exp_avg_sq"))
 def sparse_adam_(
     param: torch.Tensor,
     grad: torch.Tensor,
@@ -73,6 +75,7 @@ def sparse_adam_(
         )
 
 
+@public_op()
 def normal_equations(
     residuals: torch.Tensor, jacobians: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -107,6 +110,7 @@ def normal_equations(
         return torch.ops.spslam.normal_equations(residuals, jacobians, weights)
 
 
+@public_op()
 def solve_normal_equations(
     hessian: torch.Tensor, gradient: torch.Tensor, damping: float = 0.0, absolute_damping: float = 0.0
 ) -> torch.Tensor:

@@ -6,6 +6,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 
 _MAX_SIDE = 2**16 - 1  # a record has 16 bits a coordinate
 _MAX_COUNT = 2**30
@@ -47,6 +48,7 @@ def _depth_image_size(size: int, step: int) -> int:
     return -(-size // step) if step > 0 else 0
 
 
+@public_op()
 def sample_frame_pixels(
     depth: torch.Tensor,
     color: torch.Tensor,
@@ -138,6 +140,7 @@ def sample_frame_pixels(
     return buffer, num_valid
 
 
+@public_op()
 def unproject_pixels(
     records: torch.Tensor, normals: torch.Tensor, pose: torch.Tensor, fx: float, fy: float, cx: float, cy: float
 ) -> tuple[torch.Tensor, torch.Tensor]:

@@ -4,6 +4,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_rows_vmap
 
 FEATURES = 8
@@ -12,6 +13,7 @@ _HIDDEN = 64
 ENCODER_PARAMETERS = _HIDDEN * (6 + 1) + _HIDDEN * (_HIDDEN + 1) + FEATURES * (_HIDDEN + 1)
 
 
+@public_op()
 def depth_normals(
     depth: torch.Tensor,
     pixels: torch.Tensor,
@@ -58,6 +60,7 @@ def depth_normals(
     return torch.ops.spslam.depth_normals(depth, pixels, fx, fy, cx, cy, step_px, max_jump)
 
 
+@public_op()
 def encode_points(
     points: torch.Tensor,
     normals: torch.Tensor,
@@ -112,6 +115,7 @@ def encode_points(
     )
 
 
+@public_op(as_given=("embeddings", "weights"))
 def fuse_prior_(
     embeddings: torch.Tensor,
     weights: torch.Tensor,
@@ -155,6 +159,7 @@ def fuse_prior_(
     torch.ops.spslam.fuse_prior_(embeddings, weights, voxel_ids, features, feature_weights, max_weight)
 
 
+@public_op()
 def random_embeddings(voxel_coords: torch.Tensor, seed: int, scale: float = 0.01) -> torch.Tensor:
     """Embeddings to start from without a prior: numbers from N(0, scale^2) that voxel and seed alone decide on.
 

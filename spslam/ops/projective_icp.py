@@ -9,9 +9,11 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
+@public_op()
 def projective_icp(
     points: torch.Tensor,
     vertices: torch.Tensor,

@@ -6,6 +6,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap
 
 _MAX_SAMPLES = 2**20
@@ -27,6 +28,7 @@ class Stream(IntEnum):
     EVALUATION = 9
 
 
+@public_op()
 def philox_uniform(
     seed: int, stream: int, frame: int, iteration: int, count: int, device: torch.device | str = "cpu"
 ) -> torch.Tensor:
@@ -56,6 +58,7 @@ def philox_uniform(
     return out
 
 
+@public_op()
 def sample_indices(
     seed: int, stream: int, frame: int, iteration: int, count: int, upper: int, device: torch.device | str = "cpu"
 ) -> torch.Tensor:
@@ -86,6 +89,7 @@ def sample_indices(
     return out
 
 
+@public_op()
 def sample_along_rays(
     depth: torch.Tensor,
     num_uniform: int,

@@ -11,6 +11,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.scene_view import COLOR_PARAMS, GEOMETRY_PARAMS, Intrinsics, SceneView, check_intrinsics
 
 PRECISIONS = ("tf32", "fp32")
@@ -166,6 +167,7 @@ class RenderStep:
     grad_color: torch.Tensor | None
 
 
+@public_op()
 def render_step(
     scene: SceneView, rays: RayBatch, options: RenderOptions, gradients: SceneGradients | None = None
 ) -> RenderStep:

@@ -4,9 +4,11 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.scene_view import SceneView
 
 
+@public_op()
 def query_sdf(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Signed distance at world points, s = F(p, TriLerp(p, V)) (eq. 2).
 
@@ -28,6 +30,7 @@ def query_sdf(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, tor
     return sdf, valid
 
 
+@public_op()
 def query_sdf_gradient(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """As `query_sdf`, and the derivative by the point.
 
@@ -48,6 +51,7 @@ def query_sdf_gradient(scene: SceneView, points: torch.Tensor) -> tuple[torch.Te
     return _query(scene, points, "query_sdf_gradient", with_gradient=True)
 
 
+@public_op()
 def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
     """RGB at world points, c = F(f_xy + f_xz + f_yz) (eq. 3, 4).
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 
 from spslam.ops._checks import check, check_tensor
+from spslam.ops.interpolation import check_plane_layout
 
 GEOMETRY_PARAMS = 32 * 12 + 32 * 33 + 33  # of the 11 -> 32 -> 32 -> 1 decoder
 COLOR_PARAMS = 32 * 33 + 32 * 33 + 3 * 33  # of the 32 -> 32 -> 32 -> 3 decoder
@@ -101,7 +102,7 @@ class SceneView:
         check(self.voxel_size > 0, function, "voxel_size", "be positive", self.voxel_size)
         check(self.plane_cell_size > 0, function, "plane_cell_size", "be positive", self.plane_cell_size)
         check(len(self.origin) == 3, function, "origin", "have 3 numbers", len(self.origin))
-        check(len(self.plane_layout) == 15, function, "plane_layout", "have 15 numbers", len(self.plane_layout))
+        check_plane_layout(function, self.plane_layout, len(self.texels), "plane_layout")
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
         """The three lists that the op schemas take."""

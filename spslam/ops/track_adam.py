@@ -4,12 +4,14 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import Stream
 from spslam.ops.render_step import RenderOptions
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 
+@public_op()
 def track_adam(
     scene: SceneView,
     records: torch.Tensor,

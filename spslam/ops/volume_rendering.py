@@ -8,11 +8,13 @@ by the truncation distance, in [-1, 1], positive in front of surfaces.
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._autograd import forbid_second_derivatives
+from spslam.ops._autograd import register_gradient
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
 
+@public_op()
 def volume_render(
     sdf: torch.Tensor, color: torch.Tensor, t: torch.Tensor, valid: torch.Tensor, truncation: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -54,6 +56,7 @@ def volume_render(
     return torch.ops.spslam.volume_render(sdf, color, t, valid, truncation)
 
 
+@public_op()
 def rendering_losses(
     color: torch.Tensor,
     depth: torch.Tensor,
@@ -180,10 +183,8 @@ def _losses_backward(ctx, grad):
     return *gradients, None, None, None, None, None, None, None
 
 
-torch.library.register_autograd("spslam::volume_render", _render_backward, setup_context=_save_render)
-torch.library.register_autograd("spslam::rendering_losses", _losses_backward, setup_context=_save_losses)
-forbid_second_derivatives("volume_render")
-forbid_second_derivatives("rendering_losses")
+register_gradient("volume_render", _render_backward, _save_render)
+register_gradient("rendering_losses", _losses_backward, _save_losses)
 register_rows_vmap("volume_render", (0, 1, 2, 3))
 register_each_vmap("volume_render_backward")
 register_each_vmap("rendering_losses")

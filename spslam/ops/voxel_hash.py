@@ -7,13 +7,16 @@ A table is two tensors of `capacity` slots, a power of two, at most half of them
 import torch
 
 from spslam.ops import _library  # noqa: F401
+from spslam.ops._autograd import register_gradient
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._public import public_op
 from spslam.ops._vmap import register_rows_vmap
 
 VOXEL_COORD_MIN = -(2**20)
 VOXEL_COORD_MAX = 2**20 - 1
 
 
+@public_op()
 def new_voxel_hash(capacity: int, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
     """An empty table.
 
@@ -50,6 +53,41 @@ def _check_table(function: str, hash_keys: torch.Tensor, hash_values: torch.Tens
     check_tensor(function, "hash_values", hash_values, [capacity], torch.int32, like=hash_keys)
 
 
+@public_op()
+def voxel_hash_absent(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_coords: torch.Tensor) -> torch.Tensor:
+    """The coordinates that a table lacks, each once: what `voxel_hash_insert` would enter. Waits for CUDA.
+
+    Args:
+        hash_keys, hash_values: the table.
+        voxel_coords: int32 [N, 3] in [-2^20, 2^20 - 1], repetitions allowed.
+
+    Returns:
+        new_voxel_coords int32 [M, 3] in the order of (x, y, z), the same on every device. M = 0 when nothing is new.
+
+    Raises:
+        ValueError: wrong shapes or devices.
+        TypeError: wrong dtypes.
+        RuntimeError: a coordinate out of range.
+
+    Example:
+        >>> coords = torch.tensor([[5, 0, 0], [2, 0, 0], [5, 0, 0]], dtype=torch.int32)
+        >>> voxel_hash_absent(*new_voxel_hash(2), coords)  # a table for one voxel: they would not fit
+        tensor([[2, 0, 0],
+                [5, 0, 0]], dtype=torch.int32)
+    """
+    return absent_voxels("voxel_hash_absent", hash_keys, hash_values, voxel_coords)
+
+
+def absent_voxels(
+    function: str, hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_coords: torch.Tensor
+) -> torch.Tensor:
+    """`voxel_hash_absent` on behalf of another function, which its errors name."""
+    _check_table(function, hash_keys, hash_values)
+    check_tensor(function, "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=hash_keys)
+    return torch.ops.spslam.voxel_hash_absent(hash_keys, hash_values, voxel_coords, function)
+
+
+@public_op()
 def voxel_hash_insert(
     hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_coords: torch.Tensor, first_id: int
 ) -> torch.Tensor:
@@ -69,7 +107,8 @@ def voxel_hash_insert(
     Raises:
         ValueError: wrong shapes or devices, `first_id` negative.
         TypeError: wrong dtypes.
-        RuntimeError: a coordinate out of range, or the table would become more than half full.
+        RuntimeError: a coordinate out of range, the table would become more than half full, or it has more voxels in
+            it than `first_id` says and too few empty slots.
 
     Example:
         >>> hash_keys, hash_values = new_voxel_hash(8)
@@ -86,6 +125,7 @@ def voxel_hash_insert(
     return torch.ops.spslam.voxel_hash_insert(hash_keys, hash_values, voxel_coords, first_id)
 
 
+@public_op()
 def voxel_hash_build_(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_coords: torch.Tensor) -> None:
     """Empties the table and enters row i of `voxel_coords` with id i: after growth, or on loading a map.
 
@@ -114,6 +154,7 @@ def voxel_hash_build_(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_
     torch.ops.spslam.voxel_hash_build_(hash_keys, hash_values, voxel_coords)
 
 
+@public_op()
 def voxel_hash_find(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_coords: torch.Tensor) -> torch.Tensor:
     """Ids of coordinates.
 
@@ -138,6 +179,7 @@ def voxel_hash_find(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_co
     return torch.ops.spslam.voxel_hash_find(hash_keys, hash_values, voxel_coords)
 
 
+@public_op()
 def voxel_hash_update_corner_ids(
     hash_keys: torch.Tensor,
     hash_values: torch.Tensor,
@@ -179,6 +221,7 @@ def voxel_hash_update_corner_ids(
     torch.ops.spslam.voxel_hash_update_corner_ids(hash_keys, hash_values, voxel_coords, corner_ids, first_new)
 
 
+@public_op()
 def voxel_hash_lookup(
     hash_keys: torch.Tensor,
     hash_values: torch.Tensor,
@@ -219,6 +262,11 @@ def voxel_hash_lookup(
     return rows, local_coords
 
 
+@torch.library.register_fake("spslam::voxel_hash_absent")
+def _(hash_keys, hash_values, voxel_coords, function="voxel_hash_absent"):
+    return voxel_coords.new_empty((torch.library.get_ctx().new_dynamic_size(), 3))
+
+
 @torch.library.register_fake("spslam::voxel_hash_insert")
 def _(hash_keys, hash_values, voxel_coords, first_id):
     return voxel_coords.new_empty((torch.library.get_ctx().new_dynamic_size(), 3))
@@ -257,6 +305,6 @@ def _lookup_backward(ctx, grad_local_coords, _grad_rows):
     return None, None, None, grad_local_coords * inside / ctx.voxel_size, None
 
 
-torch.library.register_autograd("spslam::voxel_hash_lookup", _lookup_backward, setup_context=_save_lookup)
+register_gradient("voxel_hash_lookup", _lookup_backward, _save_lookup)
 register_rows_vmap("voxel_hash_find", (2,))
 register_rows_vmap("voxel_hash_lookup", (3,))

@@ -210,6 +210,7 @@ def _marching_cubes(generator, device, n):
 
 CASES = {
     "voxel_hash_find": Case(_find, rows=("voxel_coords",)),
+    "voxel_hash_absent": Case(_find),
     "voxel_hash_insert": Case(_insert),
     "voxel_hash_build_": Case(_build_table, compiles=False),
     "voxel_hash_update_corner_ids": Case(_update_corners),

@@ -65,6 +65,7 @@ TABLE_ROWS = [
 ]
 # Ops whose rows melt together, or that check them: the test that says what becomes of a bad one.
 ELSEWHERE = {
+    "voxel_hash_absent": "test_voxel_hash.test_coordinates_out_of_range_leave_the_table_alone",
     "voxel_hash_insert": "test_voxel_hash.test_coordinates_out_of_range_leave_the_table_alone",
     "voxel_hash_build_": "test_voxel_hash.test_coordinates_out_of_range_leave_the_table_alone",
     "encode_points": "test_prior_fusion.test_points_beyond_the_range_of_coordinates_are_skipped",

@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from spslam import ops
 from tests.ops.arguments import outputs
@@ -115,6 +116,59 @@ def test_many_gradients_at_once(name, generator):
     got = torch.autograd.grad(result, leaves, grads, is_grads_batched=True, **options)
     each = [torch.autograd.grad(result, leaves, grad, **options) for grad in grads]
     assert_same(got, [torch.stack(parts) for parts in zip(*each, strict=True)])
+
+
+def refuses_forward_mode(name):
+    return pytest.raises(NotImplementedError, match=f"^{name}: forward-mode AD is not supported, use reverse mode$")
+
+
+def derive_forward(function, value):
+    """The ways to ask for a derivative in forward mode."""
+    ones = torch.ones_like(value)
+    stacked = torch.stack([value, value])
+
+    def with_dual(requires_grad=False):
+        with forward_ad.dual_level():
+            return function(forward_ad.make_dual(value.clone().requires_grad_(requires_grad), ones))
+
+    yield lambda: torch.func.jvp(function, (value,), (ones,))
+    yield lambda: torch.func.jacfwd(function)(value)
+    yield lambda: torch.func.jvp(torch.vmap(function), (stacked,), (torch.ones_like(stacked),))
+    yield lambda: torch.vmap(lambda v: torch.func.jvp(function, (v,), (ones,))[1])(stacked)
+    yield with_dual
+    yield lambda: with_dual(requires_grad=True)
+    yield torch.no_grad()(with_dual)
+
+
+@named(lambda case: case.differentiable)
+def test_forward_mode_is_refused(name, device, generator):
+    """By any of its ways, by each argument: torch's own answer would be a derivative of zero."""
+    call = arguments(name, generator, device, rows=20)
+    for key in CASES[name].differentiable:
+
+        def of_one(given, key=key):
+            return outputs(getattr(ops, name)(**{**call, key: given}))[-1]
+
+        for derive in derive_forward(of_one, call[key]):
+            with refuses_forward_mode(name):
+                derive()
+
+
+@named(lambda case: case.differentiable)
+def test_forward_mode_over_a_gradient_is_refused(name, device, generator):
+    """A tangent that comes with the gradient of the output, as in products with a Hessian."""
+    call = arguments(name, generator, device, rows=20)
+    leaves = [call[key].requires_grad_() for key in CASES[name].differentiable]
+    result = next(part for part in outputs(getattr(ops, name)(**call)) if part.requires_grad)
+    with forward_ad.dual_level():
+        grad = forward_ad.make_dual(torch.ones_like(result), torch.ones_like(result))
+        if name == "voxel_hash_lookup":  # its gradient is plain torch
+            (found,) = torch.autograd.grad(result, leaves, grad)
+            primal, tangent = forward_ad.unpack_dual(found)
+            assert torch.equal(tangent, primal)
+        else:
+            with refuses_forward_mode(name):
+                torch.autograd.grad(result, leaves, grad)
 
 
 def test_vmap_over_nothing_is_refused(generator):

@@ -173,11 +173,60 @@ def test_a_table_that_would_be_more_than_half_full_is_left_alone(device):
         ops.voxel_hash_build_(keys, values, coords([[x, 0, 0] for x in range(5)], device))
 
 
+def test_absent_is_what_an_insertion_enters(device, generator):
+    keys, values, inserted = table_of(random_coords(200, 4, generator), capacity=2048, device=device)
+    batch = random_coords(400, 5, generator).to(device)
+    before = keys.clone()
+    absent = ops.voxel_hash_absent(keys, values, batch)
+    assert torch.equal(keys, before)
+    assert torch.equal(absent, ops.voxel_hash_insert(keys, values, batch, len(inserted)))
+    assert ops.voxel_hash_absent(keys, values, batch).shape == (0, 3)
+
+
+def full_table(device, capacity=64):
+    """A table with a voxel in every slot, which the ops alone would never make: ids of (0, 0, z) for z >= 0."""
+    keys, values = ops.new_voxel_hash(4 * capacity, device)
+    inserted = ops.voxel_hash_insert(keys, values, coords([[0, 0, z] for z in range(capacity)], device), 0)
+    packed = keys[keys >= 0].sort().values  # by (x, y, z), as ids are
+    return packed.clone(), torch.arange(capacity, dtype=torch.int32, device=device), inserted
+
+
+def test_a_full_table_is_searched_to_its_end(device):
+    """No empty slot ends a probe: it ends where it began."""
+    keys, values, inserted = full_table(device)
+    found = ops.voxel_hash_find(keys, values, inserted)
+    assert found.tolist() == list(range(64))
+    absent = coords([[5, 5, z] for z in range(100)], device)
+    assert ops.voxel_hash_find(keys, values, absent).tolist() == [-1] * 100
+    assert torch.equal(ops.voxel_hash_absent(keys, values, torch.cat([absent, inserted])), absent)
+    points = torch.full((10, 3), 7.5, device=device)
+    rows = torch.full((64, 8), -1, dtype=torch.int32, device=device)
+    assert (ops.voxel_hash_lookup(keys, values, rows, points, 1.0)[0] == -1).all()
+    ops.voxel_hash_update_corner_ids(keys, values, inserted, rows, 0)
+    assert (rows == -1).all()
+
+
+@pytest.mark.parametrize("taken", [64, 63])
+def test_an_insertion_without_a_slot_is_refused(taken, device):
+    """Whatever the caller says of the voxels in the table; what is in it stays."""
+    keys, values, _ = full_table(device)
+    keys[taken:] = -1
+    before = keys.clone()
+    two = coords([[5, 5, 5], [6, 6, 6]], device)
+    with pytest.raises(
+        RuntimeError, match=f"first_id must be the number of voxels in the table, got 0 .* {64 - taken} "
+    ):
+        ops.voxel_hash_insert(keys, values, two, 0)
+    assert torch.equal(keys, before)
+
+
 def test_coordinates_out_of_range_leave_the_table_alone(device):
     keys, values = ops.new_voxel_hash(16, device)
     batch = coords([[0, 0, 0], [LIMIT, 0, 0], [0, -LIMIT - 1, 0]], device)
     with pytest.raises(RuntimeError, match=r"voxel_coords must lie in \[-2\^20, 2\^20 - 1\], got 2 rows outside"):
         ops.voxel_hash_insert(keys, values, batch, 0)
+    with pytest.raises(RuntimeError, match=r"voxel_hash_absent: voxel_coords must lie in .*, got 2 rows outside"):
+        ops.voxel_hash_absent(keys, values, batch)
     assert (keys == -1).all()
     with pytest.raises(ValueError, match=r"voxel_hash_build_: voxel_coords must lie in .*, got \[-1048577, 1048576\]"):
         ops.voxel_hash_build_(keys, values, batch)
@@ -225,4 +274,5 @@ def test_opcheck(device, generator):
     torch.library.opcheck(op.voxel_hash_build_, (keys, values, new))
     torch.library.opcheck(op.voxel_hash_lookup, (keys, values, rows, points, 0.04))
     more = random_coords(10, 4, generator).to(device)
+    torch.library.opcheck(op.voxel_hash_absent, (keys, values, more))
     torch.library.opcheck(op.voxel_hash_insert, (keys, values, more, len(new)))

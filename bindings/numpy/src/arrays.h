@@ -9,7 +9,7 @@
 #include <type_traits>
 #include <vector>
 
-#include "core/device.h"
+#include "spslam/core/device.h"
 
 namespace spslam::numpy {
 

@@ -1,5 +1,5 @@
 #include "arrays.h"
-#include "core/parallel.h"
+#include "spslam/core/parallel.h"
 
 namespace {
 

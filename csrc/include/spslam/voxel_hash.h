@@ -17,6 +17,7 @@ std::int64_t voxel_hash_workspace_bytes(Device device, std::int64_t n);
 struct AbsentVoxels {
   std::int64_t count;         // distinct coordinates that the table lacks
   std::int64_t out_of_range;  // input rows outside 21 bits an axis
+  std::int64_t empty_slots;   // of the table, counted up to `count` at least
 };
 
 // Writes the packed coordinates that the table lacks, sorted and unique, into absent_keys [n]; returns how many.
@@ -26,7 +27,8 @@ AbsentVoxels voxel_hash_absent(Device device, const std::int64_t* hash_keys, con
                                std::int64_t capacity, const std::int32_t* voxel_coords, std::int64_t n, void* workspace,
                                std::int64_t* absent_keys);
 
-// Enters n keys that are distinct and absent, with ids first_id, first_id + 1, ...
+// Enters n keys that are distinct and absent, with ids first_id, first_id + 1, ... There must be an empty slot for
+// each: a key that finds none is left out.
 template <class Device>
 void voxel_hash_assign(Device device, std::int64_t* hash_keys, std::int32_t* hash_values, std::int64_t capacity,
                        const std::int64_t* keys, std::int64_t n, std::int32_t first_id);

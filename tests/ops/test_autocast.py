@@ -1,0 +1,79 @@
+"""In an autocast region ops take what other modules give there, and compute in float32."""
+
+import pytest
+import torch
+
+from spslam import ops
+from tests.ops.arguments import outputs
+from tests.ops.cases import CASES, arguments
+
+LOWERED = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+# Changed in place, or of 16 bits by their meaning: not cast.
+AS_GIVEN = {"param", "grad", "exp_avg", "exp_avg_sq", "embeddings", "weights", "poses", "depth_thumbnails"}
+
+
+def lowered(name, call, dtype):
+    """The call with the float32 tensors among its arguments in another dtype, and what they then are in float32."""
+    in_place = AS_GIVEN if name.endswith("_") or "thumbnail_step" in call else set()
+    low = {
+        key: value.to(dtype)
+        for key, value in call.items()
+        if isinstance(value, torch.Tensor) and value.dtype == torch.float32 and key not in in_place
+    }
+    return call | low, call | {key: value.float() for key, value in low.items()}
+
+
+@LOWERED
+@pytest.mark.parametrize("name", CASES)
+def test_ops_compute_in_float32(name, dtype, device, generator):
+    given, _ = lowered(name, arguments(name, generator, device), dtype)
+    _, wide = lowered(name, arguments(name, generator.manual_seed(0), device), dtype)
+    with torch.autocast(device.type, dtype=dtype):
+        results = outputs(getattr(ops, name)(**given))
+    wanted = outputs(getattr(ops, name)(**wide))
+    assert len(results) == len(wanted)
+    for got, want in zip(results, wanted, strict=True):
+        assert got.dtype == want.dtype
+        assert torch.equal(got.nan_to_num(), want.nan_to_num())
+
+
+@LOWERED
+def test_a_network_goes_on_from_a_layer(dtype, device, generator):
+    """Gradients flow back through the cast, into the layer's float32 weights."""
+    layer = torch.nn.Linear(6, 11, device=device)
+    params = torch.randn(ops.mlp_num_params(11, 8, 2), generator=generator).to(device).requires_grad_()
+    x = torch.randn(20, 6, generator=generator).to(device)
+    with torch.autocast(device.type, dtype=dtype):
+        hidden = layer(x)
+        assert hidden.dtype == dtype
+        out = ops.mlp(hidden, params, 8, 2)
+    assert out.dtype == torch.float32
+    out.sum().backward()
+    assert params.grad.dtype == layer.weight.grad.dtype == torch.float32
+    assert layer.weight.grad.abs().sum() > 0
+
+
+def test_compiled_code_casts_too(generator):
+    layer = torch.nn.Linear(6, 11)
+    params = torch.randn(ops.mlp_num_params(11, 8, 2), generator=generator)
+    x = torch.randn(20, 6, generator=generator)
+
+    def network(x):
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            return ops.mlp(layer(x), params, 8, 2)
+
+    torch._dynamo.reset()
+    assert torch.equal(torch.compile(network, fullgraph=True, backend="aot_eager")(x), network(x))
+
+
+@LOWERED
+def test_what_is_changed_in_place_is_not_cast(dtype):
+    """The change would be made to a copy and lost."""
+    table = torch.zeros(4, 8, dtype=dtype)
+    with torch.autocast("cpu", dtype=torch.bfloat16), pytest.raises(TypeError, match="sparse_adam_: param must be"):
+        ops.sparse_adam_(table, table, table, table, lr=0.1, step=1)
+
+
+def test_outside_of_a_region_nothing_is_cast():
+    with pytest.raises(TypeError, match="mlp: input must be float32 or float64, got bfloat16"):
+        ops.mlp(torch.zeros(1, 3, dtype=torch.bfloat16), torch.zeros(1), 8, 1)
