@@ -68,7 +68,7 @@ def test_a_perfect_run_has_perfect_metrics(output, room):
     figures = trajectory_figures(run)
     assert figures["ate_rmse_cm"] < 1e-4
     assert figures["rpe_cm"] < 1e-4
-    figures = surface_figures(run, room, room.room)
+    figures = surface_figures(run, room, room.room, samples=20_000, novel_views=50)
     assert figures["f1_5cm"] > 99.9
     assert figures["accuracy_cm"] < 0.1
     assert figures["completeness_cm"] < 0.1

@@ -21,7 +21,17 @@ def _double(gradients):
 
 @pytest.mark.parametrize("parts", [OPS, TORCH])
 @pytest.mark.parametrize("compact", [False, True])
-@pytest.mark.parametrize("change", [{}, dict(cosine_targets=False), dict(weight_rgb=0.0)], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        *(
+            pytest.param(change, marks=pytest.mark.slow)
+            for change in (dict(cosine_targets=False), dict(weight_rgb=0.0))
+        ),
+    ],
+    ids=str,
+)
 def test_equals_the_reference(parts, compact, change, device, generator):
     scene, rays = make_scene(generator, random_decoder=True, device=device), noisy_rays(generator, device=device)
     options = replace(OPTIONS, **change)

@@ -111,19 +111,23 @@ def _intensity_equations(reference, records):
         x, y, z = seen(increment).unbind(-1)
         return torch.stack([x / z * k.fx + k.cx, y / z * k.fy + k.cy], -1)
 
-    def difference(increment):
-        grid = (2 * place(increment) / size - 1)[None, None]
+    def difference(uv):
+        grid = (2 * uv / size - 1)[None, None]
         image = cells[None, ..., 0][None]
         return torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, 0, 0] - gray
 
     zero = torch.zeros(6, dtype=torch.float64)
-    left_top, depth = place(zero).floor().long(), seen(zero)[:, 2]
+    uv = place(zero).requires_grad_()
+    left_top, depth = uv.detach().floor().long(), seen(zero)[:, 2]
     inside = ((left_top >= 0) & (left_top < size.long())).all(1)
     u, v = torch.where(inside[:, None], left_top, 0).unbind(1)
     corners = torch.stack([cells[v + dv, u + du, 1] for dv in (0, 1) for du in (0, 1)])
     agrees = inside & ((corners - depth).abs() < 0.1 * depth).all(0)
-    weight = (1 / (1 + (difference(zero) / reference.kernel) ** 2)) ** 2 * agrees
-    return reference.weight * torch.autograd.functional.jacobian(difference, zero), weight
+    value = difference(uv)
+    (slope,) = torch.autograd.grad(value.sum(), uv)
+    weight = (1 / (1 + (value.detach() / reference.kernel) ** 2)) ** 2 * agrees
+    jacobian = torch.einsum("ni,nij->nj", slope, torch.func.jacfwd(place)(zero))
+    return reference.weight * jacobian, weight
 
 
 def test_color_equations_are_those_of_autograd(device, generator):
