@@ -23,6 +23,9 @@ INCLUDES = {
 # The maths of one element runs on both devices, so it knows only what both have.
 ELEMENT_SYSTEM_HEADERS = {"cmath", "cstdint", "limits"}
 
+# More become a struct of options, or a list of numbers where they are an op's.
+MAX_PARAMETERS = 12
+
 # Which parts of spslam a part may import. Parts that aren't named here are of the ground floor.
 GROUND = {"camera", "config", "errors", "geometry", "io", "options", "run_folder", "trajectory"}
 IMPORTS = {
@@ -112,6 +115,30 @@ def test_bindings_use_the_stable_abi_alone(path):
     torch_headers = [header for header in includes(path) if header.startswith("torch/")]
     stable = r"torch/(csrc/stable|headeronly|csrc/inductor/aoti_torch/c)/"
     assert all(re.match(stable, header) for header in torch_headers)
+
+
+def argument_counts(text):
+    """Name and number of arguments of everything in C++ that looks like a function's declaration or call."""
+    code = re.sub(r'//[^\n]*|"(\\.|[^"\\])*"', "", text)
+    for match in re.finditer(r"(\w+)(<[^<>()]*>)?\(", code):
+        depth, angles, count = 1, 0, 1
+        for character in code[match.end() :]:
+            depth += (character in "([{") - (character in ")]}")
+            angles += (character == "<") - (character == ">")
+            count += character == "," and depth == 1 and angles == 0
+            if depth == 0:
+                break
+        yield match[1], count
+
+
+def test_arguments_are_counted():
+    text = "void f(std::map<int, int> a, int (*b)(int, int), T c = g(1, 2, 3));  // h(1, 2)"
+    assert list(argument_counts(text)) == [("f", 3), ("g", 3)]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=relative)
+def test_functions_take_few_parameters(path):
+    assert not [name for name, count in argument_counts(path.read_text()) if count > MAX_PARAMETERS]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)

@@ -111,15 +111,11 @@ GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<I
   return options;
 }
 
-std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(std::vector<Tensor> scene_tensors,
-                                                      std::vector<double> scene_scalars,
-                                                      std::vector<std::int64_t> plane_layout, Tensor pixels,
-                                                      Tensor pose, std::vector<double> scalars,
-                                                      std::vector<std::int64_t> integers, std::vector<Tensor> reference,
-                                                      std::vector<double> reference_scalars,
-                                                      std::vector<Tensor> depth_keyframes,
-                                                      std::vector<double> depth_keyframe_scalars,
-                                                      std::vector<std::int64_t> depth_keyframe_integers) {
+std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
+    std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars, std::vector<std::int64_t> plane_layout,
+    Tensor pixels, Tensor pose, std::vector<double> scalars, std::vector<std::int64_t> integers,
+    std::vector<Tensor> reference, std::vector<double> reference_scalars, std::vector<Tensor> depth_keyframes,
+    std::vector<double> depth_keyframe_scalars, std::vector<std::int64_t> depth_keyframe_integers) {
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0, kName,
             ": pixels must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == kPoseSize, kName, ": pose must have 7 elements");

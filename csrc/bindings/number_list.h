@@ -1,6 +1,8 @@
 // Numbers that an op takes as one list, so that a further one is an entry of an enum and no further parameter.
 #pragma once
 
+#include <type_traits>
+
 #include "bindings/common.h"
 
 namespace spslam::bindings {
@@ -9,19 +11,26 @@ namespace spslam::bindings {
 template <class Place, class T>
 class NumberList {
  public:
-  NumberList(const char* function, const char* argument, const std::vector<T>& values) : values_(values) {
+  NumberList(const char* function, const char* argument, const std::vector<T>& values)
+      : function_(function), argument_(argument), values_(values) {
     SPS_CHECK(values.size() == static_cast<std::size_t>(Place::kCount), function, ": ", argument, " must have ",
               static_cast<int>(Place::kCount), " numbers, got ", values.size());
   }
 
   T operator[](Place place) const { return values_[static_cast<std::size_t>(place)]; }
 
+  // A whole number must fit 32 bits where that is the type it is asked in.
   template <class U>
   U as(Place place) const {
-    return static_cast<U>((*this)[place]);
+    if constexpr (std::is_same_v<T, std::int64_t> && std::is_same_v<U, std::int32_t>) {
+      return to_int32(function_, argument_, (*this)[place]);
+    } else {
+      return static_cast<U>((*this)[place]);
+    }
   }
 
  private:
+  const char *function_, *argument_;
   const std::vector<T>& values_;
 };
 

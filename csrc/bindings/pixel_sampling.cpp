@@ -1,6 +1,6 @@
 #include "spslam/pixel_sampling.h"
 
-#include "bindings/common.h"
+#include "bindings/number_list.h"
 
 namespace spslam::bindings {
 namespace {
@@ -26,48 +26,64 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
 }
 
 #ifndef SPS_CUDA
+// Places in the lists of numbers of sample_frame_pixels; spslam/ops/pixel_sampling.py fills them.
+enum class Scalar { kFx, kFy, kCx, kCy, kMinDepth, kMaxDepth, kMaxJump, kDepthImageUnit, kCount };
+enum class Integer { kNumPixels, kStepPx, kThumbnailStep, kDepthImageStep, kSeed, kStream, kFrame, kCount };
+
+PixelSampling load_sampling(const Scalars<Scalar>& scalars, const Integers<Integer>& integers) {
+  constexpr std::int64_t kMaxSide = 65535;  // a record has 16 bits per coordinate
+  const auto in_range = [&](Integer place, std::int64_t least, std::int64_t most) {
+    return integers[place] >= least && integers[place] <= most;
+  };
+  SPS_CHECK(in_range(Integer::kNumPixels, 0, std::int64_t{1} << 30) && in_range(Integer::kStepPx, 1, kMaxSide) &&
+                in_range(Integer::kThumbnailStep, 1, kMaxSide) && in_range(Integer::kDepthImageStep, 0, kMaxSide),
+            "sample_frame_pixels: count, step_px, thumbnail_step, depth_image_step must be at least 0, 1, 1, 0");
+  SPS_CHECK(integers[Integer::kDepthImageStep] == 0 || scalars[Scalar::kDepthImageUnit] > 0.0,
+            "sample_frame_pixels: depth_image_unit must be positive");
+  return {integers[Integer::kNumPixels],
+          scalars.as<float>(Scalar::kMinDepth),
+          scalars.as<float>(Scalar::kMaxDepth),
+          integers.as<std::int32_t>(Integer::kStepPx),
+          scalars.as<float>(Scalar::kMaxJump),
+          integers.as<std::int32_t>(Integer::kThumbnailStep),
+          integers.as<std::int32_t>(Integer::kDepthImageStep),
+          scalars.as<float>(Scalar::kDepthImageUnit)};
+}
+
+std::int64_t words_of_halves(std::int64_t count) {
+  return (count + 1) / 2;
+}
+
 // Frames arrive on the CPU, so this op is there alone. One buffer for all: records [count, 3], normals [count, 3] as
-// their bits, the depth thumbnail's halves in pairs, the view's 16-bit numbers in pairs.
-std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, double fx, double fy, double cx,
-                                                     double cy, std::int64_t count, double min_depth, double max_depth,
-                                                     std::int64_t step_px, double max_jump, std::int64_t thumbnail_step,
-                                                     std::int64_t depth_image_step, double depth_image_unit,
-                                                     std::int64_t seed, std::int64_t stream, std::int64_t frame) {
-  constexpr std::int64_t kMaxSide = 65535;  // a record has 16 bits a coordinate
-  SPS_CHECK(depth.dim() == 2 && depth.size(0) <= kMaxSide && depth.size(1) <= kMaxSide &&
+// their bits, the depth thumbnail's halves in pairs, the depth image's 16-bit numbers in pairs.
+std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, std::vector<double> scalar_list,
+                                                     std::vector<std::int64_t> integer_list) {
+  const Scalars<Scalar> scalars("sample_frame_pixels", "scalars", scalar_list);
+  const Integers<Integer> integers("sample_frame_pixels", "integers", integer_list);
+  const PixelSampling sampling = load_sampling(scalars, integers);
+  SPS_CHECK(depth.dim() == 2 && depth.size(0) <= 65535 && depth.size(1) <= 65535 &&
                 depth.numel() < (std::int64_t{1} << 31) && has_shape(color, {depth.size(0), depth.size(1), 3}),
             "sample_frame_pixels: depth and color must have shapes [H, W] and [H, W, 3], H and W below 2^16");
-  SPS_CHECK(count >= 0 && count <= (std::int64_t{1} << 30) && step_px >= 1 && step_px <= kMaxSide &&
-                thumbnail_step >= 1 && thumbnail_step <= kMaxSide && depth_image_step >= 0 &&
-                depth_image_step <= kMaxSide && (depth_image_step == 0 || depth_image_unit > 0.0),
-            "sample_frame_pixels: count, step_px, thumbnail_step, depth_image_step must be at least 0, 1, 1, 0, "
-            "depth_image_unit positive");
   depth = contiguous(depth);
   color = contiguous(color);
   const std::int32_t height = static_cast<std::int32_t>(depth.size(0)),
                      width = static_cast<std::int32_t>(depth.size(1));
-  const RgbdImage image{data<float>(depth), data<std::uint8_t>(color), width, height, fx, fy, cx, cy};
-  const PixelSampling sampling{count,
-                               static_cast<float>(min_depth),
-                               static_cast<float>(max_depth),
-                               static_cast<std::int32_t>(step_px),
-                               static_cast<float>(max_jump),
-                               static_cast<std::int32_t>(thumbnail_step),
-                               static_cast<std::int32_t>(depth_image_step),
-                               static_cast<float>(depth_image_unit)};
-  const std::int64_t depth_thumbnail = static_cast<std::int64_t>(thumbnail_size(height, sampling.thumbnail_step)) *
-                                       thumbnail_size(width, sampling.thumbnail_step);
-  const std::int64_t view = static_cast<std::int64_t>(depth_image_size(height, sampling.depth_image_step)) *
-                            depth_image_size(width, sampling.depth_image_step);
-  const std::int64_t thumbnail_at = 6 * count, view_at = thumbnail_at + (depth_thumbnail + 1) / 2;
-  const Tensor buffer = empty(depth, {view_at + (view + 1) / 2}, ScalarType::Int);
+  const RgbdImage image{
+      data<float>(depth),   data<std::uint8_t>(color), width, height, scalars[Scalar::kFx], scalars[Scalar::kFy],
+      scalars[Scalar::kCx], scalars[Scalar::kCy]};
+  const std::int64_t thumbnail = static_cast<std::int64_t>(thumbnail_size(height, sampling.thumbnail_step)) *
+                                 thumbnail_size(width, sampling.thumbnail_step);
+  const std::int64_t depth_image = static_cast<std::int64_t>(depth_image_size(height, sampling.depth_image_step)) *
+                                   depth_image_size(width, sampling.depth_image_step);
+  const std::int64_t thumbnail_at = 6 * sampling.count, depth_image_at = thumbnail_at + words_of_halves(thumbnail);
+  const Tensor buffer = empty(depth, {depth_image_at + words_of_halves(depth_image)}, ScalarType::Int);
   std::int32_t* words = mutable_data<std::int32_t>(buffer);
-  if (depth_thumbnail % 2 != 0) words[view_at - 1] = 0;
-  if (view % 2 != 0) words[buffer.numel() - 1] = 0;
-  const SampledPixels out{words, reinterpret_cast<float*>(words + 3 * count),
+  if (thumbnail % 2 != 0) words[depth_image_at - 1] = 0;
+  if (depth_image % 2 != 0) words[buffer.numel() - 1] = 0;
+  const SampledPixels out{words, reinterpret_cast<float*>(words + 3 * sampling.count),
                           reinterpret_cast<std::uint16_t*>(words + thumbnail_at),
-                          reinterpret_cast<std::uint16_t*>(words + view_at)};
-  return {buffer, sample_pixels(image, philox_key(seed, stream, frame, 0), sampling, out)};
+                          reinterpret_cast<std::uint16_t*>(words + depth_image_at)};
+  return {buffer, sample_pixels(image, load_key(integers, 0), sampling, out)};
 }
 
 #endif
@@ -80,11 +96,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "unproject_pixels(Tensor records, Tensor normals, Tensor pose, float fx, float fy, float cx, float cy) -> "
       "(Tensor points, Tensor normals)");
   m.def(
-      "sample_frame_pixels(Tensor depth, Tensor color, float fx, float fy, float cx, float cy, int count, float "
-      "min_depth, float max_depth, int step_px, float max_jump, int thumbnail_step, int depth_image_step, float "
-      "depth_image_unit, int "
-      "seed, int stream, int frame) -> "
-      "(Tensor buffer, int num_valid)");
+      "sample_frame_pixels(Tensor depth, Tensor color, float[] scalars, int[] integers) -> (Tensor buffer, int "
+      "num_valid)");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(spslam, CPU, m) {

@@ -2,7 +2,7 @@
 
 #include <functional>
 
-#include "bindings/common.h"
+#include "bindings/number_list.h"
 
 namespace spslam::bindings {
 namespace {
@@ -16,7 +16,7 @@ void fuse_prior_(Tensor embeddings, Tensor weights, Tensor voxel_ids, Tensor fea
   SPS_CHECK(has_shape(voxel_ids, {count}) && has_shape(features, {count, kPriorFeatures}) &&
                 has_shape(feature_weights, {count}) && has_shape(embeddings, {-1, kPriorFeatures}) &&
                 has_shape(weights, {embeddings.size(0)}),
-            "fuse_prior_: embeddings and features must have 8 channels and a row a weight");
+            "fuse_prior_: embeddings and features must have 8 channels and one weight per row");
   DeviceScope scope(embeddings);
   fuse_prior(scope.context, data<std::int32_t>(voxel_ids), data<float>(features), data<float>(feature_weights), count,
              embeddings.size(0), static_cast<float>(max_weight), mutable_data<float>(embeddings),
@@ -83,56 +83,64 @@ std::tuple<Tensor, Tensor, Tensor> encode_points(Tensor points, Tensor normals, 
   return {voxel_coords, features, weights};
 }
 
-FeatureVolume checked_volume(const Tensor& hash_keys, const Tensor& hash_values, const Tensor& voxel_coords,
-                             const Tensor& corner_ids, const Tensor& embeddings, const Tensor& weights,
-                             std::int64_t num_voxels, std::int64_t max_voxels) {
-  const std::int64_t rows = weights.numel(), slots = hash_keys.numel();
-  SPS_CHECK(has_shape(weights, {rows}) && has_shape(voxel_coords, {rows, 3}) && has_shape(corner_ids, {rows, 8}) &&
+// Places in the lists of numbers of encode_frame_; spslam/ops/encode_frame.py fills them.
+enum class Scalar { kVoxelSize, kMinPairWeight, kMinWeight, kKappa, kMaxWeight, kCount };
+enum class Integer { kNumVoxels, kMaxVoxels, kNeighborhood, kMaxPoints, kFuseKnown, kTf32, kCount };
+
+// hash_keys, hash_values, voxel_coords, corner_ids, embeddings and weights of a volume.
+FeatureVolume checked_volume(const std::vector<Tensor>& tensors, std::int64_t num_voxels, std::int64_t max_voxels) {
+  SPS_CHECK(tensors.size() == 6, "encode_frame_: volume must be 6 tensors, got ", tensors.size());
+  const Tensor &keys = tensors[0], &values = tensors[1], &coords = tensors[2], &corners = tensors[3],
+               &embeddings = tensors[4], &weights = tensors[5];
+  const std::int64_t rows = weights.numel(), slots = keys.numel();
+  SPS_CHECK(has_shape(weights, {rows}) && has_shape(coords, {rows, 3}) && has_shape(corners, {rows, 8}) &&
                 has_shape(embeddings, {rows, kPriorFeatures}),
             "encode_frame_: the volume's tensors must have as many rows each");
-  SPS_CHECK(slots >= 2 && (slots & (slots - 1)) == 0 && hash_values.numel() == slots,
+  SPS_CHECK(slots >= 2 && (slots & (slots - 1)) == 0 && values.numel() == slots,
             "encode_frame_: hash_keys must have a power of two of slots, got ", slots);
   SPS_CHECK(0 <= num_voxels && num_voxels <= max_voxels && max_voxels <= rows && max_voxels <= slots / 2,
             "encode_frame_: num_voxels, max_voxels and the volume's room must not decrease in this order, got ",
             num_voxels, ", ", max_voxels, " and ", rows);
   to_int32("encode_frame_", "max_voxels", max_voxels);
-  return {mutable_data<std::int64_t>(hash_keys),
-          mutable_data<std::int32_t>(hash_values),
+  return {mutable_data<std::int64_t>(keys),
+          mutable_data<std::int32_t>(values),
           slots,
-          mutable_data<std::int32_t>(voxel_coords),
-          mutable_data<std::int32_t>(corner_ids),
+          mutable_data<std::int32_t>(coords),
+          mutable_data<std::int32_t>(corners),
           mutable_data<float>(embeddings),
           mutable_data<float>(weights),
           num_voxels,
           max_voxels};
 }
 
+FusionSettings load_fusion(const Tensor& encoder_params, const Scalars<Scalar>& scalars,
+                           const Integers<Integer>& integers) {
+  return {
+      checked_settings("encode_frame_", encoder_params, scalars[Scalar::kVoxelSize], integers[Integer::kNeighborhood],
+                       scalars[Scalar::kMinPairWeight], integers.as<bool>(Integer::kTf32)),
+      integers[Integer::kMaxPoints],
+      scalars.as<float>(Scalar::kMinWeight),
+      scalars.as<float>(Scalar::kKappa),
+      scalars.as<float>(Scalar::kMaxWeight),
+      integers.as<bool>(Integer::kFuseKnown)};
+}
+
 // `bounds` lies on the CPU: the caller needs it there.
-std::int64_t encode_frame_(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, Tensor corner_ids,
-                           Tensor embeddings, Tensor weights, std::int64_t num_voxels, std::int64_t max_voxels,
-                           Tensor points, Tensor normals, Tensor encoder_params, double voxel_size,
-                           std::int64_t neighborhood, double min_pair_weight, std::int64_t max_points,
-                           double min_weight, double kappa, double max_weight, bool fuse_known, bool tf32,
-                           Tensor bounds) {
-  const FusionSettings settings{
-      checked_settings("encode_frame_", encoder_params, voxel_size, neighborhood, min_pair_weight, tf32),
-      max_points,
-      static_cast<float>(min_weight),
-      static_cast<float>(kappa),
-      static_cast<float>(max_weight),
-      fuse_known};
+std::int64_t encode_frame_(std::vector<Tensor> volume, Tensor points, Tensor normals, Tensor encoder_params,
+                           std::vector<double> scalar_list, std::vector<std::int64_t> integer_list, Tensor bounds) {
+  const Scalars<Scalar> scalars("encode_frame_", "scalars", scalar_list);
+  const Integers<Integer> integers("encode_frame_", "integers", integer_list);
+  const FusionSettings settings = load_fusion(encoder_params, scalars, integers);
+  const FeatureVolume into = checked_volume(volume, integers[Integer::kNumVoxels], integers[Integer::kMaxVoxels]);
   SPS_CHECK(bounds.numel() == 6, "encode_frame_: bounds must have 6 numbers, got ", bounds.numel());
   check_points("encode_frame_", points, normals);
   points = contiguous(points);
   normals = contiguous(normals);
   encoder_params = contiguous(encoder_params);
-  DeviceScope scope(embeddings);
+  DeviceScope scope(points);
   Scratch scratch(points);
-  const EncodedFrame frame = encode_frame(
-      scope.context,
-      checked_volume(hash_keys, hash_values, voxel_coords, corner_ids, embeddings, weights, num_voxels, max_voxels),
-      data<float>(points), data<float>(normals), points.size(0), data<float>(encoder_params), settings,
-      std::ref(scratch));
+  const EncodedFrame frame = encode_frame(scope.context, into, data<float>(points), data<float>(normals),
+                                          points.size(0), data<float>(encoder_params), settings, std::ref(scratch));
   float* bound = mutable_data<float>(bounds);
   for (int a = 0; a < 3; ++a) {
     bound[a] = frame.low[a];
@@ -162,11 +170,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "encode_points(Tensor points, Tensor normals, Tensor encoder_params, float voxel_size, int neighborhood, float "
       "min_pair_weight, bool tf32=True) -> (Tensor, Tensor, Tensor)");
   m.def(
-      "encode_frame_(Tensor(a!) hash_keys, Tensor(b!) hash_values, Tensor(c!) voxel_coords, Tensor(d!) corner_ids, "
-      "Tensor(e!) embeddings, Tensor(f!) weights, int num_voxels, int max_voxels, Tensor points, Tensor normals, "
-      "Tensor "
-      "encoder_params, float voxel_size, int neighborhood, float min_pair_weight, int max_points, float min_weight, "
-      "float kappa, float max_weight, bool fuse_known, bool tf32, Tensor(g!) bounds) -> int");
+      "encode_frame_(Tensor(a!)[] volume, Tensor points, Tensor normals, Tensor encoder_params, float[] scalars, "
+      "int[] integers, Tensor(b!) bounds) -> int");
   m.def(
       "fuse_prior_(Tensor(a!) embeddings, Tensor(b!) weights, Tensor voxel_ids, Tensor features, Tensor "
       "feature_weights, float max_weight) -> ()");

@@ -9,40 +9,45 @@ namespace {
 
 constexpr char kName[] = "track_adam";
 
+// Places in the op's lists of numbers; spslam/ops/track_adam.py fills them.
+enum class Rate { kRotation, kTranslation, kCount };
+enum class Integer { kPixelStream, kNumPixels, kIterations, kGraph, kCount };
+
 std::tuple<Tensor, Tensor> track_adam(std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars,
                                       std::vector<std::int64_t> plane_layout, Tensor records, Tensor pose,
-                                      SPS_RENDER_OPTIONS_PARAMETERS, std::int64_t pixel_stream, std::int64_t num_pixels,
-                                      std::int64_t iterations, double rotation_rate, double translation_rate,
-                                      std::int64_t precision, std::int64_t graph) {
+                                      std::vector<double> render_scalars, std::vector<std::int64_t> render_integers,
+                                      std::vector<double> rate_list, std::vector<std::int64_t> integer_list) {
+  const Scalars<Rate> rates(kName, "rates", rate_list);
+  const Integers<Integer> integers(kName, "integers", integer_list);
   SPS_CHECK(records.dim() == 2 && records.size(0) >= 1 && records.size(1) == 3, kName,
             ": records must have shape [P, 3] with P >= 1");
-  SPS_CHECK(pose.numel() == 7, kName, ": pose must have 7 elements");
-  check_count(kName, "num_pixels", num_pixels);
-  check_count(kName, "iterations", iterations);
+  SPS_CHECK(pose.numel() == kPoseSize, kName, ": pose must have 7 elements");
+  check_count(kName, "num_pixels", integers[Integer::kNumPixels]);
+  check_count(kName, "iterations", integers[Integer::kIterations]);
   DeviceScope scope(pose);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
+  const RenderArgument render(kName, render_scalars, render_integers);
   records = contiguous(records);
   pose = contiguous(pose);
-  Tensor best = empty(pose, {7}, ScalarType::Float);
-  Tensor losses = empty(pose, {iterations, kLossTerms}, ScalarType::Float);
   PoseTracking call{};
   call.scene = scene.view;
   call.rays.records = data<std::int32_t>(records);
   call.rays.records_per_row = records.size(0);
-  call.rays.draw = philox_key(seed, pixel_stream, frame, iteration);
-  call.rays.num_rays = num_pixels;
+  call.rays.draw = render.pixel_key(integers[Integer::kPixelStream]);
+  call.rays.num_rays = integers[Integer::kNumPixels];
   call.rays.num_slots = 1;
-  call.intrinsics = load_intrinsics(kName, intrinsics);
-  call.options = load_options(kName, num_uniform, num_surface, near, far, truncation, cosine_targets, weights,
-                              philox_key(seed, stream, frame, iteration), precision);
-  call.iterations = iterations;
-  call.rotation_rate = rotation_rate;
-  call.translation_rate = translation_rate;
+  call.intrinsics = render.intrinsics;
+  call.options = render.options;
+  call.iterations = integers[Integer::kIterations];
+  call.rotation_rate = rates[Rate::kRotation];
+  call.translation_rate = rates[Rate::kTranslation];
+  Tensor best = empty(pose, {kPoseSize}, ScalarType::Float);
+  Tensor losses = empty(pose, {call.iterations, kLossTerms}, ScalarType::Float);
   call.start = data<float>(pose);
   call.best = mutable_data<float>(best);
   call.losses = mutable_data<float>(losses);
   Tensor workspace = empty(pose, {track_adam_workspace_size(scope.context, call)}, ScalarType::Byte);
-  spslam::track_adam(scope.context, call, workspace.mutable_data_ptr(), find_launch_graph(graph));
+  spslam::track_adam(scope.context, call, workspace.mutable_data_ptr(), find_launch_graph(integers[Integer::kGraph]));
   return {best, losses};
 }
 
@@ -50,9 +55,8 @@ std::tuple<Tensor, Tensor> track_adam(std::vector<Tensor> scene_tensors, std::ve
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
-  m.def("track_adam(" SPS_SCENE_SCHEMA ", Tensor records, Tensor pose, " SPS_RENDER_OPTIONS_SCHEMA
-        ", int pixel_stream, int num_pixels, int iterations, float rotation_rate, float translation_rate, "
-        "int precision=0, int graph=0) -> (Tensor, Tensor)");
+  m.def("track_adam(" SPS_SCENE_SCHEMA ", Tensor records, Tensor pose, " SPS_RENDER_SCHEMA
+        ", float[] rates, int[] integers) -> (Tensor, Tensor)");
 }
 #endif
 

@@ -44,7 +44,8 @@ void write_thumbnail(const RgbdImage& image, std::int32_t step, PaddedDepth& dep
   }
 }
 
-void write_view(const RgbdImage& image, const PixelSampling& sampling, PaddedDepth& depth, std::uint16_t* view) {
+void write_depth_image(const RgbdImage& image, const PixelSampling& sampling, PaddedDepth& depth,
+                       std::uint16_t* depth_image) {
   const std::int32_t step = sampling.depth_image_step;
   if (step == 0) return;
   const float per_unit = 1.0f / sampling.depth_image_unit;
@@ -53,9 +54,9 @@ void write_view(const RgbdImage& image, const PixelSampling& sampling, PaddedDep
     const std::int32_t columns = depth_image_size(image.width, step);
     SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) {
       const float units = row[c * step] * per_unit + 0.5f;
-      view[c] = static_cast<std::uint16_t>(units < 65536.0f ? static_cast<std::int32_t>(units) : 0);
+      depth_image[c] = static_cast<std::uint16_t>(units < 65536.0f ? static_cast<std::int32_t>(units) : 0);
     }
-    view += columns;
+    depth_image += columns;
   }
 }
 
@@ -68,13 +69,13 @@ void draw_batch(const RgbdImage& image, PaddedDepth& depth, const std::int32_t* 
     v[i] = place / image.width;
     u[i] = place - v[i] * image.width;
   }
-  const DepthImage depth_image{image.depth,
-                               image.width,
-                               image.height,
-                               {static_cast<float>(image.fx), static_cast<float>(image.fy),
-                                static_cast<float>(image.cx), static_cast<float>(image.cy)}};
+  const DepthImage whole{image.depth,
+                         image.width,
+                         image.height,
+                         {static_cast<float>(image.fx), static_cast<float>(image.fy), static_cast<float>(image.cx),
+                          static_cast<float>(image.cy)}};
   float* normals = out.normals + 3 * first;
-  normals_of_batch(depth_image, depth, u, v, n, sampling.step_px, sampling.max_jump, normals);
+  normals_of_batch(whole, depth, u, v, n, sampling.step_px, sampling.max_jump, normals);
   for (int i = 0; i < n; ++i) {
     const std::uint8_t* color = image.color + 3 * (static_cast<std::int64_t>(v[i]) * image.width + u[i]);
     pack_pixel(u[i], v[i], depth.row(v[i])[u[i]], color, normals + 3 * i, image.fx, image.fy, image.cx, image.cy,
@@ -92,7 +93,7 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
   std::int32_t* valid = scratch.valid.reserve(static_cast<std::int64_t>(image.width) * image.height + 1);
   const std::int64_t num_valid = list_valid(image, sampling, depth, valid);
   write_thumbnail(image, sampling.thumbnail_step, depth, out.depth_thumbnail);
-  write_view(image, sampling, depth, out.view);
+  write_depth_image(image, sampling, depth, out.depth_image);
   if (num_valid == 0) {
     std::fill(out.records, out.records + kPixelWords * sampling.count, 0);
     std::fill(out.normals, out.normals + 3 * sampling.count, 0.0f);

@@ -14,10 +14,10 @@
 
 namespace spslam {
 
-constexpr double kMinViewDepth = 0.05;   // m
+constexpr double kMinPointDepth = 0.05;  // m
 constexpr double kDepthAgreement = 0.1;  // m
 
-SPS_INLINE Pose<double> load_view_pose(const float* pose) {
+SPS_INLINE Pose<double> load_frame_pose(const float* pose) {
   const double p[kPoseSize] = {pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6]};
   return load_pose(p);
 }
@@ -34,7 +34,7 @@ SPS_INLINE float half_to_float(std::uint16_t bits) {
 }
 
 // World point of a packed pixel of a frame.
-SPS_INLINE Vec3<double> view_point(const std::int32_t* record, const Pose<double>& pose, const Intrinsics& k) {
+SPS_INLINE Vec3<double> pixel_point(const std::int32_t* record, const Pose<double>& pose, const Intrinsics& k) {
   const Pixel pixel = unpack_pixel(record);
   const double z = pixel.depth;
   const Vec3<double> local{(static_cast<double>(pixel.u) - k.cx) / k.fx * z,
@@ -44,29 +44,29 @@ SPS_INLINE Vec3<double> view_point(const std::int32_t* record, const Pose<double
 
 // A depth thumbnail cell holds the depth of its middle pixel; pixel u lies in cell (u + 1/2) / step, so that no pixel
 // is on the border of two.
-SPS_INLINE bool sees_point(const FrameViews& views, std::int64_t frame, const Pose<double>& pose,
+SPS_INLINE bool sees_point(const FrameThumbnails& frames, std::int64_t frame, const Pose<double>& pose,
                            const Vec3<double>& point) {
   const Vec3<double> d = point - pose.translation;
   const double* r = pose.rotation.m;
   const double x = r[0] * d.x + r[3] * d.y + r[6] * d.z, y = r[1] * d.x + r[4] * d.y + r[7] * d.z,
                z = r[2] * d.x + r[5] * d.y + r[8] * d.z;
-  if (!(z > kMinViewDepth)) return false;
-  const Intrinsics& k = views.intrinsics;
-  const double step = static_cast<double>(views.step);
+  if (!(z > kMinPointDepth)) return false;
+  const Intrinsics& k = frames.intrinsics;
+  const double step = static_cast<double>(frames.step);
   const double column = std::floor((x / z * k.fx + k.cx + 0.5) / step);
   const double row = std::floor((y / z * k.fy + k.cy + 0.5) / step);
-  if (!(column >= 0.0 && column < static_cast<double>(views.columns) && row >= 0.0 &&
-        row < static_cast<double>(views.rows))) {
+  if (!(column >= 0.0 && column < static_cast<double>(frames.columns) && row >= 0.0 &&
+        row < static_cast<double>(frames.rows))) {
     return false;
   }
   const std::int64_t cell =
-      (frame * views.rows + static_cast<std::int64_t>(row)) * views.columns + static_cast<std::int64_t>(column);
-  const double seen = half_to_float(views.depth_thumbnails[cell]);
+      (frame * frames.rows + static_cast<std::int64_t>(row)) * frames.columns + static_cast<std::int64_t>(column);
+  const double seen = half_to_float(frames.depth_thumbnails[cell]);
   return seen > 0.0 && std::fabs(seen - z) < kDepthAgreement;
 }
 
-SPS_INLINE bool is_frame(const FrameViews& views, std::int64_t row) {
-  return row >= 0 && row < views.num_frames;
+SPS_INLINE bool is_frame(const FrameThumbnails& frames, std::int64_t row) {
+  return row >= 0 && row < frames.num_frames;
 }
 
 // Fewest of the points that a co-visible frame sees.

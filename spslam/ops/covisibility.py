@@ -1,6 +1,6 @@
 """Which frames see what another one sees. Not differentiable.
 
-A frame sees a world point if the point projects into a cell of its depth depth_thumbnail and lies within 0.1 m of the depth
+A frame sees a world point if the point projects into a cell of its depth thumbnail and lies within 0.1 m of the depth
 there. Computed in float64, so that CPU and CUDA agree.
 """
 
@@ -26,10 +26,10 @@ def frame_overlap(
     Args:
         points: float32 [N, 3], m.
         poses: float32 [F, 7] T_world_camera, quaternion (w, x, y, z) and translation (m).
-        depth_thumbnails: float16 [F, h, w] depth (m) of the frames at every `thumbnail_step`-th pixel, the first in the middle of
-            the first cell; 0 where unknown.
+        depth_thumbnails: float16 [F, h, w] depth (m) of the frames at every `thumbnail_step`-th pixel, the first in the
+            middle of the first cell; 0 where unknown.
         intrinsics: of the whole image.
-        thumbnail_step: side of a depth_thumbnail cell, px.
+        thumbnail_step: side of a depth thumbnail's cell, px.
 
     Returns:
         float32 [F] in [0, 1]; 0 where N = 0 and for a pose that is not finite. Points and depths that are not are not
@@ -40,13 +40,13 @@ def frame_overlap(
 
     Example:
         >>> poses = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [0.0, 0, 1, 0, 0, 0, 0]])  # forward, and turned back
-        >>> depth_thumbnails = torch.full((2, 6, 8), 2.0, dtype=torch.float16)
-        >>> frame_overlap(torch.tensor([[0.1, 0.2, 2.0]]), poses, depth_thumbnails, Intrinsics(100, 100, 63.5, 47.5), 16)
+        >>> depth, camera = torch.full((2, 6, 8), 2.0, dtype=torch.float16), Intrinsics(100, 100, 63.5, 47.5)
+        >>> frame_overlap(torch.tensor([[0.1, 0.2, 2.0]]), poses, depth, camera, 16)
         tensor([1., 0.])
     """
     name = "frame_overlap"
     check_tensor(name, "points", points, ("N", 3), torch.float32)
-    _check_keyframes(name, poses, depth_thumbnails, intrinsics, thumbnail_step, like=points)
+    _check_frames(name, poses, depth_thumbnails, intrinsics, thumbnail_step, like=points)
     return torch.ops.spslam.frame_overlap(points, poses, depth_thumbnails, list(intrinsics), thumbnail_step)
 
 
@@ -93,43 +93,36 @@ def select_covisible_frames(
 
     Example:
         >>> poses = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [0.0, 0, 1, 0, 0, 0, 0]]).repeat(3, 1)  # every other one
-        >>> depth_thumbnails = torch.full((6, 6, 8), 2.0, dtype=torch.float16)  # looks back
+        >>> thumbnails = torch.full((6, 6, 8), 2.0, dtype=torch.float16)  # looks back
         >>> depth = torch.full((1,), 2.0).view(torch.int32)
         >>> record = torch.stack([torch.tensor([60 | 40 << 16], dtype=torch.int32), depth, 0 * depth], 1)
         >>> select_covisible_frames(
-        ...     record, 0, poses, depth_thumbnails, torch.arange(1, 6), Intrinsics(100, 100, 63.5, 47.5), thumbnail_step=16,
+        ...     record, 0, poses, thumbnails, torch.arange(1, 6), Intrinsics(100, 100, 63.5, 47.5), thumbnail_step=16,
         ...     num_points=10, num_covisible=2, count=3, threshold=0.1, seed=0, frame=0)
         tensor([1, 2, 4])
     """
     name = "select_covisible_frames"
     check_tensor(name, "records", records, ("P", 3), torch.int32)
     check(len(records) > 0, name, "records", "have at least one row", 0)
-    _check_keyframes(name, poses, depth_thumbnails, intrinsics, thumbnail_step, like=records)
+    _check_frames(name, poses, depth_thumbnails, intrinsics, thumbnail_step, like=records)
     check(0 <= current < len(poses), name, "current", f"be a row of the {len(poses)} poses", current)
     check_tensor(name, "candidates", candidates, ("M",), torch.int64, like=records)
     check(len(candidates) <= len(poses), name, "candidates", f"be at most {len(poses)} rows", len(candidates))
     for argument, number in (("num_points", num_points), ("num_covisible", num_covisible), ("count", count)):
         check(number >= 0, name, argument, "be at least 0", number)
     check(0 <= threshold <= 1, name, "threshold", "be in [0, 1]", threshold)
+    # The enum Integer in csrc/bindings/covisibility.cpp.
+    counts = [num_points, num_covisible, count]
+    integers = [current, thumbnail_step, *counts, seed, int(Stream.COVISIBILITY), frame]
     return torch.ops.spslam.select_covisible_frames(
-        records,
-        current,
-        poses,
-        depth_thumbnails,
-        candidates,
-        list(intrinsics),
-        thumbnail_step,
-        num_points,
-        num_covisible,
-        count,
-        threshold,
-        seed,
-        Stream.COVISIBILITY,
-        frame,
+        records, poses, depth_thumbnails, candidates, list(intrinsics), threshold, integers
     )
 
 
-def _check_keyframes(
+_COUNT = 4  # among the integers
+
+
+def _check_frames(
     name: str,
     poses: torch.Tensor,
     depth_thumbnails: torch.Tensor,
@@ -149,5 +142,5 @@ def _(points, poses, depth_thumbnails, intrinsics, thumbnail_step):
 
 
 @torch.library.register_fake("spslam::select_covisible_frames")
-def _(records, current, poses, depth_thumbnails, candidates, intrinsics, step, num_points, num_covisible, count, *_):
-    return candidates.new_empty(min(count, candidates.shape[0]))
+def _(records, poses, depth_thumbnails, candidates, intrinsics, threshold, integers):
+    return candidates.new_empty(min(integers[_COUNT], candidates.shape[0]))

@@ -153,28 +153,12 @@ def encode_frame_(
     check_tensor(name, "normals", normals, [points.shape[0], 3], torch.float32, like=points)
     check_tensor(name, "encoder_params", encoder_params, [ENCODER_PARAMETERS], torch.float32, like=points)
     bounds = torch.empty(2, 3)
+    tensors = [volume.hash_keys, volume.hash_values, volume.voxel_coords, volume.corner_ids, volume.embeddings]
+    # The enums Scalar and Integer in csrc/bindings/prior_fusion.cpp.
+    scalars = [fusion.voxel_size, fusion.min_pair_weight, fusion.min_weight, fusion.kappa, fusion.max_weight]
+    integers = [num_voxels, max_voxels, fusion.neighborhood, fusion.max_points, int(fusion.fuse_known), int(tf32)]
     new_voxels = torch.ops.spslam.encode_frame_(
-        volume.hash_keys,
-        volume.hash_values,
-        volume.voxel_coords,
-        volume.corner_ids,
-        volume.embeddings,
-        volume.weights,
-        num_voxels,
-        max_voxels,
-        points,
-        normals,
-        encoder_params,
-        fusion.voxel_size,
-        fusion.neighborhood,
-        fusion.min_pair_weight,
-        fusion.max_points,
-        fusion.min_weight,
-        fusion.kappa,
-        fusion.max_weight,
-        fusion.fuse_known,
-        tf32,
-        bounds,
+        [*tensors, volume.weights], points, normals, encoder_params, scalars, integers, bounds
     )
     return EncodedFrame(new_voxels, num_voxels + new_voxels <= max_voxels, bounds)
 

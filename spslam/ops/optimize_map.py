@@ -90,6 +90,11 @@ class MapMoments:
         """In the order of the attributes."""
         return self.embeddings, self.texels, self.geometry_params, self.color_params, self.poses
 
+    def arguments(self) -> tuple[list[torch.Tensor], list[float]]:
+        """What the schema takes: the tensors of what is not frozen, and all rates, -1 where frozen."""
+        tensors = [tensor for moments in self.all() if moments is not None for tensor in moments.tensors()]
+        return tensors, [-1.0 if moments is None else moments.rate for moments in self.all()]
+
 
 _PARAMETERS = ("embeddings", "texels", "geometry_params", "color_params", "poses")
 
@@ -206,17 +211,18 @@ def optimize_map_(
             poses,
             frames,
             *options.arguments(intrinsics),
-            int(pixel_stream),
-            num_pixels,
-            iterations,
-            fixed_frame,
-            *[[] if m is None else m.tensors() for m in moments.all()],
-            [0.0 if m is None else m.rate for m in moments.all()],
-            first_step,
-            first_stamp,
+            *moments.arguments(),
+            # The enum Integer in csrc/bindings/optimize_map.cpp.
+            [
+                int(pixel_stream),
+                num_pixels,
+                iterations,
+                fixed_frame,
+                first_step,
+                first_stamp,
+                0 if graph is None else graph.number(poses.device),
+            ],
             losses,
-            options.precision_code,
-            0 if graph is None else graph.number(poses.device),
         )
     return losses
 

@@ -8,7 +8,7 @@ from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops._public import public_op
 
-_MAX_SIDE = 2**16 - 1  # a record has 16 bits a coordinate
+_MAX_SIDE = 2**16 - 1  # a record has 16 bits per coordinate
 _MAX_COUNT = 2**30
 
 
@@ -20,9 +20,9 @@ class PixelSampling:
         count: pixels to draw, P.
         min_depth, max_depth: pixels nearer or farther, m, are not drawn.
         step_px, max_jump: of the normals, see `depth_normals`.
-        thumbnail_step: distance of the depth_thumbnail's pixels, px; the first lies at half of it.
-        depth_image_step: distance of the view's pixels, px; the first lies at 0. With 0 there is no view.
-        depth_image_unit: m, of the view's depth.
+        thumbnail_step: distance of the depth thumbnail's pixels, px; the first lies at half of it.
+        depth_image_step: distance of the small depth image's pixels, px; the first lies at 0. With 0 there is none.
+        depth_image_unit: m, of the small image's depth.
     """
 
     count: int
@@ -35,12 +35,12 @@ class PixelSampling:
     depth_image_unit: float = 1e-3
 
     def thumbnail_shape(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the depth_thumbnail of an image."""
+        """Rows and columns of the depth thumbnail of an image."""
         first, step = self.thumbnail_step // 2, self.thumbnail_step
         return len(range(first, height, step)), len(range(first, width, step))
 
     def depth_image_shape(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the view of an image; 0 and 0 where there is none."""
+        """Rows and columns of the small depth image of an image; 0 and 0 where there is none."""
         return _depth_image_size(height, self.depth_image_step), _depth_image_size(width, self.depth_image_step)
 
 
@@ -76,11 +76,11 @@ def sample_frame_pixels(
         seed, stream, frame: key of the draw, as in `philox_uniform`.
 
     Returns:
-        buffer int32 [3 P + 3 P + ceil(h w / 2) + ceil(h' w' / 2)]: the records [P, 3], the normals [P, 3] as the bits
-        of float32, float16 depth [h, w] (m, 0 where invalid) at every `thumbnail_step`-th pixel, two a word, and the
-        view, uint16 depth [h', w'] in `depth_image_unit` m, rounded (0 where invalid or beyond 65535) at every `depth_image_step`-th
-        pixel, two a word; and the number of valid pixels. Where that is 0, records and normals are 0. The same bits on
-        every run.
+        buffer int32 [3 P + 3 P + ceil(h w / 2) + ceil(h' w' / 2)]: the records [P, 3]; the normals [P, 3] as the bits
+        of float32; the depth thumbnail, float16 [h, w] (m, 0 where invalid) at every `thumbnail_step`-th pixel, two per
+        word; and the small depth image, uint16 [h', w'] in `depth_image_unit`, rounded (0 where invalid or beyond
+        65535), at every `depth_image_step`-th pixel, two per word. And the number of valid pixels. Where that is 0,
+        records and normals are 0. The same bits on every run.
 
     Raises:
         ValueError: wrong shapes or devices, or a number out of range.
@@ -119,25 +119,18 @@ def sample_frame_pixels(
     )
     check(sampling.depth_image_unit > 0, name, "depth_image_unit", "be positive", sampling.depth_image_unit)
     buffer, num_valid = torch.ops.spslam.sample_frame_pixels(
-        depth,
-        color,
-        fx,
-        fy,
-        cx,
-        cy,
-        sampling.count,
-        sampling.min_depth,
-        sampling.max_depth,
-        sampling.step_px,
-        sampling.max_jump,
-        sampling.thumbnail_step,
-        sampling.depth_image_step,
-        sampling.depth_image_unit,
-        seed,
-        stream,
-        frame,
+        depth, color, *_arguments(sampling, (fx, fy, cx, cy), (seed, stream, frame))
     )
     return buffer, num_valid
+
+
+def _arguments(
+    sampling: PixelSampling, camera: tuple[float, ...], key: tuple[int, ...]
+) -> tuple[list[float], list[int]]:
+    """The schema's scalars and integers: the enums Scalar and Integer in csrc/bindings/pixel_sampling.cpp."""
+    scalars = [*camera, sampling.min_depth, sampling.max_depth, sampling.max_jump, sampling.depth_image_unit]
+    steps = [sampling.step_px, sampling.thumbnail_step, sampling.depth_image_step]
+    return scalars, [sampling.count, *steps, *(int(part) for part in key)]
 
 
 @public_op()
@@ -182,22 +175,9 @@ def _(records, normals, pose, fx, fy, cx, cy):
 
 
 @torch.library.register_fake("spslam::sample_frame_pixels")
-def _(
-    depth,
-    color,
-    fx,
-    fy,
-    cx,
-    cy,
-    count,
-    min_depth,
-    max_depth,
-    step_px,
-    max_jump,
-    thumbnail_step,
-    depth_image_step,
-    *rest,
-):
+def _(depth, color, scalars, integers):
+    count, _, thumbnail_step, depth_image_step = integers[:4]
     height, width = (max(0, -((thumbnail_step // 2 - size) // thumbnail_step)) for size in depth.shape)
-    view = _depth_image_size(depth.shape[0], depth_image_step) * _depth_image_size(depth.shape[1], depth_image_step)
-    return depth.new_empty((6 * count + (height * width + 1) // 2 + (view + 1) // 2,), dtype=torch.int32), 0
+    rows, columns = (_depth_image_size(size, depth_image_step) for size in depth.shape)
+    words = 6 * count + (height * width + 1) // 2 + (rows * columns + 1) // 2
+    return depth.new_empty((words,), dtype=torch.int32), 0

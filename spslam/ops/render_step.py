@@ -89,27 +89,13 @@ class RenderOptions:
         check(self.truncation > 0, function, "truncation", "be positive", self.truncation)
         check(self.precision in PRECISIONS, function, "precision", f"be {' or '.join(PRECISIONS)}", self.precision)
 
-    @property
-    def precision_code(self) -> int:
-        """The number that schemas take for it."""
-        return PRECISIONS.index(self.precision)
-
-    def arguments(self, intrinsics: Intrinsics) -> tuple[object, ...]:
-        """What schemas take from the camera's intrinsics to the iteration."""
-        return (
-            list(intrinsics),
-            self.num_uniform,
-            self.num_surface,
-            self.near,
-            self.far,
-            self.truncation,
-            self.cosine_targets,
-            [self.weight_rgb, self.weight_depth, self.weight_free_space, self.weight_sdf],
-            self.seed,
-            int(self.stream),
-            self.frame,
-            self.iteration,
-        )
+    def arguments(self, intrinsics: Intrinsics) -> tuple[list[float], list[int]]:
+        """The scalars and integers of schemas: the enums in csrc/bindings/render_options.h."""
+        weights = [self.weight_rgb, self.weight_depth, self.weight_free_space, self.weight_sdf]
+        samples = [self.num_uniform, self.num_surface, int(self.cosine_targets)]
+        key = [self.seed, int(self.stream), self.frame, self.iteration]
+        scalars = [*intrinsics, self.near, self.far, self.truncation, *weights]
+        return scalars, [*samples, *key, PRECISIONS.index(self.precision)]
 
 
 @dataclass(frozen=True)
@@ -224,22 +210,24 @@ def render_step(
     )
     torch.ops.spslam.render_step(
         *scene.arguments(),
-        rays.pixels,
-        rays.ray_frames,
-        rays.poses,
+        [rays.pixels, rays.ray_frames, rays.poses],
         *options.arguments(rays.intrinsics),
+        g.stamp,
         step.losses,
         step.grad_poses,
-        g.embeddings,
-        g.embedding_stamps,
-        g.texels,
-        g.texel_stamps,
-        step.grad_geometry,
-        step.grad_color,
-        g.stamp,
-        options.precision_code,
+        _decoder_outputs(step.grad_geometry, g.embeddings, g.embedding_stamps),
+        _decoder_outputs(step.grad_color, g.texels, g.texel_stamps),
     )
     return step
+
+
+def _decoder_outputs(
+    params: torch.Tensor | None, table: torch.Tensor | None, stamps: torch.Tensor | None
+) -> list[torch.Tensor]:
+    """Gradients of a decoder and of its table, and the table's stamps if any; nothing where they are frozen."""
+    if params is None or table is None:
+        return []
+    return [params, table] if stamps is None else [params, table, stamps]
 
 
 @torch.library.register_fake("spslam::render_step")

@@ -83,17 +83,15 @@ def track_adam(
             records,
             pose,
             *options.arguments(intrinsics),
-            int(pixel_stream),
-            num_pixels,
-            iterations,
-            rotation_rate,
-            translation_rate,
-            options.precision_code,
-            0 if graph is None else graph.number(pose.device),
+            [rotation_rate, translation_rate],
+            # The enum Integer in csrc/bindings/track_adam.cpp.
+            [int(pixel_stream), num_pixels, iterations, 0 if graph is None else graph.number(pose.device)],
         )
 
 
+_ITERATIONS = 2  # among the integers
+
+
 @torch.library.register_fake("spslam::track_adam")
-def _(scene, scene_scalars, plane_layout, records, pose, *args):
-    iterations = args[14]  # after twelve of the options, the pixel stream and the number of pixels
-    return pose.new_empty(7), pose.new_empty(iterations, 5)
+def _(scene, scene_scalars, plane_layout, records, pose, render_scalars, render_integers, rates, integers):
+    return pose.new_empty(7), pose.new_empty(integers[_ITERATIONS], 5)

@@ -165,5 +165,5 @@ def test_opcheck(device, generator):
     k = list(INTRINSICS)
     points = torch.rand(9, 3, generator=generator)
     opcheck(torch.ops.spslam.frame_overlap.default, (points, poses, depth_thumbnails, k, STEP), device)
-    arguments = (records, 5, poses, depth_thumbnails, torch.arange(5), k, STEP, 64, 2, 3, 0.1, 0, 6, 0)
+    arguments = (records, poses, depth_thumbnails, torch.arange(5), k, 0.1, [5, STEP, 64, 2, 3, 0, 6, 0])
     opcheck(torch.ops.spslam.select_covisible_frames.default, arguments, device)

@@ -270,9 +270,9 @@ def test_opcheck(device, generator):
     volume = SparseVolume(0.04, device=device)
     tensors = [getattr(volume.buffers, field.name) for field in dataclasses.fields(volume.buffers)]
     points, normals = (x.to(device) for x in wall(50, generator))
-    numbers = (0.04, 64, 1e-4, 8000, 0.006, 2.5, 20.0, True, True)
+    scalars, integers = [0.04, 1e-4, 0.006, 2.5, 20.0], [0, 1 << 16, 64, 8000, 1, 1]
     torch.library.opcheck(
         torch.ops.spslam.encode_frame_,
-        (*tensors, 0, 1 << 16, points, normals) + (random_encoder(generator).to(device), *numbers, torch.empty(2, 3)),
+        (tensors, points, normals, random_encoder(generator).to(device), scalars, integers, torch.empty(2, 3)),
         test_utils=("test_schema", "test_autograd_registration"),
     )

@@ -34,30 +34,32 @@ def frame(generator, height=50, width=70, noise=0.004):
 
 
 def split(buffer, sampling, shape):
-    """Records, normals, depth_thumbnail and view as the buffer holds them."""
+    """Records, normals, depth thumbnail and small depth image as the buffer holds them."""
     (h, w), (rows, columns) = sampling.thumbnail_shape(*shape), sampling.depth_image_shape(*shape)
-    words, depth_thumbnail, view = buffer.split([6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2])
+    words, depth_thumbnail, depth_image = buffer.split(
+        [6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2]
+    )
     records, normals = words.view(2, sampling.count, 3)
-    depth_thumbnail, view = depth_thumbnail.view(torch.float16), view.view(torch.uint16)
+    depth_thumbnail, depth_image = depth_thumbnail.view(torch.float16), depth_image.view(torch.uint16)
     assert not depth_thumbnail[h * w :].any()
-    assert not view[rows * columns :].any()
+    assert not depth_image[rows * columns :].any()
     return (
         records,
         normals.view(torch.float32),
         depth_thumbnail[: h * w].view(h, w),
-        view[: rows * columns].view(rows, columns),
+        depth_image[: rows * columns].view(rows, columns),
     )
 
 
 def check_against_numpy(depth, color, sampling):
     buffer, num_valid = ops.sample_frame_pixels(depth, color, *CAMERA, sampling, *KEY)
-    records, normals, depth_thumbnail, view = split(buffer, sampling, depth.shape)
+    records, normals, depth_thumbnail, depth_image = split(buffer, sampling, depth.shape)
     want = reference.sample_frame_pixels(depth.numpy(), color.numpy(), *CAMERA, sampling, *KEY)
     assert num_valid == want[4]
     np.testing.assert_array_equal(records.numpy(), want[0])
     np.testing.assert_array_equal(normals.numpy(), want[1])
     np.testing.assert_array_equal(depth_thumbnail.numpy(), want[2])
-    np.testing.assert_array_equal(view.numpy(), want[3])
+    np.testing.assert_array_equal(depth_image.numpy(), want[3])
     return records, normals
 
 
@@ -195,10 +197,10 @@ def test_wrong_arguments_are_named(generator):
 
 def test_opcheck(generator):
     depth, color = frame(generator)
-    numbers = (100, 0.1, 6.0, 3, 0.05, 16, 2, 1e-3, 7, 0, 3)
+    scalars, integers = [*CAMERA, 0.1, 6.0, 0.05, 1e-3], [100, 3, 16, 2, 7, 0, 3]
     torch.library.opcheck(
         torch.ops.spslam.sample_frame_pixels,
-        (depth, color, *CAMERA, *numbers),
+        (depth, color, scalars, integers),
         test_utils=("test_schema", "test_autograd_registration"),
     )
 

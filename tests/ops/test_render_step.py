@@ -8,7 +8,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import matrix_to_pose7, quaternion_to_matrix
-from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, TRUNCATION, make_scene
+from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, make_scene
 from tests.ops.step_inputs import gradient_buffers, noisy_rays
 from tests.reference.render_step import PARAMETERS, render_step
 
@@ -259,7 +259,6 @@ def test_opcheck(device, generator):
     scene = make_scene(generator, random_decoder=True, device=device)
     rays, g = noisy_rays(generator, device=device), gradient_buffers(scene)
     new = rays.poses.new_empty
-    args = (rays.pixels, rays.ray_frames, rays.poses, list(INTRINSICS), 32, 11, 0.2, 1.02, TRUNCATION, True)
-    args += ([10.0, 0.1, 20.0, 1000.0], 1, 4, 0, 0, new(5), new(3, 6), g.embeddings, g.embedding_stamps)
-    args += (g.texels, g.texel_stamps, new(1473), new(2211), 3)
+    args = ([rays.pixels, rays.ray_frames, rays.poses], *OPTIONS.arguments(INTRINSICS), 3, new(5), new(3, 6))
+    args += ([new(1473), g.embeddings, g.embedding_stamps], [new(2211), g.texels, g.texel_stamps])
     torch.library.opcheck(torch.ops.spslam.render_step, (*scene.arguments(), *args))

@@ -130,7 +130,7 @@ def test_tracking_leaves_the_scene(device, options, generator):
 
 def test_opcheck(device, options, generator):
     scene, records, start = make_problem(device, generator, random_decoder=True)
-    args = (*scene.arguments(), records, start, *options.arguments(INTRINSICS), 1, 20, 3, 1e-3, 2e-3)
+    args = (*scene.arguments(), records, start, *options.arguments(INTRINSICS), [1e-3, 2e-3], [1, 20, 3, 0])
     torch.library.opcheck(torch.ops.spslam.track_adam, args)
 
 

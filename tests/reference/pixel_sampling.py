@@ -1,4 +1,4 @@
-"""Sampling a frame's pixels, in NumPy: mask, draw, normals, packing, depth_thumbnail, view, one after the other."""
+"""Sampling a frame's pixels, in NumPy: mask, draw, normals, packing, thumbnail, depth image, one after the other."""
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ def usable_depth(depth: np.ndarray, min_depth: float, max_depth: float) -> np.nd
 
 
 def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSampling, seed, stream, frame):
-    """Records int32 [P, 3], normals float32 [P, 3], thumbnail float16, depth image uint16, and the valid pixels."""
+    """Records int32 [P, 3], normals float32 [P, 3], thumbnail float16, depth image uint16, number of valid pixels."""
     depth = usable_depth(depth, sampling.min_depth, sampling.max_depth)
     valid = np.flatnonzero(depth)
     count = sampling.count if len(valid) else 0
@@ -33,10 +33,10 @@ def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSamplin
     records[:, 2] = rgbc.view(np.uint32)[:, 0]
     step = sampling.thumbnail_step
     depth_thumbnail = depth[step // 2 :: step, step // 2 :: step].astype(np.float16)
-    return records.view(np.int32), normals, depth_thumbnail, _view(depth, sampling), len(valid)
+    return records.view(np.int32), normals, depth_thumbnail, _depth_image(depth, sampling), len(valid)
 
 
-def _view(depth: np.ndarray, sampling: ops.PixelSampling) -> np.ndarray:
+def _depth_image(depth: np.ndarray, sampling: ops.PixelSampling) -> np.ndarray:
     if sampling.depth_image_step == 0:
         return np.zeros((0, 0), np.uint16)
     kept = depth[:: sampling.depth_image_step, :: sampling.depth_image_step]

@@ -9,9 +9,8 @@
 
 namespace spslam {
 
-// Frames as far as co-visibility goes: their poses, and depth at the middle of each cell of a depth thumbnail over the
-// image.
-struct FrameViews {
+// What co-visibility knows of frames: their poses, and depth thumbnails, whose cells hold the depth at their middle.
+struct FrameThumbnails {
   const float* poses;                     // [num_frames, 7]
   const std::uint16_t* depth_thumbnails;  // [num_frames, rows, columns] bits of float16, m; 0 where unknown
   std::int64_t num_frames, rows, columns;
@@ -21,7 +20,8 @@ struct FrameViews {
 
 // share [num_frames]: of the world points [num_points, 3] (m), how many each frame sees at the depth it measured.
 template <class Device>
-void frame_overlap(Device device, const float* points, std::int64_t num_points, const FrameViews& views, float* share);
+void frame_overlap(Device device, const float* points, std::int64_t num_points, const FrameThumbnails& frames,
+                   float* share);
 
 struct CovisibleSelection {
   std::int64_t current;        // row of the frame that the others are compared with
@@ -33,7 +33,7 @@ struct CovisibleSelection {
 };
 
 template <class Device>
-std::int64_t covisible_workspace_size(Device device, const FrameViews& views, std::int64_t num_candidates,
+std::int64_t covisible_workspace_size(Device device, const FrameThumbnails& frames, std::int64_t num_candidates,
                                       const CovisibleSelection& selection);
 
 // selected [count], ascending: the first co-visible of the candidates [num_candidates] (rows in order of preference),
@@ -41,7 +41,7 @@ std::int64_t covisible_workspace_size(Device device, const FrameViews& views, st
 // selected is -1 then. records [num_records, 3] are the current frame's pixels.
 template <class Device>
 void select_covisible_frames(Device device, const std::int32_t* records, std::int64_t num_records,
-                             const FrameViews& views, const std::int64_t* candidates, std::int64_t num_candidates,
+                             const FrameThumbnails& frames, const std::int64_t* candidates, std::int64_t num_candidates,
                              const CovisibleSelection& selection, void* workspace, std::int64_t* selected);
 
 }  // namespace spslam

@@ -9,7 +9,7 @@
 
 namespace spslam {
 
-// A frame's images, pixel by pixel of the same view, and its camera (px).
+// A frame's depth and color images, aligned with each other, and its camera (px).
 struct RgbdImage {
   const float* depth;         // [height, width], m; 0, negative and not finite are invalid
   const std::uint8_t* color;  // [height, width, 3]
@@ -22,18 +22,17 @@ struct PixelSampling {
   float min_depth, max_depth;     // m; others, 0 and not finite ones are not drawn
   std::int32_t step_px;           // of the normals' differences
   float max_jump;                 // of depth beside a normal, as a share
-  std::int32_t thumbnail_step;    // px; the first depth thumbnail pixel lies at half of it
-  std::int32_t depth_image_step;  // px; the first of the view lies at 0; 0: no view
-  float depth_image_unit;         // m, of the view's depth
+  std::int32_t thumbnail_step;    // px; the first pixel of the depth thumbnail lies at half of it
+  std::int32_t depth_image_step;  // px; the first pixel of the small depth image lies at 0; 0: no depth image
+  float depth_image_unit;         // m, of its depth
 };
 
 // Where the results go.
 struct SampledPixels {
   std::int32_t* records;           // [count, 3], see kernels/pixel_record.h
   float* normals;                  // [count, 3], camera axes, towards the camera; 0 where unknown
-  std::uint16_t* depth_thumbnail;  // [thumbnail_size(height), thumbnail_size(width)] float16 depth (m), 0 where invalid
-  std::uint16_t*
-      view;  // [depth_image_size(height), depth_image_size(width)] depth in units, 0 where invalid or too far
+  std::uint16_t* depth_thumbnail;  // [thumbnail_size(height), thumbnail_size(width)] float16 m, 0 where invalid
+  std::uint16_t* depth_image;      // [depth_image_size(height), depth_image_size(width)] units, 0: invalid or too far
 };
 
 constexpr std::int32_t thumbnail_size(std::int32_t size, std::int32_t step) {
