@@ -22,7 +22,7 @@ from typing import NamedTuple
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
@@ -177,8 +177,8 @@ def track_gauss_newton(
     check(len(pixels) > 0, name, "pixels", "have at least one row", 0)
     check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
     check_intrinsics(name, intrinsics)
-    check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
-    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
+    check_count(name, "num_pixels", num_pixels)
+    check_count(name, "iterations", iterations)
     check(truncation > 0, name, "truncation", "be positive", truncation)
     check(
         kernel_start > 0 and kernel_end > 0,
