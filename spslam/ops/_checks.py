@@ -13,6 +13,12 @@ def check(condition: bool, function: str, argument: str, rule: str, actual: obje
         raise ValueError(f"{function}: {argument} must {rule}, got {actual}")
 
 
+def check_count(function: str, argument: str, count: int, least: int = 1) -> None:
+    """Checks how many rays, points, iterations or channels there are to be: products of them must fit 64 bits."""
+    check(count >= least, function, argument, f"be at least {least}", count)
+    check(count <= 2**30, function, argument, "be at most 2^30", count)
+
+
 def check_tensor(
     function: str,
     argument: str,

@@ -7,7 +7,7 @@ there. Computed in float64, so that CPU and CUDA agree.
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.ray_sampling import Stream
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
@@ -108,7 +108,8 @@ def select_covisible_frames(
     check(0 <= current < len(poses), name, "current", f"be a row of the {len(poses)} poses", current)
     check_tensor(name, "candidates", candidates, ("M",), torch.int64, like=records)
     check(len(candidates) <= len(poses), name, "candidates", f"be at most {len(poses)} rows", len(candidates))
-    for argument, number in (("num_points", num_points), ("num_covisible", num_covisible), ("count", count)):
+    check_count(name, "num_points", num_points, least=0)
+    for argument, number in (("num_covisible", num_covisible), ("count", count)):
         check(number >= 0, name, argument, "be at least 0", number)
     check(0 <= threshold <= 1, name, "threshold", "be in [0, 1]", threshold)
     # The enum Integer in csrc/bindings/covisibility.cpp.

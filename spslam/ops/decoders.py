@@ -6,7 +6,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._autograd import register_gradient
-from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._checks import FLOATING, check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
@@ -71,8 +71,8 @@ def mlp(
         torch.Size([1000, 1])
     """
     check_tensor("mlp", "input", input, ["N", "I"], FLOATING)
-    check(hidden >= 1, "mlp", "hidden", "be at least 1", hidden)
-    check(output >= 1, "mlp", "output", "be at least 1", output)
+    check_count("mlp", "hidden", hidden)
+    check_count("mlp", "output", output)
     check(int(activation) in (0, 1, 2), "mlp", "activation", "be 0, 1 or 2", activation)
     check_tensor("mlp", "params", params, [mlp_num_params(input.shape[1], hidden, output)], input.dtype, like=input)
     return torch.ops.spslam.mlp(input, params, hidden, output, int(activation))

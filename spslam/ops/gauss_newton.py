@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.earlier_frames import DepthKeyframes, ReferenceImage
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
@@ -88,8 +88,8 @@ class GaussNewtonOptions:
 
     def check(self, function: str) -> None:
         """Raises ValueError, naming `function`, where a number is out of range."""
-        check(self.num_pixels >= 1, function, "num_pixels", "be at least 1", self.num_pixels)
-        check(self.iterations >= 1, function, "iterations", "be at least 1", self.iterations)
+        check_count(function, "num_pixels", self.num_pixels)
+        check_count(function, "iterations", self.iterations)
         check(self.truncation > 0, function, "truncation", "be positive", self.truncation)
         check(self.kernel_start > 0, function, "kernel_start", "be positive", self.kernel_start)
         check(self.kernel_end > 0, function, "kernel_end", "be positive", self.kernel_end)

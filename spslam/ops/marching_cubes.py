@@ -6,6 +6,7 @@ from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops._public import public_op
 
+_MAX_SAMPLES = 1025  # an axis: a cell's samples are counted in 32 bits
 _OUT_OF_RANGE = 1  # kCoordOutOfRange in csrc/include/spslam/marching_cubes.h
 
 
@@ -36,8 +37,8 @@ def marching_cubes(
 
     Raises:
         TypeError: a tensor of another dtype.
-        ValueError: shapes or devices that do not fit, fewer than two samples an axis, coordinates out of range or
-            repeated.
+        ValueError: shapes or devices that do not fit, less than 2 or more than 1025 samples an axis, coordinates out of
+            range or repeated.
 
     Example:
         >>> axis = torch.linspace(-1, 1, 9)
@@ -52,6 +53,7 @@ def marching_cubes(
     cells, side = values.shape[:2]
     check_tensor(name, "values", values, (cells, side, side, side), torch.float32)
     check(side >= 2, name, "values", "have at least 2 samples an axis", side)
+    check(side <= _MAX_SAMPLES, name, "values", f"have at most {_MAX_SAMPLES} samples an axis", side)
     check_tensor(name, "cell_coords", cell_coords, (cells, 3), torch.int32, like=values)
     with torch.no_grad():
         vertices, faces, faults = torch.ops.spslam.marching_cubes(cell_coords, values, level)

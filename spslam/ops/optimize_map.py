@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import Stream
@@ -198,9 +198,9 @@ def optimize_map_(
     check(len(frames) >= 1, name, "frames", "name at least one frame", len(frames))
     check_intrinsics(name, intrinsics)
     moments.check(name, scene, poses)
-    check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
-    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
-    check(first_step >= 1, name, "first_step", "be at least 1", first_step)
+    check_count(name, "num_pixels", num_pixels)
+    check_count(name, "iterations", iterations)
+    check_count(name, "first_step", first_step)
     last_stamp = first_stamp + iterations - 1
     check(first_stamp >= -(2**31) and last_stamp < 2**31, name, "first_stamp", "fit 32 bits", first_stamp)
     losses = poses.new_empty(iterations, 5)

@@ -66,6 +66,7 @@ def sparse_adam_(
         check_tensor(name, "stamps", stamps, (param.shape[0],), torch.int32, like=param)
     check(-(2**31) <= stamp < 2**31, name, "stamp", "fit 32 bits", stamp)
     check(lr >= 0, name, "lr", "be at least 0", lr)
+    check(len(betas) == 2, name, "betas", "be two numbers", betas)
     check(all(0 <= beta < 1 for beta in betas), name, "betas", "be in [0, 1)", betas)
     check(eps >= 0, name, "eps", "be at least 0", eps)
     check(step >= 1, name, "step", "be at least 1", step)

@@ -9,6 +9,7 @@ from spslam.ops._vmap import register_rows_vmap
 
 FEATURES = 8
 _HIDDEN = 64
+_MAX_SIDE = 2**16 - 1  # of an image, px
 # Encoder, as the layout of `mlp` has it: W1 [64, 6], b1, W2 [64, 64], b2, W3 [8, 64], b3.
 ENCODER_PARAMETERS = _HIDDEN * (6 + 1) + _HIDDEN * (_HIDDEN + 1) + FEATURES * (_HIDDEN + 1)
 
@@ -33,7 +34,7 @@ def depth_normals(
         depth: float32 [H, W], meters; 0, negative and not finite are invalid.
         pixels: int32 [N, 2], (u, v): column, row.
         fx, fy, cx, cy: pinhole camera, px.
-        step_px: distance of the differences, at least 1.
+        step_px: distance of the differences, 1 to 65535.
         max_jump: a neighbor whose depth differs by this share of the pixel's, or more, is another surface.
 
     Returns:
@@ -42,7 +43,7 @@ def depth_normals(
         an empty tensor.
 
     Raises:
-        ValueError: wrong shapes or devices, `fx`, `fy` or `max_jump` not positive, `step_px` below 1.
+        ValueError: wrong shapes or devices, `fx`, `fy` or `max_jump` not positive, `step_px` out of range.
         TypeError: wrong dtypes.
 
     Example:
@@ -56,6 +57,7 @@ def depth_normals(
     check(fx > 0, name, "fx", "be positive", fx)
     check(fy > 0, name, "fy", "be positive", fy)
     check(step_px >= 1, name, "step_px", "be at least 1", step_px)
+    check(step_px <= _MAX_SIDE, name, "step_px", f"be at most {_MAX_SIDE}", step_px)
     check(max_jump > 0, name, "max_jump", "be positive", max_jump)
     return torch.ops.spslam.depth_normals(depth, pixels, fx, fy, cx, cy, step_px, max_jump)
 

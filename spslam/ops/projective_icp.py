@@ -8,7 +8,7 @@ Blais and Levine 1995.
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
@@ -71,7 +71,7 @@ def projective_icp(
     check_tensor(name, "normals", normals, tuple(vertices.shape), torch.float32, like=points)
     check_tensor(name, "pose", pose, (7,), torch.float32, like=points)
     check_intrinsics(name, intrinsics)
-    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
+    check_count(name, "iterations", iterations)
     check(max_distance > 0, name, "max_distance", "be positive", max_distance)
     kernels = (kernel_start, kernel_end)
     check(min(kernels) > 0, name, "kernel_start and kernel_end", "be positive", kernels)

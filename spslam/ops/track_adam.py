@@ -3,7 +3,7 @@
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import Stream
@@ -73,8 +73,8 @@ def track_adam(
     check(len(records) >= 1, name, "records", "hold at least one pixel", len(records))
     check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
     check_intrinsics(name, intrinsics)
-    check(num_pixels >= 1, name, "num_pixels", "be at least 1", num_pixels)
-    check(iterations >= 1, name, "iterations", "be at least 1", iterations)
+    check_count(name, "num_pixels", num_pixels)
+    check_count(name, "iterations", iterations)
     check(rotation_rate >= 0, name, "rotation_rate", "be at least 0", rotation_rate)
     check(translation_rate >= 0, name, "translation_rate", "be at least 0", translation_rate)
     with torch.no_grad():

@@ -28,6 +28,9 @@ TABLES = ("hash_keys", "hash_values", "corner_ids")
 EXTREME_FLOATS = (math.nan, math.inf, -math.inf, 1e30, -1e30, 1e-38)
 # What bindings take beside tensors: sums and products of these would not fit 64 bits, or 32.
 EXTREME_ARGUMENTS = (-(2**63), -(2**62), -(2**31) - 1, -1, 2**31, 2**32 + 1, 2**62, 2**63 - 1)
+# How many of something there are to be: within 2^30.
+COUNTS = ("num_pixels", "iterations", "num_points", "hidden", "output", "first_step", "num_uniform", "num_surface")
+HUGE_COUNTS = (2**30 + 1, 2**31, 2**62, 2**63 - 1)
 # Numbers, not tensors: no counts, which say how long a call runs.
 EXTREME_NUMBERS = {float: (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e30), int: (-(2**63), -(2**31), -1, 0)}
 
@@ -224,6 +227,16 @@ def test_sizes_without_memory_do_no_harm():
         op.marching_cubes(torch.zeros(0, 3, dtype=torch.int32), torch.zeros(0, 2**20, 2**20, 2**20), 0.0)
     with pytest.raises(RuntimeError, match=r"frames must be in \[0, 2\^30\]"):
         op.normal_equations(torch.zeros(2**61, 0), torch.zeros(2**61, 0, 6), torch.zeros(2**61, 0))
+
+
+@each_op
+def test_huge_counts_are_refused(name, device, generator):
+    call = arguments(name, generator, device)
+    for path in numbers(call):
+        if path[-1] in COUNTS:
+            for count in HUGE_COUNTS:
+                with pytest.raises(ValueError, match=rf"{name}: .*{path[-1]}.* must .*, got [0-9]+$"):
+                    run(name, changed(call, path, count))
 
 
 @each_op

@@ -41,6 +41,8 @@ void check(bool condition, const Argument& argument, const std::string& rule, Nu
   if (condition) return;
   if constexpr (std::is_integral_v<Number>) {
     refuse_value(argument, rule, std::to_string(actual));
+  } else if constexpr (std::is_same_v<Number, std::string>) {
+    refuse_value(argument, rule, actual);
   } else {
     refuse_value(argument, rule, py::cast<std::string>(py::repr(py::float_(actual))));
   }

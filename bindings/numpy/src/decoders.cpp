@@ -5,10 +5,18 @@
 namespace spslam::numpy {
 namespace {
 
+constexpr std::int64_t kMaxWidth = std::int64_t{1} << 30;  // so that the number of parameters fits 64 bits
+
+void check_width(const Argument& argument, std::int64_t width) {
+  check(width >= 1, argument, "be at least 1", width);
+  check(width <= kMaxWidth, argument, "be at most 2^30", width);
+}
+
 MlpShape checked_shape(const char* name, std::int64_t inputs, std::int64_t hidden, std::int64_t output,
                        std::int64_t activation) {
-  check(hidden >= 1, {name, "hidden"}, "be at least 1", hidden);
-  check(output >= 1, {name, "output"}, "be at least 1", output);
+  check_width({name, "hidden"}, hidden);
+  check_width({name, "output"}, output);
+  check(inputs <= kMaxWidth, {name, "input"}, "have at most 2^30 columns", inputs);
   check(activation >= 0 && activation <= 2, {name, "activation"}, "be 0, 1 or 2", activation);
   return {inputs, hidden, output, static_cast<MlpActivation>(activation)};
 }
@@ -46,6 +54,10 @@ py::object backward(const py::object& grad, const py::object& input, const py::o
 }
 
 std::int64_t num_params(std::int64_t inputs, std::int64_t hidden, std::int64_t outputs) {
+  const char* name = "mlp_num_params";
+  check_width({name, "inputs"}, inputs);
+  check_width({name, "hidden"}, hidden);
+  check_width({name, "outputs"}, outputs);
   return MlpShape{inputs, hidden, outputs, MlpActivation::kNone}.num_params();
 }
 

@@ -60,8 +60,8 @@ template <class T>
 struct Bilinear {
   Bilinear(const char* name, const py::object& table, const py::object& uv)
       : texels({name, "texels"}, table, {"H", "W", "C"}), positions({name, "uv"}, uv, {"N", 2}) {
-    check(texels.size(0) * texels.size(1) > 0 || positions.size(0) == 0, {name, "texels"}, "have at least one texel",
-          texels.size(0) * texels.size(1));
+    check((texels.size(0) > 0 && texels.size(1) > 0) || positions.size(0) == 0, {name, "texels"},
+          "have at least one texel", 0);
   }
   Input<T> texels, positions;
 };
@@ -108,15 +108,28 @@ struct TriPlanes {
     check(cell_size > 0, {name, "cell_size"}, "be positive", cell_size);
     check(numbers.size() == 15, {name, "layout"}, "have 15 numbers", static_cast<std::int64_t>(numbers.size()));
     inverse_cell_size = static_cast<T>(1 / cell_size);
-    for (int plane = 0; plane < 3; ++plane) {
-      const std::int64_t* p = numbers.data() + 5 * plane;
-      const bool fits = p[0] >= 0 && p[3] >= 0 && p[4] >= 0 && p[3] < INT32_MAX && p[4] < INT32_MAX &&
-                        p[0] + p[3] * p[4] <= texels.size(0);
-      check(fits, {name, "layout"}, "lie within the " + std::to_string(texels.size(0)) + " texels", p[0] + p[3] * p[4]);
-      layout.planes[plane] = {p[0], static_cast<std::int32_t>(p[1]), static_cast<std::int32_t>(p[2]),
-                              static_cast<std::int32_t>(p[3]), static_cast<std::int32_t>(p[4])};
-    }
+    for (int plane = 0; plane < 3; ++plane) layout.planes[plane] = checked_plane(name, numbers.data() + 5 * plane);
   }
+
+  // Of five integers that may be any: their sums and products must not overflow before they are checked.
+  PlaneLayout checked_plane(const char* name, const std::int64_t* p) const {
+    constexpr std::int64_t kFarthest = std::int64_t{1} << 30;
+    const std::int64_t offset = p[0], size_u = p[3], size_v = p[4], rows = texels.size(0);
+    const auto near = [](std::int64_t number) { return number >= -kFarthest && number <= kFarthest; };
+    check(near(p[1]) && near(p[2]) && near(size_u) && near(size_v), {name, "layout"},
+          "have origins and sizes within 2^30", numbers_of(p));
+    const bool fits = size_u >= 0 && size_v >= 0 && offset >= 0 && offset <= rows && size_u * size_v <= rows - offset;
+    check(fits, {name, "layout"}, "lie within the " + std::to_string(rows) + " texels", numbers_of(p));
+    return {offset, static_cast<std::int32_t>(p[1]), static_cast<std::int32_t>(p[2]), static_cast<std::int32_t>(size_u),
+            static_cast<std::int32_t>(size_v)};
+  }
+
+  static std::string numbers_of(const std::int64_t* p) {
+    std::string text = "[";
+    for (int i = 0; i < 5; ++i) text += (i ? ", " : "") + std::to_string(p[i]);
+    return text + "]";
+  }
+
   Input<T> texels, points;
   T inverse_cell_size;
   TriPlaneLayout layout;

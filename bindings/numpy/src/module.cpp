@@ -6,7 +6,9 @@ namespace {
 namespace py = pybind11;
 
 void set_num_threads(std::int64_t count) {
+  constexpr std::int64_t kMaxThreads = 4096;
   spslam::numpy::check(count >= 1, {"set_num_threads", "count"}, "be at least 1", count);
+  spslam::numpy::check(count <= kMaxThreads, {"set_num_threads", "count"}, "be at most 4096", count);
   spslam::set_num_threads(static_cast<int>(count));
 }
 

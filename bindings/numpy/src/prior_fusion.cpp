@@ -12,7 +12,7 @@ py::array_t<float> normals_of(const py::object& depth, const py::object& pixels,
   const Input<std::int32_t> at({name, "pixels"}, pixels, {"N", 2});
   check(fx > 0, {name, "fx"}, "be positive", fx);
   check(fy > 0, {name, "fy"}, "be positive", fy);
-  check(step_px >= 1 && step_px <= INT32_MAX, {name, "step_px"}, "be at least 1", step_px);
+  check(step_px >= 1 && step_px <= 65535, {name, "step_px"}, "be in [1, 65535]", step_px);
   check(max_jump > 0, {name, "max_jump"}, "be positive", max_jump);
   const DepthImage view{
       image.data(),

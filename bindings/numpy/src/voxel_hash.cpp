@@ -34,34 +34,64 @@ py::tuple new_voxel_hash(std::int64_t capacity) {
   return py::make_tuple(keys, values);
 }
 
-py::array_t<std::int32_t> voxel_hash_insert(const py::object& hash_keys, const py::object& hash_values,
-                                            const py::object& voxel_coords, std::int64_t first_id) {
+// The coordinates that a table lacks, packed in the first rows of `packed`.
+struct Absent {
+  std::vector<std::int64_t> packed;
+  AbsentVoxels found;
+
+  Absent(const char* function, const std::int64_t* keys, const std::int32_t* values, std::int64_t capacity,
+         const Input<std::int32_t>& coords)
+      : packed(coords.size(0)) {
+    const std::int64_t n = coords.size(0);
+    std::vector<std::uint8_t> workspace(voxel_hash_workspace_bytes(kCpu, n));
+    found = without_gil([&] {
+      return spslam::voxel_hash_absent(kCpu, keys, values, capacity, coords.data(), n, workspace.data(), packed.data());
+    });
+    if (found.out_of_range == 0) return;
+    throw std::runtime_error(std::string(function) + ": voxel_coords must lie in [-2^20, 2^20 - 1], got " +
+                             std::to_string(found.out_of_range) + " rows outside");
+  }
+
+  py::array_t<std::int32_t> coords() const {
+    auto coords = empty<std::int32_t>({found.count, 3});
+    voxel_hash_unpack(kCpu, packed.data(), found.count, coords.mutable_data());
+    return coords;
+  }
+};
+
+py::array_t<std::int32_t> absent(const py::object& hash_keys, const py::object& hash_values,
+                                 const py::object& voxel_coords) {
+  const char* name = "voxel_hash_absent";
+  const Input<std::int64_t> keys({name, "hash_keys"}, hash_keys, {"capacity"});
+  const std::int64_t capacity = checked_capacity(name, keys);
+  const Input<std::int32_t> values({name, "hash_values"}, hash_values, {capacity});
+  const Input<std::int32_t> coords({name, "voxel_coords"}, voxel_coords, {"N", 3});
+  return Absent(name, keys.data(), values.data(), capacity, coords).coords();
+}
+
+py::array_t<std::int32_t> insert(const py::object& hash_keys, const py::object& hash_values,
+                                 const py::object& voxel_coords, std::int64_t first_id) {
   const char* name = "voxel_hash_insert";
   InOut<std::int64_t> keys({name, "hash_keys"}, hash_keys, {"capacity"});
   const std::int64_t capacity = checked_capacity(name, keys);
   InOut<std::int32_t> values({name, "hash_values"}, hash_values, {capacity});
   const Input<std::int32_t> coords({name, "voxel_coords"}, voxel_coords, {"N", 3});
   check(first_id >= 0, {name, "first_id"}, "be at least 0", first_id);
-  const std::int64_t n = coords.size(0);
-  std::vector<std::int64_t> absent(n);
-  std::vector<std::uint8_t> workspace(voxel_hash_workspace_bytes(kCpu, n));
-  const AbsentVoxels found = without_gil([&] {
-    return voxel_hash_absent(kCpu, keys.data(), values.data(), capacity, coords.data(), n, workspace.data(),
-                             absent.data());
-  });
-  if (found.out_of_range != 0) {
-    throw std::runtime_error(std::string(name) + ": voxel_coords must lie in [-2^20, 2^20 - 1], got " +
-                             std::to_string(found.out_of_range) + " rows outside");
-  }
+  const Absent absent(name, keys.data(), values.data(), capacity, coords);
+  const AbsentVoxels& found = absent.found;
+  check_room(name, capacity, first_id);
   check_room(name, capacity, first_id + found.count);
-  auto added = empty<std::int32_t>({found.count, 3});
-  voxel_hash_assign(kCpu, keys.data(), values.data(), capacity, absent.data(), found.count,
+  if (found.count > found.empty_slots) {
+    throw std::runtime_error(std::string(name) + ": first_id must be the number of voxels in the table, got " +
+                             std::to_string(first_id) + " for a table with " + std::to_string(found.empty_slots) +
+                             " empty slots of " + std::to_string(capacity));
+  }
+  voxel_hash_assign(kCpu, keys.data(), values.data(), capacity, absent.packed.data(), found.count,
                     static_cast<std::int32_t>(first_id));
-  voxel_hash_unpack(kCpu, absent.data(), found.count, added.mutable_data());
-  return added;
+  return absent.coords();
 }
 
-void voxel_hash_build(const py::object& hash_keys, const py::object& hash_values, const py::object& voxel_coords) {
+void build(const py::object& hash_keys, const py::object& hash_values, const py::object& voxel_coords) {
   const char* name = "voxel_hash_build_";
   InOut<std::int64_t> keys({name, "hash_keys"}, hash_keys, {"capacity"});
   const std::int64_t capacity = checked_capacity(name, keys);
@@ -138,11 +168,13 @@ void define_voxel_hash(py::module_& m) {
   m.def("new_voxel_hash", &new_voxel_hash, py::arg("capacity"),
         "An empty table of `capacity` slots, a power of two: hash_keys int64 [capacity], hash_values int32 [capacity]. "
         "It holds half as many voxels.");
-  m.def("voxel_hash_insert", &voxel_hash_insert, py::arg("hash_keys"), py::arg("hash_values"), py::arg("voxel_coords"),
+  m.def("voxel_hash_absent", &absent, py::arg("hash_keys"), py::arg("hash_values"), py::arg("voxel_coords"),
+        "The coordinates int32 [M, 3] among int32 [N, 3] that the table lacks, each once, in sorted order.");
+  m.def("voxel_hash_insert", &insert, py::arg("hash_keys"), py::arg("hash_values"), py::arg("voxel_coords"),
         py::arg("first_id"),
         "Enters the coordinates int32 [N, 3] that the table lacks, in place, with ids from `first_id` on in sorted "
         "order. Returns them, int32 [M, 3].");
-  m.def("voxel_hash_build_", &voxel_hash_build, py::arg("hash_keys"), py::arg("hash_values"), py::arg("voxel_coords"),
+  m.def("voxel_hash_build_", &build, py::arg("hash_keys"), py::arg("hash_values"), py::arg("voxel_coords"),
         "Empties the table and enters row i of the distinct `voxel_coords` int32 [V, 3] with id i.");
   m.def("voxel_hash_find", &find, py::arg("hash_keys"), py::arg("hash_values"), py::arg("voxel_coords"),
         "Ids int32 [N] of coordinates int32 [N, 3], -1 where absent or out of range.");
