@@ -23,7 +23,18 @@ INCLUDES = {
 ELEMENT_SYSTEM_HEADERS = {"cmath", "cstdint", "limits"}
 
 # Which parts of spslam a part may import. Parts that aren't named here are of the ground floor.
-GROUND = {"camera", "config", "errors", "geometry", "io", "options", "trajectory"}
+GROUND = {
+    "camera",
+    "config",
+    "errors",
+    "geometry",
+    "io",
+    "options",
+    "reading",
+    "tensor_file",
+    "tensor_schema",
+    "trajectory",
+}
 IMPORTS = {
     **{name: GROUND for name in GROUND},
     "ops": set(),
@@ -36,7 +47,8 @@ IMPORTS = {
     "slam": GROUND | {"ops", "scene", "prior", "datasets"},
     "run": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
     "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run"},
-    "cli": GROUND | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "benchmark"},
+    "cli": GROUND
+    | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "benchmark"},
 }
 
 

@@ -6,6 +6,7 @@ import torch
 
 from spslam import ops
 from spslam.errors import SpslamError
+from spslam.tensor_schema import check_plane_layout
 
 FEATURES = 32
 MARGIN_M = 1.0  # grown beyond what is asked for, so that growth is rare
@@ -73,10 +74,21 @@ class TriPlanes:
         return self._regrow(planes)
 
     def restore(self, texels: torch.Tensor, layout: Sequence[int]) -> None:
-        """Takes over saved texels and layout."""
-        rows = sum(layout[5 * plane + 3] * layout[5 * plane + 4] for plane in range(3)) if len(layout) == 15 else -1
-        if texels.shape != (rows, FEATURES):
-            raise ValueError(f"TriPlanes: texels must have the rows of layout, got {list(texels.shape)}")
+        """Takes over saved texels and layout.
+
+        Args:
+            texels: float32 [P, 32].
+            layout: as `layout` of the class.
+
+        Raises:
+            ValueError: the planes do not fill the texels exactly, one after the other.
+        """
+        if texels.dim() != 2 or texels.shape[1] != FEATURES:
+            raise ValueError(f"TriPlanes.restore: texels must have shape [P, {FEATURES}], got {list(texels.shape)}")
+        try:
+            check_plane_layout(layout, len(texels))
+        except ValueError as fault:
+            raise ValueError(f"TriPlanes.restore: {fault}") from None
         self.texels = texels.to(self.texels.device, torch.float32).clone()
         self.layout = [int(value) for value in layout]
 
