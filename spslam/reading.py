@@ -22,7 +22,7 @@ MAX_TEXT_BYTES = 32 << 20  # 100,000 poses of 16 numbers
 MAX_LINE_CHARACTERS = 1 << 20
 MAX_JSON_BYTES = 4 << 20
 # Whole numbers of more digits mean nothing in our files; Python refuses to read those of over 4,300 in its own words.
-_MAX_DIGITS = 20
+MAX_DIGITS = 20
 
 
 def open_regular(path: Path, error: type[SpslamError]) -> BinaryIO:
@@ -128,8 +128,8 @@ def parse_json(text: str, name: str, error: type[Exception]) -> dict[str, Any]:
 
 
 def _whole_number(digits: str) -> int:
-    if len(digits) > _MAX_DIGITS:
-        raise ValueError(f"a whole number must have at most {_MAX_DIGITS} digits, got {len(digits)}")
+    if len(digits) > MAX_DIGITS:
+        raise ValueError(f"a whole number must have at most {MAX_DIGITS} digits, got {len(digits)}")
     return int(digits)
 
 
