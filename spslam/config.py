@@ -19,8 +19,8 @@ import pydantic
 import yaml
 
 from spslam.errors import ConfigError
-from spslam.reading import MAX_DIGITS, read_text
 from spslam.options import PRESETS, Config, Section
+from spslam.reading import MAX_DIGITS, read_text
 
 __all__ = ["Config", "config_names", "dump_config", "load_config", "option_paths", "resolve_config_path"]
 

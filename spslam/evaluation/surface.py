@@ -11,12 +11,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spslam.errors import DatasetError
+from spslam.meshing import load_mesh
 
 # Faces are looked up at sites spread over them, about this far apart; no point of a face is farther from its nearest
 # site than 1.1 times that.
 _SITE_SPACING_M = 0.02
 _REACH = 1.1
 _MOST_SITES_ALONG = 512
+# Of all faces together, unless there are as many faces: a building of 5,000 m2; they take half a gigabyte.
+_MOST_SITES = 1 << 24
 # Sites compared at first, and at last where the nearest face isn't settled.
 _SITES_COMPARED = (8, 32, 128)
 
@@ -62,18 +65,11 @@ class TriangleSurface:
 
     @classmethod
     def load(cls, path: Path) -> TriangleSurface:
-        """The mesh in a file (PLY, OBJ, GLB, ...); raises DatasetError if there is none, or none with faces."""
-        import trimesh
-
-        if not path.is_file():
-            raise DatasetError(f"{path}: no such mesh file")
-        try:
-            mesh = trimesh.load(path, process=False, force="mesh")
-        except Exception as error:  # trimesh raises whatever the parser stumbles over
-            raise DatasetError(f"{path}: can't be read as a mesh: {error}") from error
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        """The mesh in a file; raises DatasetError as `spslam.meshing.load_mesh`, and where it has no faces."""
+        mesh = load_mesh(path)
+        if not len(mesh.faces):
             raise DatasetError(f"{path}: must be a mesh with faces, got none")
-        return cls(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        return cls(mesh.vertices, mesh.faces)
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices [V,3] and faces [L,3], those of no area left out."""
@@ -105,7 +101,7 @@ class TriangleSurface:
 
         Faces are found by the sites closest to a point, as many as it takes to be sure that no other face is closer,
         128 at most. So the distance is exact up to about 10 cm from the surface, and farther off at most a few
-        millimeters too long. Deterministic.
+        millimeters too long. Deterministic. Raises DatasetError for a surface of thousands of square meters.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         distance = np.full(len(points), np.inf)
@@ -139,6 +135,11 @@ class TriangleSurface:
         frames = _BaseFrames.of(self._corners)
         counts = np.ceil(np.stack((frames.base, frames.height), axis=1) / _SITE_SPACING_M)
         counts = np.clip(counts, 1, _MOST_SITES_ALONG).astype(np.int64)
+        if counts.prod(axis=1).sum() > max(_MOST_SITES, 2 * len(counts)):
+            raise DatasetError(
+                f"a mesh of {len(counts)} faces and {self.area_m2:.3g} m2 is too large to measure distances to; "
+                "is it in meters?"
+            )
         sites, owners = [], []
         for columns, rows in np.unique(counts, axis=0):
             faces = np.flatnonzero((counts == (columns, rows)).all(axis=1))
