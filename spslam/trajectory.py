@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,9 +13,12 @@ import numpy as np
 from spslam.errors import DatasetError
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.io import atomic_write
+from spslam.reading import read_lines
 
+MAX_POSES = 1 << 20  # of a file: an hour of motion capture at 300 Hz
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
 _LOST = "# lost"
+_SHORTEST, _LONGEST = 1e-100, 1e100  # of a quaternion
 _NO_POSE = " 0 0 0 0 0 0 1"
 
 
@@ -83,26 +88,23 @@ class Trajectory:
 
         Raises:
             DatasetError: a missing file, or a line that is not eight finite numbers with a quaternion of a length
-                above 0. Names file and line.
+                above 0, or more than `MAX_POSES` poses. Names file and line.
         """
         path = Path(path)
-        try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise DatasetError(f"{path}: can't be read as a trajectory: {error}") from error
-        rows: list[list[float]] = []
-        lost: list[bool] = []
-        for number, line in enumerate(lines, start=1):
+        rows, lost = array("d"), bytearray()
+        for number, line in enumerate(read_lines(path, DatasetError), start=1):
             is_lost = line.startswith(f"{_LOST} ")
             if is_lost:
                 line = line.removeprefix(_LOST) + _NO_POSE
             if line.strip() and not line.startswith("#"):
                 row = _parse_row(path, number, line, skip_unknown)
-                if np.all(np.isfinite(row)):
-                    rows.append(row)
+                if all(map(math.isfinite, row)):
+                    rows.extend(row)
                     lost.append(is_lost)
+            if len(lost) > MAX_POSES:
+                raise DatasetError(f"{path}: must have at most {MAX_POSES} poses")
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-        return cls(table[:, 0], pose7_to_matrix(table[:, [7, 4, 5, 6, 1, 2, 3]]), np.array(lost, bool))
+        return cls(table[:, 0], pose7_to_matrix(table[:, [7, 4, 5, 6, 1, 2, 3]]), np.array(lost, dtype=bool))
 
 
 def _hold_known(poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
@@ -119,7 +121,10 @@ def _parse_row(path: Path, number: int, line: str, may_be_unknown: bool) -> list
         row = [float(word) for word in line.replace(",", " ").split()]
     except ValueError:
         row = []
-    if len(row) != 8 or not any(row[4:]) or not (may_be_unknown or np.all(np.isfinite(row))):
+    is_finite = all(map(math.isfinite, row))
+    # Lengths whose square is 0 or infinite in floating point can't be divided by.
+    is_turn = len(row) == 8 and (not is_finite or _SHORTEST < math.hypot(*row[4:]) < _LONGEST)
+    if not is_turn or not (may_be_unknown or is_finite):
         raise DatasetError(
             f"{path}, line {number}: must be `timestamp tx ty tz qx qy qz qw`, got {line.strip()[:80]!r}"
         )

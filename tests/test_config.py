@@ -180,5 +180,41 @@ def test_wrong_path_is_one_clear_line(path, message):
 def test_binary_file_is_one_clear_line(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="mine.yaml: can't be read: not a text file"):
+    with pytest.raises(ConfigError, match="mine.yaml: must be a text file"):
         load_config(path)
+
+
+ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 3000, "must be YAML: it is nested too deep"),
+        ("a: " + "{b: " * 3000, "must be YAML: it is nested too deep"),
+        (ALIASES, ":2: must be YAML: aliases are not supported"),
+        ("seed: &a 3\nmapping: {<<: *a}", ":2: must be YAML: aliases are not supported"),
+        ("seed: " + "9" * 5000, ":1: must be YAML: a whole number must have at most 20 digits"),
+        ("seed: 0x" + "f" * 5000, ":1: must be YAML: a whole number must have at most 20 digits"),
+        ("seed: 1" + ":59" * 100_000, ":1: must be YAML: a whole number must have at most 20 digits"),
+        ("seed: !!bool maybe", "must be YAML: malformed"),
+        ("seed: !!int ''", "must be YAML: malformed"),
+        ("seed: !!timestamp soon", "must be YAML: malformed"),
+        ("seed: 0001-01-01 00:00:00 +23:59", "seed must be a whole number, got datetime"),
+        ("seed: 99999999999999999999", "seed must be below 9223372036854775808, got 99999999999999999999"),
+        ("seed: text", "seed must be a whole number, got 'text'"),
+        ("# " + "x" * (1 << 20), "must have at most 1048576 bytes, got 1048578"),
+    ],
+)
+def test_hostile_files_are_one_short_line(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        load_config(write(tmp_path, text))
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 300
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="/dev/zero: no such configuration"):
+        load_config("/dev/zero")

@@ -27,7 +27,19 @@ ELEMENT_SYSTEM_HEADERS = {"cmath", "cstdint", "limits"}
 MAX_PARAMETERS = 12
 
 # Which parts of spslam a part may import. Parts that aren't named here are of the ground floor.
-GROUND = {"camera", "config", "errors", "geometry", "io", "options", "run_folder", "trajectory"}
+GROUND = {
+    "camera",
+    "config",
+    "errors",
+    "geometry",
+    "io",
+    "options",
+    "reading",
+    "run_folder",
+    "tensor_file",
+    "tensor_schema",
+    "trajectory",
+}
 IMPORTS = {
     **{name: GROUND for name in GROUND},
     "ops": set(),

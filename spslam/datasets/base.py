@@ -13,19 +13,21 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.errors import DatasetError
 
+# Most frames of a sequence that one file tells of: almost five hours at 30 Hz.
+MAX_FRAMES = 1 << 19
+
 
 @dataclass
 class RgbdFrame:
-    """One color image with its depth image, pixel by pixel of the same view.
+    """One color image with its depth image, both of the same view and size.
 
-    Attributes
-    ----------
-    index : the frame's number in the dataset it was read from, counted from 0.
-    timestamp : seconds.
-    color : uint8 [H,W,3], RGB.
-    depth : float32 [H,W], meters along the optical axis; 0 where nothing was measured.
-    pose : float64 [4,4] ``T_world_camera`` in OpenCV axes (x right, y down, z forward), or None where unknown.
-        It is the truth to evaluate against; the system uses no more than the first.
+    Attributes:
+        index: the frame's number in the dataset it was read from, counted from 0.
+        timestamp: s.
+        color: uint8 [H, W, 3], RGB.
+        depth: float32 [H, W], m along the optical axis; 0 where nothing was measured.
+        pose: float64 [4, 4] T_world_camera in OpenCV axes (x right, y down, z forward), or None where unknown. It is
+            the ground truth to evaluate against; the system uses no more than the first.
     """
 
     index: int
@@ -38,9 +40,14 @@ class RgbdFrame:
 class RgbdDataset(ABC):
     """A sequence of frames of one camera, read one at a time and from any thread.
 
-    ``dataset[i]`` reads frame i (0 <= i < len) and checks it: raises IndexError outside the range and
-    DatasetError, naming the file, for a frame that can't be used. Depth outside ``depth_range`` (meters) and within
-    ``border_px`` pixels of the image's border comes as 0. Reading the same frame again gives the same values.
+    `dataset[i]` reads frame i (0 <= i < len) and checks it: raises IndexError outside the range and DatasetError,
+    naming the file, for a frame that can't be used. Reading the same frame again gives the same values.
+
+    Attributes:
+        name: of the sequence, for messages and reports.
+        camera: of all frames.
+        depth_range: nearest and farthest depth (m); depth outside comes as 0.
+        border_px: depth within so many pixels of the image's border comes as 0.
     """
 
     name: str
@@ -54,18 +61,18 @@ class RgbdDataset(ABC):
 
     @abstractmethod
     def timestamps(self) -> np.ndarray:
-        """Times of all frames, float64 [F], seconds, ascending. Reads no image."""
+        """Times of all frames, float64 [F], s, ascending. Reads no image."""
 
     @abstractmethod
     def poses(self) -> np.ndarray | None:
-        """True poses of all frames, float64 [F,4,4], NaN where unknown; None if none is known. Reads no image."""
+        """Ground-truth poses, float64 [F, 4, 4], NaN where unknown; None if none is known. Reads no image."""
 
     @abstractmethod
     def read(self, index: int) -> RgbdFrame:
-        """Frame ``index`` as it is stored, converted to our units and axes; ``dataset[i]`` is what to call."""
+        """Frame `index` as it is stored, converted to our units and axes; `dataset[i]` is what to call."""
 
     def describe(self, index: int) -> str:
-        """What an error about frame ``index`` should name: its files where it has any."""
+        """What an error about frame `index` should name: its files where it has any."""
         return f"{self.name}, frame {index}"
 
     def __getitem__(self, index: int) -> RgbdFrame:
@@ -97,16 +104,18 @@ class RgbdDataset(ABC):
 
 
 class Subset(RgbdDataset):
-    """Every ``step``-th frame of a dataset from ``start`` up to but without ``stop``, numbered anew from 0.
+    """Every `step`-th frame of a dataset from `start` up to but without `stop`, numbered anew from 0.
 
-    The bounds are taken as in a Python slice: beyond the end they are cut, negative ones count from the end.
+    Args:
+        dataset: what to take frames from.
+        start: first frame. The bounds are taken as in a Python slice: beyond the end they are cut, negative ones count
+            from the end.
+        stop: first frame that is left out; None for the end.
+        step: distance of the frames.
 
-    Raises
-    ------
-    ValueError
-        When ``step`` is below 1.
-    DatasetError
-        When no frame is left.
+    Raises:
+        ValueError: `step` is below 1.
+        DatasetError: no frame is left.
     """
 
     def __init__(self, dataset: RgbdDataset, start: int = 0, stop: int | None = None, step: int = 1) -> None:

@@ -26,16 +26,14 @@ def kinect_depth(depth: np.ndarray, focal_px: float, level: float, generator: np
     squared (about 0.2 cm at 1 m, 1.1 cm at 2.5 m); edges wander sideways; pixels are missing at depth edges, on
     surfaces seen under more than 80 degrees, outside 0.35 to 8 m, and now and then anywhere.
 
-    Parameters
-    ----------
-    depth : float32 [H,W], exact depth, all above 0.
-    focal_px : the camera's focal length; lengths in the image scale with the width.
-    level : 1 is the sensor, 0 none; scales the errors and the loss of pixels.
-    generator : decides on everything; the same state gives the same image.
+    Args:
+        depth: float32 [H, W], m, exact depth, all above 0.
+        focal_px: the camera's focal length; lengths in the image scale with the width.
+        level: 1 is the sensor, 0 none; scales the errors and the loss of pixels.
+        generator: decides on everything; the same state gives the same image.
 
-    Returns
-    -------
-    float32 [H,W], 0 where nothing was measured.
+    Returns:
+        float32 [H, W], m, 0 where nothing was measured.
     """
     if level == 0:
         return depth.copy()

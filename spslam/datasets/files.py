@@ -16,10 +16,19 @@ from spslam.datasets.images import read_color, read_depth, resized_color
 from spslam.datasets.text import read_pose, read_pose_table
 from spslam.errors import DatasetError
 
+_MAX_NUMBER = 2**63 - 1
+
 
 @dataclass(frozen=True)
 class FramePaths:
-    """One frame's files and time. ``fault`` says why the frame can't be used, if that is known beforehand."""
+    """One frame's files and time.
+
+    Attributes:
+        color: image file.
+        depth: image file.
+        timestamp: s.
+        fault: why the frame can't be used, if that is known beforehand.
+    """
 
     color: Path
     depth: Path
@@ -29,14 +38,24 @@ class FramePaths:
 
 @dataclass(frozen=True)
 class Undistortion:
-    """Pixel maps (``cv2.remap``) that turn a distorted image into a pinhole camera's."""
+    """Pixel maps that turn a distorted image into a pinhole camera's.
+
+    Attributes:
+        map_x: int16 [H, W, 2], see `cv2.remap`.
+        map_y: uint16 [H, W].
+    """
 
     map_x: np.ndarray
     map_y: np.ndarray
 
     @classmethod
     def of(cls, camera: Camera, coefficients: Sequence[float]) -> Undistortion:
-        """Maps for OpenCV's distortion coefficients (k1, k2, p1, p2, k3); the camera stays the same."""
+        """The maps of a camera, which stays the same.
+
+        Args:
+            camera: of the images.
+            coefficients: OpenCV's distortion coefficients (k1, k2, p1, p2, k3).
+        """
         matrix, size = camera.matrix(), (camera.width, camera.height)
         return cls(*cv2.initUndistortRectifyMap(matrix, np.asarray(coefficients), None, matrix, size, cv2.CV_16SC2))
 
@@ -49,13 +68,13 @@ class Undistortion:
 class FileDataset(RgbdDataset):
     """Frames in image files.
 
-    Attributes
-    ----------
-    frames : the files in order of time.
-    true_poses : float64 [F,4,4], NaN where unknown, or None.
-    units_per_meter, invalid_depth : see :func:`spslam.datasets.images.read_depth`.
-    undistortion : applied to each color image.
-    resize_color : bring each color image to its depth image's size.
+    Attributes:
+        frames: the files in order of time.
+        true_poses: float64 [F, 4, 4], NaN where unknown, or None.
+        units_per_meter: see `spslam.datasets.images.read_depth`.
+        invalid_depth: see `spslam.datasets.images.read_depth`.
+        undistortion: applied to each color image.
+        resize_color: bring each color image, of whatever size, to its depth image's size.
     """
 
     name: str
@@ -86,8 +105,9 @@ class FileDataset(RgbdDataset):
         paths = self.frames[index]
         if paths.fault is not None:
             raise DatasetError(paths.fault)
-        color = read_color(paths.color)
-        depth = read_depth(paths.depth, self.units_per_meter, self.invalid_depth)
+        size = self.camera.width, self.camera.height
+        color = read_color(paths.color, None if self.resize_color else size)
+        depth = read_depth(paths.depth, self.units_per_meter, self.invalid_depth, size)
         if self.undistortion is not None:
             color = self.undistortion(color)
         if self.resize_color:
@@ -113,9 +133,14 @@ def require_folder(path: Path) -> Path:
 
 
 def find_numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """The files of a folder whose whole name matches ``pattern``, by the number in its first group, ascending.
+    """The files of a folder by number, ascending.
 
-    An empty result for a missing folder. Raises DatasetError when two files have the same number.
+    Args:
+        folder: a missing one has none.
+        pattern: regular expression that a whole name must match; its first group is the number.
+
+    Raises:
+        DatasetError: two files have the same number, or one has a number of over 63 bits.
     """
     expression = re.compile(pattern)
     found: dict[int, Path] = {}
@@ -124,6 +149,8 @@ def find_numbered(folder: Path, pattern: str) -> dict[int, Path]:
         if match is None:
             continue
         number = int(match.group(1))
+        if number > _MAX_NUMBER:
+            raise DatasetError(f"{path}: the number in the name must be at most {_MAX_NUMBER}")
         if number in found:
             raise DatasetError(f"{path}: must be the only file of frame {number}, got {found[number].name} as well")
         found[number] = path
@@ -135,7 +162,14 @@ def pair_numbered(
 ) -> dict[int, FramePaths]:
     """Frames of the numbers that have a color or a depth image; one without the other is a frame with a fault.
 
-    Times count from the first number at the given rate, so that a gap in the numbers is a gap in time.
+    Args:
+        colors: files by number.
+        depths: files by number.
+        frames_per_second: times count from the first number at this rate, so that a gap in the numbers is a gap in
+            time.
+
+    Returns:
+        Frames by number, ascending.
     """
     frames = {}
     numbers = sorted({*colors, *depths})
@@ -154,10 +188,18 @@ def paired(color: Path | None, depth: Path | None, timestamp: float) -> FramePat
 
 
 def attach_pose_table(frames: Mapping[int, FramePaths], table_path: Path) -> tuple[list[FramePaths], np.ndarray | None]:
-    """The frames in order, and their poses [F,4,4] from row ``number`` of a table, see ``text.read_pose_table``.
+    """Gives frames the poses of a table.
 
-    NaN for frames beyond the table; None where there is no table. A frame whose pose is no rigid motion becomes one
-    with a fault.
+    Args:
+        frames: by number.
+        table_path: row `number` is the pose of that frame, see `spslam.datasets.text.read_pose_table`.
+
+    Returns:
+        The frames in order, those whose pose is no rigid motion with a fault; and float64 [F, 4, 4], NaN for frames
+        beyond the table, or None where there is no table.
+
+    Raises:
+        DatasetError: the table can't be read.
     """
     if not table_path.is_file():
         return list(frames.values()), None
@@ -173,9 +215,15 @@ def attach_pose_table(frames: Mapping[int, FramePaths], table_path: Path) -> tup
 def attach_poses(
     frames: Mapping[int, FramePaths], pose_path: Callable[[int], Path]
 ) -> tuple[list[FramePaths], np.ndarray]:
-    """The frames in order, and their poses [F,4,4] from a file each; NaN where the file is missing or says so.
+    """Gives frames the poses of a file each.
 
-    A frame whose pose file is malformed becomes one with a fault.
+    Args:
+        frames: by number.
+        pose_path: the file of a number.
+
+    Returns:
+        The frames in order, those whose pose file is malformed with a fault; and float64 [F, 4, 4], NaN where the file
+        is missing or says that the pose is unknown.
     """
     poses = np.full((len(frames), 4, 4), np.nan)
     attached = []

@@ -1,11 +1,11 @@
 """A user's own recording: a folder of color images, a folder of depth images and the intrinsics.
 
-``color/`` (or ``rgb/``, ``images/``) and ``depth/``, paired by name (the part before the suffix) or, where the names
-differ, by natural order if there are as many of each. Intrinsics in one of ``intrinsics.txt``,
-``camera-intrinsics.txt`` (3x3 or 4x4 matrix, or fx fy cx cy), ``intrinsics.json`` or ``camera.json`` (``fx, fy, cx,
-cy`` and optionally ``width, height, depth_scale``). Depth is a 16-bit PNG or TIFF, or floating-point TIFF or npy, with
-``depth_scale`` units a meter: if nothing says otherwise 1000 for integers and 1 for floating point. Poses aren't
-needed; ``poses.txt``, with 16 numbers a frame (4x4 camera to world, OpenCV axes), is read if it is there.
+`color/` (or `rgb/`, `images/`) and `depth/`, paired by name (the part before the suffix) or, where the names
+differ, by natural order if there are as many of each. Intrinsics in one of `intrinsics.txt`,
+`camera-intrinsics.txt` (3x3 or 4x4 matrix, or fx fy cx cy), `intrinsics.json` or `camera.json` (`fx, fy, cx,
+cy` and optionally `width, height, depth_scale`). Depth is a 16-bit PNG or TIFF, or floating-point TIFF or npy, with
+`depth_scale` units per meter: if nothing says otherwise 1000 for integers and 1 for floating point. Poses aren't
+needed; `poses.txt`, with 16 numbers per frame (4x4 camera to world, OpenCV axes), is read if it is there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.files import FileDataset, FramePaths, attach_pose_table, paired, require_folder
-from spslam.datasets.images import first_size, read_depth
+from spslam.datasets.images import DEPTH_SCALE_RULE, Size, first_size, is_depth_scale, read_depth
 from spslam.datasets.text import camera_from_matrix, read_intrinsics_matrix, read_json
 from spslam.errors import DatasetError
 
@@ -35,18 +35,15 @@ _FRAMES_TRIED_FOR_SCALE = 5
 
 
 def open_folder(folder: Path, depth_scale: float | None = None) -> FileDataset:
-    """A recording in the layout above.
+    """Opens a recording in the layout above.
 
-    Parameters
-    ----------
-    folder : the recording.
-    depth_scale : depth units a meter; overrides the one in the JSON file.
+    Args:
+        folder: the recording.
+        depth_scale: depth units per meter; overrides the one in the JSON file.
 
-    Raises
-    ------
-    DatasetError
-        For a missing folder or intrinsics, intrinsics of another shape or image size, images that can't be paired, and
-        a depth scale that puts the median depth outside 0.1 to 20 m.
+    Raises:
+        DatasetError: a missing folder or intrinsics, intrinsics of another shape or image size, images that can't be
+            paired, or a depth scale that puts the median depth outside 0.1 to 20 m.
     """
     colors = _list_images(_color_folder(require_folder(folder)), COLOR_SUFFIXES)
     depths = _list_images(folder / "depth", DEPTH_SUFFIXES)
@@ -54,9 +51,9 @@ def open_folder(folder: Path, depth_scale: float | None = None) -> FileDataset:
     width, height = first_size(colors)
     camera, stored_scale = _read_intrinsics(folder, width, height)
     scale = stored_scale if depth_scale is None else depth_scale
-    if scale is not None and not 0 < scale < float("inf"):
-        raise DatasetError(f"{folder}: depth_scale must be positive, got {scale}")
-    _check_scale(frames, scale)
+    if scale is not None and not is_depth_scale(scale):
+        raise DatasetError(f"{folder}: depth_scale must be {DEPTH_SCALE_RULE}, got {scale}")
+    _check_scale(frames, scale, (width, height))
     frames, poses = attach_pose_table(dict(enumerate(frames)), folder / "poses.txt")
     return FileDataset(f"folder/{folder.name}", camera, frames, poses, scale)
 
@@ -79,7 +76,7 @@ def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 def _natural_order(name: str) -> list[tuple[int, str]]:
     parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _pair(folder: Path, colors: list[Path], depths: list[Path]) -> list[FramePaths]:
@@ -113,8 +110,8 @@ def _read_json_intrinsics(path: Path, width: int, height: int) -> tuple[Camera, 
         if name in values and values[name] != actual:
             raise DatasetError(f"{path}: {name} must be the images' {actual}, got {values[name]}")
     scale = values.get("depth_scale")
-    if scale is not None and not (_is_number(scale) and scale > 0):
-        raise DatasetError(f"{path}: depth_scale must be a positive number, got {scale}")
+    if scale is not None and not is_depth_scale(scale):
+        raise DatasetError(f"{path}: depth_scale must be {DEPTH_SCALE_RULE}, got {scale}")
     matrix = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path)), scale
 
@@ -123,12 +120,12 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _check_scale(frames: list[FramePaths], scale: float | None) -> None:
+def _check_scale(frames: list[FramePaths], scale: float | None, size: Size) -> None:
     usable = (frame.depth for frame in frames if frame.fault is None)
     for path in itertools.islice(usable, _FRAMES_TRIED_FOR_SCALE):
         try:
-            depth = read_depth(path, scale)
-            stored = read_depth(path, 1.0)
+            depth = read_depth(path, scale, size=size)
+            stored = read_depth(path, 1.0, size=size)
         except DatasetError:
             continue
         measured = depth[depth > 0]

@@ -35,8 +35,8 @@ class Material:
     """A color with a pattern through space, so that it needs no seams and no texture coordinates.
 
     Two waves, multiplied and sharpened, give checks or stripes between the color and a darker one; a third, longer
-    wave varies the brightness. ``color`` is RGB in 0..1; ``waves`` [3,3] are wave vectors in radians a meter,
-    ``phases`` [3]; ``contrast`` is the share of the color that the pattern takes.
+    wave varies the brightness. `color` is RGB in 0..1; `waves` [3,3] are wave vectors in radians a meter,
+    `phases` [3]; `contrast` is the share of the color that the pattern takes.
     """
 
     color: np.ndarray

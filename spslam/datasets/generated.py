@@ -1,4 +1,4 @@
-"""A sequence through a room of our own making, with exact truth; it needs no download.
+"""A sequence through a procedurally generated room, with exact ground truth; it needs no download.
 
 A hand-held camera goes round a table in the middle of a furnished room and looks across it, so that every view holds
 furniture before two walls and the floor. One round is 300 frames; the path doesn't depend on how many are asked for.
@@ -11,8 +11,9 @@ import math
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.base import MAX_FRAMES, RgbdDataset, RgbdFrame
 from spslam.datasets.depth_noise import kinect_depth
+from spslam.datasets.images import check_image_size
 from spslam.datasets.room import Room
 from spslam.errors import DatasetError
 from spslam.geometry import pose_from
@@ -28,22 +29,19 @@ _SMALLEST_IMAGE = 16
 class GeneratedDataset(RgbdDataset):
     """Frames of a generated room; the same arguments give the same bytes.
 
-    Parameters
-    ----------
-    frames : number of frames.
-    width, height : image size; the field of view is 60 degrees across.
-    noise : 0 is exact depth and clean color, 1 the errors of a Kinect v1 (:func:`kinect_depth`) and slight color
-        noise; True and False stand for 1 and 0.
-    seed : decides on colors, small pieces of furniture, the hand's shaking and the noise.
+    Args:
+        frames: number of frames.
+        width: of the images, px; the field of view is 60 degrees across.
+        height: of the images, px.
+        noise: 0 is exact depth and clean color, 1 the errors of a Kinect v1 (`kinect_depth`) and slight color noise;
+            True and False stand for 1 and 0.
+        seed: decides on colors, small pieces of furniture, the shaking of the hand and the noise.
 
-    Attributes
-    ----------
-    room : the :class:`Room` seen, for evaluation: ``signed_distance``, ``sample_surface``, ``mesh``.
+    Attributes:
+        room: the `Room` seen, for evaluation: `signed_distance`, `sample_surface`, `mesh`.
 
-    Raises
-    ------
-    DatasetError
-        For numbers out of range.
+    Raises:
+        DatasetError: a number out of range.
     """
 
     name = "generated"
@@ -60,6 +58,9 @@ class GeneratedDataset(RgbdDataset):
         ):
             if not least <= value < float("inf"):
                 raise DatasetError(f"dataset.{option} must be at least {least}, got {value}")
+        check_image_size((width, height), "dataset.width and dataset.height")
+        if frames > MAX_FRAMES:
+            raise DatasetError(f"dataset.frames must be at most {MAX_FRAMES}, got {frames}")
         focal = _FOCAL_PER_WIDTH * width
         self.camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         self.room = Room(seed)
@@ -87,7 +88,7 @@ class GeneratedDataset(RgbdDataset):
 
 
 def camera_path(frames: int, seed: int = 0) -> np.ndarray:
-    """Poses [frames,4,4] of a hand-held round through the room; about 2 cm and 1.3 degrees a frame, at most double."""
+    """Poses [frames, 4, 4] of a hand-held round through the room; about 2 cm and 1.3 degrees per frame."""
     turn = 2 * np.pi * np.arange(frames) / FRAMES_PER_ROUND
     eye = np.stack((1.05 * np.cos(turn), 0.75 * np.sin(turn), 1.45 + 0.12 * np.sin(2 * turn + 1)), axis=1)
     heading = turn + np.pi + 0.22 * np.sin(3 * turn)
@@ -102,7 +103,7 @@ def camera_path(frames: int, seed: int = 0) -> np.ndarray:
 
 
 def _hand_shake(frames: int, seed: int) -> np.ndarray:
-    """Offsets [frames,6]: meters, then radians of yaw, pitch and roll; waves of 0.3 to 1.5 Hz."""
+    """Offsets [frames, 6]: m, then yaw, pitch and roll in radians; waves of 0.3 to 1.5 Hz."""
     generator = np.random.default_rng([seed, 5])
     frequency = generator.uniform(0.3, 1.5, (6, 4))
     phase = generator.uniform(0, 2 * np.pi, (6, 4))

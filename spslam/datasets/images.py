@@ -1,53 +1,88 @@
-"""Decoding color and depth images; every failure names the file."""
+"""Decoding color and depth images; every failure names the file.
+
+The size in an image's header is held against what is expected before anything is decoded: a PNG of 2.6 MB can hold
+30000 x 30000 pixels.
+"""
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from spslam.datasets.image_header import image_size, is_truncated
 from spslam.errors import DatasetError
+from spslam.reading import read_bytes
 
-# A PNG ends with its IEND chunk and a JPEG with the marker FF D9; some writers add a few bytes of padding.
-_END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-_TAIL_BYTES = 1024
+# Of an image whose size isn't known beforehand; about 33 million pixels. Pixel records have 16 bits for a coordinate.
+MAX_PIXELS, MAX_SIDE_PX = 1 << 25, 1 << 15
+# Of an image's file.
+MAX_IMAGE_BYTES = 8 * MAX_PIXELS
+_DEPTH_TYPES = (np.uint16, np.float32, np.float64)
+
+# Depth units per meter that make sense: of nanometers up to ones of a kilometer.
+_LEAST_UNITS, _MOST_UNITS = 1e-3, 1e9
+DEPTH_SCALE_RULE = f"a number from {_LEAST_UNITS:g} to {_MOST_UNITS:g}"
+
+Size = tuple[int, int]
 
 
-def read_color(path: Path) -> np.ndarray:
-    """The image as uint8 [H,W,3], RGB; gray images are repeated over the channels.
+def read_color(path: Path, size: Size | None = None) -> np.ndarray:
+    """Reads a color image.
 
-    A rotation noted in EXIF is ignored: the depth image beside it isn't rotated either. Raises DatasetError.
+    Args:
+        path: a PNG, JPEG or TIFF. A rotation noted in EXIF is ignored: the depth image beside it isn't rotated either.
+        size: (width, height) that it must have; None for any that `check_image_size` lets pass.
+
+    Returns:
+        uint8 [H, W, 3], RGB; gray images are repeated over the channels.
+
+    Raises:
+        DatasetError: the file is missing, truncated, no image, or of another size.
     """
-    return decode_color(_read_bytes(path), path.suffix, str(path))
+    return decode_color(_image_bytes(path), str(path), size)
 
 
-def decode_color(content: bytes, suffix: str, name: str) -> np.ndarray:
-    """As :func:`read_color` from an image file's bytes; ``suffix`` says which kind, ``name`` is what errors name."""
-    image = _decode(content, suffix, name, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+def decode_color(content: bytes, name: str, size: Size | None = None) -> np.ndarray:
+    """As `read_color`, from an image file's bytes.
+
+    Args:
+        content: of the file.
+        name: what errors name.
+        size: see `read_color`.
+    """
+    image = _decode(content, name, size, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
-def read_depth(path: Path, units_per_meter: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
-    """The depth image as float32 [H,W] in meters, 0 where nothing was measured.
+def read_depth(
+    path: Path, units_per_meter: float | None, invalid: Sequence[int] = (), size: Size | None = None
+) -> np.ndarray:
+    """Reads a depth image.
 
-    Parameters
-    ----------
-    path : a one-channel image, 16-bit (PNG, TIFF) or 32-bit float (TIFF), or a two-dimensional ``.npy``.
-    units_per_meter : the stored value of one meter; None means millimeters in 16 bits, meters in floating point.
-    invalid : stored values besides 0 that stand for "not measured". Negative and non-finite ones always do.
+    Args:
+        path: an image with one channel, 16-bit (PNG, TIFF) or 32-bit float (TIFF), or a two-dimensional `.npy`.
+        units_per_meter: the stored value of one meter; None means millimeters in 16 bits, meters in floating point.
+        invalid: stored values besides 0 that stand for "not measured". Negative and non-finite ones always do.
+        size: (width, height) that it must have; None for any that `check_image_size` lets pass.
 
-    Raises
-    ------
-    DatasetError
-        For a file that is missing, truncated, not an image, or of another kind (8-bit, several channels).
+    Returns:
+        float32 [H, W], m, 0 where nothing was measured.
+
+    Raises:
+        DatasetError: the file is missing, truncated, not an image, of another kind (8-bit, several channels), or of
+            another size.
     """
-    if path.suffix == ".npy":
-        stored = _load_array(path)
+    if path.suffix.lower() == ".npy":
+        stored = _load_array(path, size)
     else:
-        stored = _decode(_read_bytes(path), path.suffix, str(path), cv2.IMREAD_UNCHANGED)
-    if stored.ndim != 2 or stored.dtype not in (np.uint16, np.float32, np.float64):
+        stored = _decode(_image_bytes(path), str(path), size, cv2.IMREAD_UNCHANGED)
+    if stored.ndim != 2 or stored.dtype not in _DEPTH_TYPES:
         channels = 1 if stored.ndim == 2 else stored.shape[-1]
         raise DatasetError(
             f"{path}: depth must be 16-bit or floating-point with one channel, got {stored.dtype} with {channels}"
@@ -56,10 +91,20 @@ def read_depth(path: Path, units_per_meter: float | None, invalid: Sequence[int]
 
 
 def depth_in_meters(stored: np.ndarray, units_per_meter: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
-    """Stored depth [H,W], uint16 or floating-point, as float32 meters; arguments as for :func:`read_depth`."""
+    """Converts stored depth to meters.
+
+    Args:
+        stored: uint16 or floating-point [H, W].
+        units_per_meter: see `read_depth`.
+        invalid: see `read_depth`.
+
+    Returns:
+        float32 [H, W], m, 0 where nothing was measured.
+    """
     if units_per_meter is None:
         units_per_meter = 1000.0 if stored.dtype == np.uint16 else 1.0
-    depth = np.divide(stored, np.float32(units_per_meter), dtype=np.float32, casting="same_kind")
+    with np.errstate(over="ignore", invalid="ignore"):  # infinity and NaN are not measured
+        depth = np.divide(stored, np.float32(units_per_meter), dtype=np.float32, casting="same_kind")
     for value in invalid:
         depth[stored == value] = 0
     if stored.dtype != np.uint16:
@@ -67,8 +112,34 @@ def depth_in_meters(stored: np.ndarray, units_per_meter: float | None, invalid: 
     return depth
 
 
-def first_size(paths: Iterable[Path], read: Callable[[Path], np.ndarray] = read_color) -> tuple[int, int]:
-    """(width, height) of the first image that ``read`` can read; raises the first one's DatasetError if none."""
+def check_image_size(size: Size, name: str) -> None:
+    """Raises DatasetError, which begins with `name`, for an image (width, height) that is empty or too large."""
+    if not (min(size) > 0 and max(size) <= MAX_SIDE_PX and math.prod(size) <= MAX_PIXELS):
+        raise DatasetError(
+            f"{name}: an image must have 1 to {MAX_PIXELS} pixels and at most {MAX_SIDE_PX} along a side, "
+            f"got {_text(size)}"
+        )
+
+
+def is_depth_scale(units_per_meter: Any) -> bool:
+    """Whether something is a number that can be the stored value of one meter."""
+    is_number = isinstance(units_per_meter, (int, float)) and not isinstance(units_per_meter, bool)
+    return is_number and _LEAST_UNITS <= units_per_meter <= _MOST_UNITS
+
+
+def first_size(paths: Iterable[Path], read: Callable[[Path], np.ndarray] = read_color) -> Size:
+    """The size of the first image that can be read.
+
+    Args:
+        paths: the images.
+        read: reads one of them.
+
+    Returns:
+        (width, height).
+
+    Raises:
+        DatasetError: none can be read; the first one's error.
+    """
     first_error = None
     for path in paths:
         try:
@@ -88,13 +159,15 @@ def resized_color(color: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
-def _decode(content: bytes, suffix: str, name: str, flags: int) -> np.ndarray:
-    mark = _END_MARKS.get(suffix.lower())
+def _decode(content: bytes, name: str, size: Size | None, flags: int) -> np.ndarray:
     # Checked beforehand because some versions of OpenCV return the half they could decode.
-    if mark is not None and mark not in content[-_TAIL_BYTES:] and mark not in content[len(content) // 2 :]:
+    if is_truncated(content):
         raise DatasetError(f"{name}: the image is truncated ({len(content)} bytes, no end mark)")
     try:
+        _check_size(image_size(content), size, name)
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    except ValueError as error:
+        raise DatasetError(f"{name}: can't be decoded as an image: {error}") from None
     except cv2.error as error:
         raise DatasetError(f"{name}: can't be decoded as an image: {error.err}") from error
     if image is None:
@@ -102,20 +175,45 @@ def _decode(content: bytes, suffix: str, name: str, flags: int) -> np.ndarray:
     return image
 
 
-def _load_array(path: Path) -> np.ndarray:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DatasetError(f"{path}: can't be read as an array: {error}") from error
+def _check_size(actual: Size, expected: Size | None, name: str) -> None:
+    if expected is not None and actual != expected:
+        raise DatasetError(
+            f"{name}: must be as large as the sequence's first image, {_text(expected)}, got {_text(actual)}"
+        )
+    check_image_size(actual, name)
 
 
-def _read_bytes(path: Path) -> bytes:
+def _text(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _load_array(path: Path, size: Size | None) -> np.ndarray:
+    """The array [H, W] in a `.npy` file; its header is checked before anything is allocated."""
+    content = _image_bytes(path)
+    file = io.BytesIO(content)
     try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise DatasetError(f"{path}: no such file") from None
-    except OSError as error:
-        raise DatasetError(f"{path}: can't be read: {error.strerror}") from error
+        version = np.lib.format.read_magic(file)
+        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, fortran_order, dtype = read_header[version](file)
+    except Exception as error:  # NumPy parses the header as Python and raises whatever that raises
+        raise DatasetError(f"{path}: can't be read as an array: {_first_line(error)}") from None
+    if len(shape) != 2 or min(shape) < 1 or dtype.type not in _DEPTH_TYPES:
+        raise DatasetError(f"{path}: depth must be 16-bit or floating-point [H, W], got {dtype} {list(shape)}")
+    height, width = shape
+    _check_size((width, height), size, str(path))
+    start = file.tell()
+    if len(content) - start < height * width * dtype.itemsize:
+        raise DatasetError(f"{path}: the array is truncated ({len(content)} bytes)")
+    stored = np.frombuffer(content, dtype, height * width, start).reshape(shape, order="F" if fortran_order else "C")
+    return stored.astype(dtype.newbyteorder("="), copy=False)
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _image_bytes(path: Path) -> bytes:
+    content = read_bytes(path, MAX_IMAGE_BYTES, DatasetError)
     if not content:
         raise DatasetError(f"{path}: the file is empty")
     return content

@@ -1,4 +1,4 @@
-"""A look through a data set before running on it: sizes, depth, holes, poses, and what looks wrong."""
+"""Inspection of a data set before a run: sizes, depth, missing depth, poses, and what looks wrong."""
 
 from __future__ import annotations
 
@@ -29,7 +29,15 @@ _GOOD_AGREEMENT = 0.02
 
 @dataclass(frozen=True)
 class DepthStatistics:
-    """Depth of the frames looked at: percentiles 1, 50 and 99 in meters, share of pixels without depth."""
+    """Depth of the frames that were inspected.
+
+    Attributes:
+        near_m: 1st percentile.
+        median_m: 50th percentile.
+        far_m: 99th percentile.
+        holes: mean share of pixels without depth.
+        most_holes: largest share of pixels without depth in a frame.
+    """
 
     near_m: float
     median_m: float
@@ -40,7 +48,17 @@ class DepthStatistics:
 
 @dataclass(frozen=True)
 class PoseStatistics:
-    """True poses: how many, motion from frame to frame, frames after which the camera jumps, agreement with depth."""
+    """Ground-truth poses.
+
+    Attributes:
+        count: frames with a known pose.
+        step_cm: median translation from frame to frame.
+        max_step_cm: largest one.
+        step_deg: median rotation from frame to frame.
+        max_step_deg: largest one.
+        jumps: frames after which the camera jumps.
+        agreement: of the poses with the depth images; None where no pair of views overlaps.
+    """
 
     count: int
     step_cm: float
@@ -53,7 +71,19 @@ class PoseStatistics:
 
 @dataclass
 class Inspection:
-    """What was found; ``problems`` says in words what looks wrong."""
+    """What was found.
+
+    Attributes:
+        name: of the data set.
+        frames: how many it has.
+        camera: of all frames.
+        frames_read: how many were inspected.
+        unreadable: errors of those that can't be read.
+        frames_per_second: from the median step between timestamps; NaN where unknown.
+        depth: None where no frame has depth.
+        poses: None where none is known.
+        problems: what looks wrong, in words.
+    """
 
     name: str
     frames: int
@@ -67,15 +97,14 @@ class Inspection:
 
 
 def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> Inspection:
-    """Read some frames, spread evenly, and all poses and times.
-
-    Parameters
-    ----------
-    dataset : what to look through.
-    frames : most frames whose depth is looked at.
-    pairs : most pairs of frames that check the poses.
+    """Reads some frames, spread evenly, and all poses and times.
 
     A frame that can't be read is reported, not raised. Deterministic.
+
+    Args:
+        dataset: what to inspect.
+        frames: most frames whose depth is read.
+        pairs: most pairs of frames that check the poses.
     """
     indices = np.unique(np.linspace(0, len(dataset) - 1, frames).astype(int))
     depths, unreadable = _read_depths(dataset, indices)

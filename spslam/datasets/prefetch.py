@@ -16,7 +16,7 @@ ReadFrame = TypeVar("ReadFrame", covariant=True)
 
 
 class Readable(Protocol[ReadFrame]):
-    """What is read ahead: an ``RgbdDataset``, or whatever else has frames by number, from any thread."""
+    """What is read ahead: an `RgbdDataset`, or whatever else has frames by number, from any thread."""
 
     def __len__(self) -> int: ...
 
@@ -24,17 +24,24 @@ class Readable(Protocol[ReadFrame]):
 
 
 class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
-    """Frames of a dataset in order, read by threads up to ``ahead`` frames in advance.
+    """Frames of a dataset in order, read by threads up to `ahead` frames in advance.
 
-    A frame that can't be read comes as its DatasetError in the frame's place (not raised): who iterates
-    decides. Any other exception is a bug and is raised in that place. The threads end with the last frame,
-    with ``close()``, on leaving a ``with`` block, and on any exception that passes through, Ctrl-C included.
+    A frame that can't be read comes as its DatasetError in the frame's place (not raised): the caller decides what to
+    do. Any other exception is a bug and is raised in that place. The threads end with the last frame, with `close()`,
+    on leaving a `with` block, and on any exception that passes through, Ctrl-C included.
 
-    Attributes
-    ----------
-    frames_read : frames handed out so far, broken ones included.
-    read_seconds : time spent on reading those, summed over the threads.
-    wait_seconds : time that the caller waited for frames.
+    Args:
+        dataset: the frames.
+        workers: threads; 0 reads each frame when it is asked for.
+        ahead: most frames read in advance.
+
+    Attributes:
+        frames_read: frames handed out so far, broken ones included.
+        read_seconds: time spent on reading those, summed over the threads.
+        wait_seconds: time that the caller waited for frames.
+
+    Raises:
+        ValueError: `workers` is negative, or `ahead` below 1.
     """
 
     def __init__(self, dataset: Readable[Frame], workers: int = 2, ahead: int = 8) -> None:
@@ -59,7 +66,7 @@ class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
             raise
 
     def close(self) -> None:
-        """Drop what was read ahead and wait for the threads to end. May be called again."""
+        """Drops what was read ahead and waits for the threads to end. May be called again."""
         self._next = len(self._dataset)
         self._pending.clear()
         if self._threads is not None:
@@ -103,16 +110,20 @@ class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
 
 
 def prefetch(dataset: Readable[Frame], workers: int = 2, ahead: int = 8) -> Prefetcher[Frame]:
-    """Read a dataset's frames in order, ``ahead`` frames in advance, on ``workers`` threads.
+    """Reads a dataset's frames in order, `ahead` frames in advance, on `workers` threads; see `Prefetcher`.
 
-    At most ``ahead`` + 1 decoded frames exist at a time. With 0 workers each frame is read when it is asked
-    for. What the frames hold doesn't depend on the number of threads. Example::
+    At most `ahead` + 1 decoded frames exist at a time. What the frames hold doesn't depend on the number of threads.
 
-        with prefetch(dataset, workers=2, ahead=8) as frames:
-            for frame in frames:
-                if isinstance(frame, DatasetError):
-                    continue
-                ...
+    Args:
+        dataset: the frames.
+        workers: threads; 0 reads each frame when it is asked for.
+        ahead: most frames read in advance.
+
+    Example:
+        >>> from spslam.datasets.generated import GeneratedDataset
+        >>> with prefetch(GeneratedDataset(2, 32, 24), workers=1) as frames:
+        ...     [frame.index for frame in frames if not isinstance(frame, DatasetError)]
+        [0, 1]
     """
     return Prefetcher(dataset, workers, ahead)
 

@@ -19,7 +19,7 @@ _SPHERE_SUBDIVISIONS = 4
 
 @dataclass(frozen=True)
 class Primitive(ABC):
-    """A convex solid, turned about the vertical by ``yaw`` radians and placed at ``center``."""
+    """A convex solid, turned about the vertical by `yaw` radians and placed at `center`."""
 
     center: tuple[float, float, float]
     yaw: float = 0.0
@@ -99,7 +99,7 @@ class Primitive(ABC):
 
 @dataclass(frozen=True)
 class Box(Primitive):
-    """A box of edge lengths ``size``."""
+    """A box of edge lengths `size`."""
 
     size: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
@@ -174,7 +174,7 @@ class Sphere(Primitive):
 
 @dataclass(frozen=True)
 class Cylinder(Primitive):
-    """An upright cylinder of ``radius`` and ``height``."""
+    """An upright cylinder of `radius` and `height`."""
 
     radius: float = 0.5
     height: float = 1.0

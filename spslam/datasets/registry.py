@@ -20,21 +20,17 @@ from spslam.options import DatasetOptions
 
 
 def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> RgbdDataset:
-    """The dataset that a configuration's ``dataset`` section names.
+    """The dataset that a configuration's `dataset` section names.
 
-    Parameters
-    ----------
-    config : any object with the attribute ``type`` (one of :func:`dataset_types`) and, each optional or None:
-        ``path``, ``stride`` (every n-th frame), ``min_depth_m``, ``max_depth_m`` (depth outside comes as 0),
-        ``border_px`` (so does depth this close to the image's border), and the options of the kind: ``sequence``
-        (7scenes), ``depth_variant`` (synthetic_rgbd), ``depth_scale`` (folder), ``frames``, ``width``, ``height``,
-        ``noise``, ``seed`` (generated).
-    data_dir : the data's folder; overrides ``config.path``. Not needed by ``generated``.
+    Args:
+        config: any object with the attribute `type` (one of `dataset_types()`) and, each optional or None: `path`,
+            `stride` (every n-th frame), `min_depth_m`, `max_depth_m` (depth outside comes as 0), `border_px` (so does
+            depth this close to the image's border), and the options of the kind: `sequence` (7scenes), `depth_variant`
+            (synthetic_rgbd), `depth_scale` (folder), `frames`, `width`, `height`, `noise`, `seed` (generated).
+        data_dir: the data's folder; overrides `config.path`. Not needed by `generated`.
 
-    Raises
-    ------
-    DatasetError
-        For an unknown type, no folder given, and whatever is wrong with the data.
+    Raises:
+        DatasetError: an unknown type, no folder given, or whatever is wrong with the data.
     """
     opener = _OPENERS.get(config.type)
     if opener is None:
@@ -47,14 +43,17 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
 
 
 def open_sequence(config: Any, data_dir: str | os.PathLike | None = None, frames: slice | None = None) -> RgbdDataset:
-    """The frames that a run is over: those of :func:`open_dataset`, or the part of them that ``frames`` names.
+    """The frames that a run is over.
 
     Frames are read until one is usable, so that data without any is refused before anything is written.
 
-    Raises
-    ------
-    DatasetError
-        As :func:`open_dataset`, and when no frame is selected or none can be read.
+    Args:
+        config: see `open_dataset`.
+        data_dir: see `open_dataset`.
+        frames: which of the dataset's frames; all where None.
+
+    Raises:
+        DatasetError: as `open_dataset`, and when no frame is selected or none can be read.
     """
     dataset = open_dataset(config, data_dir)
     if frames is not None:
@@ -70,15 +69,17 @@ def open_sequence(config: Any, data_dir: str | os.PathLike | None = None, frames
 
 
 def sequence_options(options: DatasetOptions) -> list[DatasetOptions]:
-    """One section of options for each sequence of the data, where ``options`` leaves open which one is meant.
+    """One section of options for each sequence of the data, where `options` leaves open which one is meant.
 
-    A 7-Scenes scene of several sequences gives one for each; ``sequence: train`` or ``test`` one for each in
-    TrainSplit.txt or TestSplit.txt. Everything else gives the options as they are.
+    Args:
+        options: of a data set.
 
-    Raises
-    ------
-    DatasetError
-        For a missing folder, or a missing or malformed split file.
+    Returns:
+        For a 7-Scenes scene of several sequences one section for each; for `sequence: train` or `test` one for each in
+        TrainSplit.txt or TestSplit.txt. Everything else gives the options as they are.
+
+    Raises:
+        DatasetError: a missing folder, or a missing or malformed split file.
     """
     split = options.sequence if options.sequence in SPLITS else None
     if options.type != "7scenes" or options.path is None or (options.sequence is not None and split is None):
@@ -88,7 +89,7 @@ def sequence_options(options: DatasetOptions) -> list[DatasetOptions]:
 
 
 def dataset_types() -> list[str]:
-    """Names that ``dataset.type`` may have."""
+    """Names that `dataset.type` may have."""
     return list(_OPENERS)
 
 

@@ -1,8 +1,8 @@
 """Replica as rendered for iMAP and NICE-SLAM.
 
-``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (16-bit), ``traj.txt`` with 16 numbers a line (4x4 camera
-to world, OpenCV axes) and ``cam_params.json`` beside the scene or in its parent folder: ``{"camera": {"w", "h", "fx",
-"fy", "cx", "cy", "scale"}}``, ``scale`` being the depth value of one meter.
+`results/frameNNNNNN.jpg` and `results/depthNNNNNN.png` (16-bit), `traj.txt` with 16 numbers a line (4x4 camera
+to world, OpenCV axes) and `cam_params.json` beside the scene or in its parent folder: `{"camera": {"w", "h", "fx",
+"fy", "cx", "cy", "scale"}}`, `scale` being the depth value of one meter.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.files import FileDataset, attach_pose_table, find_numbered, pair_numbered, require_folder
-from spslam.datasets.images import first_size
+from spslam.datasets.images import DEPTH_SCALE_RULE, first_size, is_depth_scale
 from spslam.datasets.text import camera_from_matrix, read_json
 from spslam.errors import DatasetError
 
@@ -22,12 +22,13 @@ FRAMES_PER_SECOND = 30.0
 
 
 def open_replica(folder: Path) -> FileDataset:
-    """A scene of the NICE-SLAM Replica layout; ``traj.txt`` may be missing or shorter than the sequence.
+    """Opens a scene of the NICE-SLAM Replica layout.
 
-    Raises
-    ------
-    DatasetError
-        For a missing folder, another layout, missing or inconsistent camera parameters, unreadable poses.
+    Args:
+        folder: the scene; `traj.txt` may be missing or shorter than the sequence.
+
+    Raises:
+        DatasetError: a missing folder, another layout, missing or inconsistent camera parameters, unreadable poses.
     """
     results = require_folder(folder) / "results"
     colors = find_numbered(results, r"frame(\d+)\.(?:jpg|jpeg|png)")
@@ -53,7 +54,7 @@ def _read_camera(path: Path, width: int, height: int) -> tuple[Camera, float]:
         raise DatasetError(f"{path}: must hold numbers camera.{{{', '.join(names)}}}, got {values}")
     if (values["w"], values["h"]) != (width, height):
         raise DatasetError(f"{path}: must give the images' size {width}x{height}, got {values['w']}x{values['h']}")
-    if values["scale"] <= 0:
-        raise DatasetError(f"{path}: camera.scale must be positive, got {values['scale']}")
+    if not is_depth_scale(values["scale"]):
+        raise DatasetError(f"{path}: camera.scale must be {DEPTH_SCALE_RULE}, got {values['scale']}")
     matrix = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path)), float(values["scale"])

@@ -30,7 +30,14 @@ Depths = Sequence[np.ndarray]
 
 @dataclass(frozen=True)
 class DepthPair:
-    """Two views: frame numbers and depth images [H,W], meters, 0 unknown."""
+    """Two views.
+
+    Attributes:
+        frame_a: number of the first frame.
+        frame_b: number of the second frame.
+        depth_a: [H, W], m, 0 unknown.
+        depth_b: [H, W], m, 0 unknown.
+    """
 
     frame_a: int
     frame_b: int
@@ -40,7 +47,13 @@ class DepthPair:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well depth agrees across views: medians over all points that fall into the other view."""
+    """How well depth agrees across views: medians over all points that fall into the other view.
+
+    Attributes:
+        median_cm: difference of depths.
+        relative: difference as a share of the depth.
+        overlap: share of the points that fall into the other view.
+    """
 
     median_cm: float
     relative: float
@@ -50,10 +63,9 @@ class Agreement:
 def choose_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
     """Pairs of frames (i, j), i < j, spread over the sequence, whose views differ a little.
 
-    Parameters
-    ----------
-    poses : [F,4,4], NaN where unknown; frames without pose are in no pair.
-    count : most pairs. Fewer than two known poses give none.
+    Args:
+        poses: [F, 4, 4], NaN where unknown; frames without pose are in no pair.
+        count: most pairs. Fewer than two known poses give none.
     """
     known = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
     pairs = []
@@ -69,16 +81,14 @@ def measure_agreement(
 ) -> Agreement | None:
     """Median difference between depth carried into a view and the depth measured there.
 
-    Parameters
-    ----------
-    camera : of all views.
-    pairs : as read by the caller.
-    poses : [F,4,4] ``T_world_camera``, indexed by the pairs' frame numbers.
-    scale : factor on all depths.
+    Args:
+        camera: of all views.
+        pairs: as read by the caller.
+        poses: [F, 4, 4] T_world_camera, indexed by the pairs' frame numbers.
+        scale: factor on all depths.
 
-    Returns
-    -------
-    None if no point of any pair falls into the other view.
+    Returns:
+        None if no point of any pair falls into the other view.
     """
     parts = [_differences(camera, pair, poses, scale) for pair in pairs]
     differences = np.concatenate([difference for difference, _, _ in parts] or [np.zeros(0)])
@@ -94,7 +104,17 @@ def measure_agreement(
 def explain_disagreement(
     camera: Camera, pairs: Sequence[DepthPair], poses: np.ndarray, actual: Agreement | None
 ) -> str | None:
-    """The reading of the poses that fits the depth clearly better, in words; None if the poses fit or none does."""
+    """The reading of the poses that fits the depth clearly better, in words.
+
+    Args:
+        camera: of all views.
+        pairs: as read by the caller.
+        poses: [F, 4, 4] T_world_camera, as they are.
+        actual: agreement of depth with these poses; None where no point falls into another view.
+
+    Returns:
+        None if the poses fit, or no other reading does.
+    """
     if actual is not None and actual.relative < _GOOD_RELATIVE_ERROR:
         return None
     best, found = np.inf if actual is None else _CLEARLY_BETTER * _cost(actual), None

@@ -30,7 +30,7 @@ _SAGITTA_M = 5e-4
 
 
 class Room:
-    """The room of a seed: 5 x 4 x 2.6 m, floor at z = 0, z up, with the furniture of :mod:`furniture`."""
+    """The room of a seed: 5 x 4 x 2.6 m, floor at z = 0, z up, with the furniture of `spslam.datasets.furniture`."""
 
     def __init__(self, seed: int = 0) -> None:
         generator = np.random.default_rng([seed, 2])
@@ -41,7 +41,7 @@ class Room:
     def render(self, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What a camera inside sees: color uint8 [H,W,3] and exact depth float32 [H,W] in meters.
 
-        One ray through each pixel center is intersected with every solid; ``pose`` is ``T_world_camera`` [4,4].
+        One ray through each pixel center is intersected with every solid; `pose` is `T_world_camera` [4,4].
         """
         origin = pose[:3, 3]
         directions = np.tensordot(pose[:3, :3].astype(np.float32), camera.ray_directions(), axes=(1, 2))
@@ -63,13 +63,13 @@ class Room:
         return distance
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] of points [N,3] to the nearest surface; exact in free space, see :meth:`signed_distance`."""
+        """Distance [N] of points [N,3] to the nearest surface; exact in free space, see `signed_distance`."""
         return np.abs(self.signed_distance(points))
 
     def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
         """Points [count,3] spread evenly by area over the surfaces that face free space; float64, meters.
 
-        The same count and seed give the same points. ``count`` 0 gives an empty array.
+        The same count and seed give the same points. `count` 0 gives an empty array.
         """
         generator = np.random.default_rng([seed, 3])
         solids = [self._shell, *(piece.solid for piece in self.pieces)]
@@ -102,7 +102,7 @@ class Room:
         return np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors)
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices [V,3] and faces [F,3] of :meth:`mesh`."""
+        """Vertices [V,3] and faces [F,3] of `mesh`."""
         vertices, faces, _ = self.mesh()
         return vertices, faces
 

@@ -1,8 +1,8 @@
 """ScanNet (Dai et al. 2017): Structure Sensor on a tablet, poses by BundleFusion.
 
-A scan is read from ``sceneNNNN_NN.sens`` as it is distributed, or from what the data set's own exporter makes of it:
-``color/N.jpg``, ``depth/N.png`` (16-bit millimeters), ``pose/N.txt`` (4x4 camera to world, OpenCV axes; infinite where
-unknown) and ``intrinsic/intrinsic_depth.txt``. Color is larger than depth (1296x968 against 640x480). The authors
+A scan is read from `sceneNNNN_NN.sens` as it is distributed, or from what the data set's own exporter makes of it:
+`color/N.jpg`, `depth/N.png` (16-bit millimeters), `pose/N.txt` (4x4 camera to world, OpenCV axes; infinite where
+unknown) and `intrinsic/intrinsic_depth.txt`. Color is larger than depth (1296x968 against 640x480). The authors
 registered the two to each other ("they can be resampled to the same resolution"), so color is brought to depth's size
 and depth's intrinsics hold for both.
 """
@@ -18,7 +18,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import depth_in_meters, first_size, read_depth, resized_color
 from spslam.datasets.sens import SensFile
-from spslam.datasets.text import camera_from_matrix, checked_pose, read_intrinsics_matrix
+from spslam.datasets.text import camera_from_matrix, checked_poses, motion_fault, read_intrinsics_matrix
 from spslam.errors import DatasetError
 
 FRAMES_PER_SECOND = 30.0
@@ -27,15 +27,16 @@ _INTRINSICS = "intrinsic_depth.txt", "intrinsic_color.txt"
 
 
 def open_scannet(path: Path) -> RgbdDataset:
-    """A scan: its ``.sens`` file, the folder that holds one, or an exported folder (which wins if both are there).
+    """Opens a scan.
 
     A frame whose pose isn't finite has no pose. A frame whose image is missing or broken, or whose pose is no rigid
     motion, is one that raises when it is read.
 
-    Raises
-    ------
-    DatasetError
-        For a missing path, another layout, several ``.sens`` files, missing or unreadable intrinsics.
+    Args:
+        path: the `.sens` file, the folder that holds one, or an exported folder (which wins if both are there).
+
+    Raises:
+        DatasetError: a missing path, another layout, several `.sens` files, missing or unreadable intrinsics.
     """
     if path.suffix == ".sens":
         return SensDataset(SensFile(path))
@@ -52,16 +53,17 @@ def open_scannet(path: Path) -> RgbdDataset:
 
 
 class SensDataset(RgbdDataset):
-    """The frames of a ``.sens`` file.
+    """The frames of a `.sens` file.
 
     Times are those of the color images, in seconds from the first; a file without times is taken at 30 Hz. Frames are
     put in order of time; of frames with the same time all but the first raise when they are read, and so does one frame
-    that stands for the missing rest of a file that was cut.
+    that stands for the missing rest of a truncated file.
 
-    Raises
-    ------
-    DatasetError
-        For a file without a whole frame, or without intrinsics of depth.
+    Args:
+        file: opened.
+
+    Raises:
+        DatasetError: the file has no whole frame, or no intrinsics of depth.
     """
 
     def __init__(self, file: SensFile) -> None:
@@ -105,12 +107,11 @@ class SensDataset(RgbdDataset):
         return self._file.describe(int(self._order[index]))
 
     def _read_poses(self, stored: np.ndarray) -> np.ndarray:
-        poses = np.full((len(self._order), 4, 4), np.nan)
-        for row, frame in enumerate(self._order):
-            try:
-                poses[row] = checked_pose(stored[frame], f"{self._file.describe(frame)}, pose")
-            except DatasetError as error:
-                self._faults.setdefault(row, str(error))
+        ordered = stored[self._order]
+        poses, is_motion = checked_poses(ordered.reshape(-1, 4, 4))
+        for row in np.flatnonzero(~is_motion):
+            name = f"{self._file.describe(self._order[row])}, pose"
+            self._faults.setdefault(int(row), motion_fault(name, ordered[row]))
         return poses
 
     def _stand_in_for_the_rest(self, announced: int) -> None:

@@ -1,14 +1,15 @@
-"""ScanNet's ``.sens``: a whole recording in one file (version 4 of its format, little-endian).
+"""ScanNet's `.sens`: a whole recording in one file (version 4 of its format, little-endian).
 
 The head: version (u32), length (u64) and bytes of the sensor's name, four 4x4 float32 matrices row by row (color's
 intrinsics and extrinsics, then depth's), the compressions of color and of depth (i32), width and height of color and
-of depth (u32), ``depth_shift`` (f32: depth units a meter) and the number of frames (u64).
-Each frame: ``camera_to_world`` (4x4 float32), the times of color and depth in microseconds (u64), the bytes that
+of depth (u32), `depth_shift` (f32: depth units per meter) and the number of frames (u64).
+Each frame: `camera_to_world` (4x4 float32), the times of color and depth in microseconds (u64), the bytes that
 either takes (u64), and these. IMU readings follow; they aren't read.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import zlib
@@ -18,30 +19,44 @@ from typing import BinaryIO
 
 import numpy as np
 
-from spslam.datasets.images import decode_color
+from spslam.datasets.base import MAX_FRAMES
+from spslam.datasets.images import DEPTH_SCALE_RULE, Size, check_image_size, decode_color, is_depth_scale
 from spslam.errors import DatasetError
+from spslam.reading import open_regular
 
 VERSION = 4
-_COLOR_SUFFIXES = {1: ".png", 2: ".jpg"}
-_RAW, _ZLIB = 0, 1
+_RAW, _PNG, _JPEG = 0, 1, 2
+_ZLIB = 1
 _LONGEST_NAME = 4096
-_LARGEST_SIDE_PX = 1 << 15
-_FRAME_HEAD = struct.Struct("<64sQQQQ")
+# A compressed image may be larger than the pixels it holds, but not much; PNG and JPEG may carry notes.
+_MOST_COMPRESSED_SHARE, _MOST_NOTES_BYTES = 2, 1 << 16
+_COLOR_BYTES, _DEPTH_BYTES = 3, 2
+_FRAME_HEAD = np.dtype(
+    [
+        ("pose", "<f4", 16),
+        ("color_time_us", "<u8"),
+        ("depth_time_us", "<u8"),
+        ("color_bytes", "<u8"),
+        ("depth_bytes", "<u8"),
+    ]
+)
+_SIZES_AT = _FRAME_HEAD.itemsize - 16  # of color_bytes and depth_bytes
 
 
 @dataclass(frozen=True)
 class SensHeader:
     """What a file says of all its frames.
 
-    Attributes
-    ----------
-    sensor : its name.
-    color_intrinsics, depth_intrinsics : float32 [4,4], pixels.
-    color_compression : 0 raw, 1 PNG, 2 JPEG.
-    depth_compression : 0 raw, 1 zlib.
-    color_size, depth_size : (width, height).
-    units_per_meter : stored depth of one meter.
-    frames : how many the file should have.
+    Attributes:
+        sensor: its name.
+        color_intrinsics: float32 [4, 4], px.
+        depth_intrinsics: float32 [4, 4], px.
+        color_compression: 0 raw, 1 PNG, 2 JPEG.
+        depth_compression: 0 raw, 1 zlib.
+        color_size: (width, height).
+        depth_size: (width, height).
+        units_per_meter: stored depth of one meter.
+        frames: how many the file should have.
     """
 
     sensor: str
@@ -49,22 +64,22 @@ class SensHeader:
     depth_intrinsics: np.ndarray
     color_compression: int
     depth_compression: int
-    color_size: tuple[int, int]
-    depth_size: tuple[int, int]
+    color_size: Size
+    depth_size: Size
     units_per_meter: float
     frames: int
 
 
 @dataclass(frozen=True)
 class SensIndex:
-    """Where the frames are and what stands beside them; F whole frames, fewer than announced if the file is cut.
+    """Where the frames are and what stands beside them; F whole frames, fewer than announced if the file is truncated.
 
-    Attributes
-    ----------
-    poses : float32 [F,16], ``camera_to_world`` as stored; minus infinity where unknown.
-    times_us : uint64 [F], of the color images.
-    offsets : int64 [F], where the color image begins in the file; depth follows it.
-    color_bytes, depth_bytes : int64 [F].
+    Attributes:
+        poses: float32 [F, 16], `camera_to_world` as stored; minus infinity where unknown.
+        times_us: uint64 [F], of the color images.
+        offsets: int64 [F], where the color image begins in the file; depth follows it.
+        color_bytes: int64 [F].
+        depth_bytes: int64 [F].
     """
 
     poses: np.ndarray
@@ -78,59 +93,84 @@ class SensIndex:
 
 
 class SensFile:
-    """A ``.sens`` file: header and index are read on opening, an image when it is asked for, from any thread.
+    """A `.sens` file: header and index are read on opening, an image when it is asked for, from any thread.
 
-    Raises
-    ------
-    DatasetError
-        For a file that is missing, empty, of another version, compressed otherwise than above, or cut in its head.
+    Args:
+        path: the file.
+
+    Attributes:
+        path: as given.
+        header: what holds for all frames.
+        index: where they are.
+
+    Raises:
+        DatasetError: the file is missing, empty, of another version, compressed otherwise than above, truncated in its
+            head, or of images that are too large.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            with path.open("rb") as file:
+        with open_regular(path, DatasetError) as file:
+            try:
                 self.header = _read_header(file, path)
                 self.index = _read_index(file, self.header.frames)
-        except FileNotFoundError:
-            raise DatasetError(f"{path}: no such file") from None
-        except OSError as error:
-            raise DatasetError(f"{path}: can't be read: {error.strerror}") from error
+            except OSError as error:
+                raise DatasetError(f"{path}: can't be read: {error.strerror}") from error
 
     def describe(self, frame: int) -> str:
         """What an error about a frame should name."""
         return f"{self.path}, frame {frame}"
 
     def color(self, frame: int) -> np.ndarray:
-        """Color image of a frame, uint8 [H,W,3], RGB. Raises DatasetError."""
-        content = self._bytes(self.index.offsets[frame], self.index.color_bytes[frame])
-        name, (width, height) = f"{self.describe(frame)}, color", self.header.color_size
-        if self.header.color_compression != _RAW:
-            return decode_color(content, _COLOR_SUFFIXES[self.header.color_compression], name)
-        if len(content) != 3 * width * height:
-            raise DatasetError(f"{name}: must be {3 * width * height} bytes, got {len(content)}")
-        return np.frombuffer(content, dtype=np.uint8).reshape(height, width, 3).copy()
+        """Color image of a frame, uint8 [H, W, 3], RGB. Raises DatasetError."""
+        size, is_raw = self.header.color_size, self.header.color_compression == _RAW
+        name, raw_bytes = f"{self.describe(frame)}, color", _COLOR_BYTES * math.prod(size)
+        content = self._bytes(self.index.offsets[frame], self.index.color_bytes[frame], raw_bytes, is_raw, name)
+        if not is_raw:
+            return decode_color(content, name, size)
+        return np.frombuffer(content, dtype=np.uint8).reshape(size[1], size[0], _COLOR_BYTES).copy()
 
     def depth(self, frame: int) -> np.ndarray:
-        """Depth image of a frame as stored, uint16 [H,W]. Raises DatasetError."""
-        content = self._bytes(self.index.offsets[frame] + self.index.color_bytes[frame], self.index.depth_bytes[frame])
-        name, (width, height) = f"{self.describe(frame)}, depth", self.header.depth_size
-        if self.header.depth_compression == _ZLIB:
-            try:
-                content = zlib.decompress(content)
-            except zlib.error as error:
-                raise DatasetError(f"{name}: can't be decompressed: {error}") from error
-        if len(content) != 2 * width * height:
-            raise DatasetError(f"{name}: must be {2 * width * height} bytes, got {len(content)}")
-        return np.frombuffer(content, dtype="<u2").reshape(height, width)
+        """Depth image of a frame as stored, uint16 [H, W]. Raises DatasetError."""
+        size, is_raw = self.header.depth_size, self.header.depth_compression == _RAW
+        name, raw_bytes = f"{self.describe(frame)}, depth", _DEPTH_BYTES * math.prod(size)
+        offset = self.index.offsets[frame] + self.index.color_bytes[frame]
+        content = self._bytes(offset, self.index.depth_bytes[frame], raw_bytes, is_raw, name)
+        if not is_raw:
+            content = _inflated(content, raw_bytes, name)
+        return np.frombuffer(content, dtype="<u2").reshape(size[1], size[0])
 
-    def _bytes(self, offset: int, count: int) -> bytes:
-        try:
-            with self.path.open("rb") as file:
+    def _bytes(self, offset: int, count: int, raw_bytes: int, is_raw: bool, name: str) -> bytes:
+        """An image's bytes; no more of them are read than an image of its size can need."""
+        if is_raw and count != raw_bytes:
+            raise DatasetError(f"{name}: must be {raw_bytes} bytes, got {count}")
+        most = _MOST_COMPRESSED_SHARE * raw_bytes + _MOST_NOTES_BYTES
+        if count > most:
+            raise DatasetError(f"{name}: must be at most {most} bytes, got {count}")
+        with open_regular(self.path, DatasetError) as file:
+            try:
                 file.seek(offset)
-                return file.read(count)
-        except OSError as error:
-            raise DatasetError(f"{self.path}: can't be read: {error.strerror}") from error
+                content = file.read(count)
+            except OSError as error:
+                raise DatasetError(f"{self.path}: can't be read: {error.strerror}") from error
+        if len(content) < count:
+            raise DatasetError(f"{name}: the file is truncated")
+        return content
+
+
+def _inflated(content: bytes, expected: int, name: str) -> bytes:
+    """The `expected` bytes that zlib's content stands for; it is never inflated to more than one beyond them."""
+    inflater = zlib.decompressobj()
+    try:
+        inflated = inflater.decompress(content, expected + 1)
+    except zlib.error as error:
+        raise DatasetError(f"{name}: can't be decompressed: {error}") from error
+    if len(inflated) <= expected and not inflater.eof:
+        raise DatasetError(f"{name}: can't be decompressed: it ends early")
+    if len(inflated) != expected:
+        actual = f"over {expected}" if len(inflated) > expected else len(inflated)
+        raise DatasetError(f"{name}: must be {expected} bytes, got {actual}")
+    return inflated
 
 
 def _read_header(file: BinaryIO, path: Path) -> SensHeader:
@@ -150,18 +190,18 @@ def _read_header(file: BinaryIO, path: Path) -> SensHeader:
         units_per_meter, frames = _unpack(file, "<fQ")
     except struct.error:
         raise DatasetError(f"{path}: the file is truncated in its head") from None
-    if color_compression not in (_RAW, *_COLOR_SUFFIXES) or depth_compression not in (_RAW, _ZLIB):
+    if color_compression not in (_RAW, _PNG, _JPEG) or depth_compression not in (_RAW, _ZLIB):
         raise DatasetError(
             f"{path}: must hold color as raw, PNG or JPEG (0, 1, 2) and depth as raw or zlib (0, 1), "
             f"got {color_compression} and {depth_compression}"
         )
     sizes = (color_width, color_height), (depth_width, depth_height)
-    if not all(0 < side <= _LARGEST_SIDE_PX for size in sizes for side in size):
-        raise DatasetError(
-            f"{path}: image sizes must be within 1 and {_LARGEST_SIDE_PX} px, got {sizes[0]}, {sizes[1]}"
-        )
-    if not 0 < units_per_meter < float("inf"):
-        raise DatasetError(f"{path}: depth_shift must be positive, got {units_per_meter}")
+    for size in sizes:
+        check_image_size(size, str(path))
+    if not is_depth_scale(units_per_meter):
+        raise DatasetError(f"{path}: depth_shift must be {DEPTH_SCALE_RULE}, got {units_per_meter}")
+    if frames > MAX_FRAMES:
+        raise DatasetError(f"{path}: must have at most {MAX_FRAMES} frames, got {frames}")
     return SensHeader(
         sensor, matrices[0], matrices[2], color_compression, depth_compression, *sizes, units_per_meter, frames
     )
@@ -169,27 +209,26 @@ def _read_header(file: BinaryIO, path: Path) -> SensHeader:
 
 def _read_index(file: BinaryIO, frames: int) -> SensIndex:
     """Hops from frame to frame; ends with the last one that is whole."""
-    end = os.fstat(file.fileno()).st_size
-    offset = file.tell()
-    rows: list[tuple[int, int, int, int]] = []
-    poses: list[bytes] = []
-    while len(rows) < frames and offset + _FRAME_HEAD.size <= end:
+    end, offset, heads, offsets = os.fstat(file.fileno()).st_size, file.tell(), bytearray(), []
+    for _ in range(frames):
+        begin = offset + _FRAME_HEAD.itemsize
+        if begin > end:
+            break
         file.seek(offset)
-        pose, color_time, _, color_bytes, depth_bytes = _FRAME_HEAD.unpack(file.read(_FRAME_HEAD.size))
-        begin = offset + _FRAME_HEAD.size
+        head = file.read(_FRAME_HEAD.itemsize)
+        color_bytes, depth_bytes = struct.unpack_from("<QQ", head, _SIZES_AT)
         offset = begin + color_bytes + depth_bytes
         if offset > end:
             break
-        rows.append((color_time, begin, color_bytes, depth_bytes))
-        poses.append(pose)
-    # One column at a time: the times may fill all 64 bits.
-    times, begins, color_sizes, depth_sizes = zip(*rows, strict=True) if rows else ((), (), (), ())
+        heads += head
+        offsets.append(begin)
+    table = np.frombuffer(bytes(heads), _FRAME_HEAD)
     return SensIndex(
-        np.frombuffer(b"".join(poses), dtype="<f4").reshape(-1, 16),
-        np.array(times, dtype=np.uint64),
-        np.array(begins, dtype=np.int64),
-        np.array(color_sizes, dtype=np.int64),
-        np.array(depth_sizes, dtype=np.int64),
+        table["pose"],
+        table["color_time_us"],
+        np.array(offsets, dtype=np.int64),
+        table["color_bytes"].astype(np.int64),
+        table["depth_bytes"].astype(np.int64),
     )
 
 

@@ -1,7 +1,7 @@
 """7-Scenes (Shotton et al. 2013): Kinect v1 in seven small rooms.
 
-A scene folder holds ``seq-01``, ``seq-02``, ..., each with ``frame-NNNNNN.color.png`` (or jpg), ``.depth.png``
-(16-bit millimeters; 0 and 65535 are invalid) and ``.pose.txt`` (4x4 camera to world, OpenCV axes). The poses are
+A scene folder holds `seq-01`, `seq-02`, ..., each with `frame-NNNNNN.color.png` (or jpg), `.depth.png`
+(16-bit millimeters; 0 and 65535 are invalid) and `.pose.txt` (4x4 camera to world, OpenCV axes). The poses are
 KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Color and depth were not
 registered to each other by the data set's authors; both are taken as one camera's, as everybody does.
 """
@@ -22,27 +22,25 @@ INTRINSICS_FILE = "camera-intrinsics.txt"
 FRAMES_PER_SECOND = 30.0
 # "The default intrinsics for this sensor", as the data set's page gives them for 640x480.
 _DEFAULT_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+_MOST_DIGITS = 9  # of a sequence's number
 _COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
 _DEPTH_NAME = r"frame-(\d+)\.depth\.png"
 
 
 def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDataset:
-    """One sequence of a scene.
+    """Opens one sequence of a scene.
 
-    Parameters
-    ----------
-    folder : the scene (with ``seq-XX`` in it) or a sequence itself.
-    sequence : ``seq-03`` or its number; ``train`` or ``test`` is the first of TrainSplit.txt or TestSplit.txt. None is
-        the first that is there.
-
-    The camera is that of ``camera-intrinsics.txt`` in the sequence or the scene, else the data set's default
+    The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the data set's default
     (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite pose, has no
     pose. A frame with an image missing or a malformed pose file is one that raises when it is read.
 
-    Raises
-    ------
-    DatasetError
-        For a missing folder, another layout, an absent sequence, unreadable intrinsics.
+    Args:
+        folder: the scene (with `seq-XX` in it) or a sequence itself.
+        sequence: `seq-03` or its number; `train` or `test` is the first of TrainSplit.txt or TestSplit.txt. None is the
+            first that is there.
+
+    Raises:
+        DatasetError: a missing folder, another layout, an absent sequence, unreadable intrinsics.
     """
     sequence_folder = _choose_sequence(require_folder(folder), sequence)
     colors = find_numbered(sequence_folder, _COLOR_NAME)
@@ -64,10 +62,13 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
 def list_sequences(scene: Path, split: str | None = None) -> list[str]:
     """Names of a scene's sequence folders, ascending; of those in TrainSplit.txt or TestSplit.txt if asked.
 
-    Parameters
-    ----------
-    scene : the scene's folder.
-    split : ``train``, ``test`` or None for all that are there.
+    Args:
+        scene: the scene's folder.
+        split: `train`, `test` or None for all that are there.
+
+    Raises:
+        ValueError: another split.
+        DatasetError: a missing folder, or a missing or malformed split file.
     """
     if split is None:
         return sorted(path.name for path in require_folder(scene).glob("seq-*") if path.is_dir())
@@ -100,7 +101,8 @@ def _choose_sequence(folder: Path, sequence: str | int | None) -> Path:
 
 def _sequence_name(sequence: str | int) -> str:
     digits = re.search(r"\d+$", str(sequence))
-    return f"seq-{int(digits.group()):02d}" if digits else str(sequence)
+    has_number = digits is not None and len(digits.group()) <= _MOST_DIGITS
+    return f"seq-{int(digits.group()):02d}" if digits and has_number else str(sequence)
 
 
 def _find_camera(sequence_folder: Path, colors: list[Path]) -> Camera:

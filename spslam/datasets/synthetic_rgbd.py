@@ -1,8 +1,8 @@
 """The layout of Neural RGB-D (Azinovic et al. 2022), which "Synthetic RGB-D" is distributed in.
 
-``images/imgN.png`` (or jpg), ``depth_filtered/depthN.png`` (noisy and filtered), ``depth_with_noise/depthN.png``
-(before the filter) and ``depth/depthN.png`` (exact), each in 16-bit millimeters, ``poses.txt`` with four lines a frame
-(4x4 camera to world, OpenGL camera axes: x right, y up, z backward) and ``focal.txt`` with one number. The principal
+`images/imgN.png` (or jpg), `depth_filtered/depthN.png` (noisy and filtered), `depth_with_noise/depthN.png`
+(before the filter) and `depth/depthN.png` (exact), each in 16-bit millimeters, `poses.txt` with four lines per frame
+(4x4 camera to world, OpenGL camera axes: x right, y up, z backward) and `focal.txt` with one number. The principal
 point is the image's middle.
 """
 
@@ -24,19 +24,16 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileDataset:
-    """A scene of the Neural RGB-D layout.
+    """Opens a scene of the Neural RGB-D layout.
 
-    Parameters
-    ----------
-    folder : the scene.
-    depth_variant : ``filtered``, ``noisy`` or ``exact``. None is the first of these that is there.
+    A pose with NaN, or none for a frame, leaves that frame without one; `poses.txt` may be missing altogether.
 
-    A pose with NaN, or none for a frame, leaves that frame without one; ``poses.txt`` may be missing altogether.
+    Args:
+        folder: the scene.
+        depth_variant: `filtered`, `noisy` or `exact`. None is the first of these that is there.
 
-    Raises
-    ------
-    DatasetError
-        For a missing folder, another layout, the variant's folder missing, unreadable focal length or poses.
+    Raises:
+        DatasetError: a missing folder, another layout, the variant's folder missing, unreadable focal length or poses.
     """
     colors = find_numbered(require_folder(folder) / "images", r"img(\d+)\.(?:png|jpg|jpeg)")
     depths = find_numbered(_depth_folder(folder, depth_variant), r"depth(\d+)\.png")

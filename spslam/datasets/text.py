@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,48 +12,58 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.errors import DatasetError
 from spslam.geometry import orthonormalize
+from spslam.reading import MAX_JSON_BYTES, parse_json, read_lines, read_text
 
 # 7-Scenes' rotations are off by up to about 1e-3; a matrix this far from a rotation is no pose at all.
 ROTATION_TOLERANCE = 0.1
-
-
-def read_text(path: Path) -> str:
-    """The file's text; raises DatasetError."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DatasetError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise DatasetError(f"{path}: must be a text file") from None
-    except OSError as error:
-        raise DatasetError(f"{path}: can't be read: {error.strerror}") from error
+_LAST_ROW_TOLERANCE = 1e-6
 
 
 def read_numbers(path: Path) -> np.ndarray:
-    """All numbers of a file, float64 [N], parted by spaces, commas or line ends; lines with ``#`` are skipped."""
-    lines = [line for line in read_text(path).splitlines() if not line.lstrip().startswith("#")]
-    words = " ".join(lines).replace(",", " ").split()
-    try:
-        return np.array(words, dtype=np.float64)
-    except ValueError as error:
-        raise DatasetError(f"{path}: must hold numbers only: {error}") from error
+    """All numbers of a file, float64 [N].
+
+    Args:
+        path: numbers separated by spaces, commas or line ends; lines that begin with `#` are skipped.
+
+    Raises:
+        DatasetError: no such file, not a text file, or something else than numbers in it.
+    """
+    numbers = array("d")
+    for line in read_lines(path, DatasetError):
+        if line.lstrip().startswith("#"):
+            continue
+        try:
+            numbers.extend(map(float, line.replace(",", " ").split()))
+        except ValueError as error:
+            raise DatasetError(f"{path}: must hold numbers only: {str(error)[:80]}") from None
+    return np.array(numbers, dtype=np.float64)
 
 
-def read_rows(path: Path, columns: int) -> list[list[str]]:
-    """The words of each line that isn't a comment; raises DatasetError for a line of fewer than ``columns``."""
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+def read_rows(path: Path, columns: int) -> Iterator[list[str]]:
+    """The words of each line that isn't a comment.
+
+    Args:
+        path: words separated by spaces or commas.
+        columns: fewest words of a line.
+
+    Raises:
+        DatasetError: no such file, not a text file, or a line of fewer words.
+    """
+    for number, line in enumerate(read_lines(path, DatasetError), start=1):
         words = line.replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
         if len(words) < columns:
             raise DatasetError(f"{path}, line {number}: must have {columns} columns, got {line.strip()[:80]!r}")
-        rows.append(words)
-    return rows
+        yield words
 
 
 def read_pose(path: Path) -> np.ndarray:
-    """One pose [4,4] from 16 (or 12) numbers, row by row; all NaN where the file says that it is unknown."""
+    """One pose [4, 4] from 16 (or 12) numbers, row by row; all NaN where the file says that it is unknown.
+
+    Raises:
+        DatasetError: another count of numbers, or no rigid motion.
+    """
     numbers = read_numbers(path)
     if numbers.size not in (12, 16):
         raise DatasetError(f"{path}: a pose must have 16 numbers, got {numbers.size}")
@@ -60,53 +71,90 @@ def read_pose(path: Path) -> np.ndarray:
 
 
 def read_pose_table(path: Path) -> tuple[np.ndarray, dict[int, str]]:
-    """Poses [F,4,4] of a file with 16 numbers each, row by row, and what is wrong with those that are no rigid motion.
+    """Poses of a file with 16 numbers each, row by row.
 
-    NaN where the file has a non-finite number, and where the pose is wrong. Raises DatasetError for a file that isn't
-    made of sixteens of numbers.
+    Returns:
+        float64 [F, 4, 4], NaN where the file has a non-finite number or no rigid motion; and what is wrong with the
+        latter, by number.
+
+    Raises:
+        DatasetError: no such file, or the count of its numbers is no multiple of 16.
     """
     numbers = read_numbers(path)
     if numbers.size % 16:
         raise DatasetError(f"{path}: must have 16 numbers a pose, got {numbers.size} numbers")
-    poses, faults = np.full((numbers.size // 16, 4, 4), np.nan), {}
-    for i, row in enumerate(numbers.reshape(-1, 16)):
-        try:
-            poses[i] = checked_pose(row, f"{path}, pose {i}")
-        except DatasetError as error:
-            faults[i] = str(error)
+    poses, is_motion = checked_poses(numbers.reshape(-1, 4, 4))
+    rows = numbers.reshape(-1, 16)
+    faults = {int(i): motion_fault(f"{path}, pose {i}", rows[i]) for i in np.flatnonzero(~is_motion)}
     return poses, faults
 
 
 def checked_pose(numbers: np.ndarray, name: str) -> np.ndarray:
-    """The pose [4,4] of 12 or 16 numbers with its rotation projected to SO(3), or all NaN if one isn't finite.
+    """One pose, as `checked_poses` does it.
 
-    Raises DatasetError for a matrix that is no rigid motion.
+    Args:
+        numbers: 12 or 16 of them, row by row.
+        name: what the error begins with.
+
+    Returns:
+        float64 [4, 4].
+
+    Raises:
+        DatasetError: no rigid motion.
     """
     pose = np.eye(4)
     pose.reshape(-1)[: numbers.size] = numbers
-    if not np.all(np.isfinite(pose)):
-        return np.full((4, 4), np.nan)
-    rotation = pose[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise DatasetError(f"{name}: must be a rotation and a translation, got {numbers.tolist()}")
-    pose[:3, :3] = orthonormalize(rotation)
-    return pose
+    poses, is_motion = checked_poses(pose[None])
+    if not is_motion[0]:
+        raise DatasetError(motion_fault(name, numbers))
+    return poses[0]
+
+
+def checked_poses(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses with their rotations projected to SO(3).
+
+    Args:
+        stored: [F, 4, 4].
+
+    Returns:
+        float64 [F, 4, 4], all NaN where a number isn't finite or the matrix is no rigid motion; and bool [F], False for
+        the latter.
+    """
+    stored = stored.astype(np.float64)
+    known = np.isfinite(stored).all(axis=(1, 2))
+    rotation, last_row = stored[:, :3, :3], stored[:, 3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
+        determinant = np.linalg.det(rotation)
+        is_motion = (error <= ROTATION_TOLERANCE) & (determinant >= 0)
+        is_motion &= np.abs(last_row - [0, 0, 0, 1]).max(axis=1) <= _LAST_ROW_TOLERANCE
+    poses = np.full_like(stored, np.nan)
+    poses[is_motion] = stored[is_motion]
+    poses[is_motion, :3, :3] = orthonormalize(rotation[is_motion])
+    return poses, is_motion | ~known
+
+
+def motion_fault(name: str, numbers: np.ndarray) -> str:
+    """What is wrong with a pose of these numbers that is no rigid motion; `name` is what the line begins with."""
+    return f"{name}: must be a rotation and a translation, got {numbers.tolist()}"
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file; raises DatasetError."""
-    try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise DatasetError(f"{path}: isn't valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DatasetError(f"{path}: must hold an object with named values, got {type(content).__name__}")
-    return content
+    return parse_json(read_text(path, MAX_JSON_BYTES, DatasetError), str(path), DatasetError)
 
 
 def read_intrinsics_matrix(path: Path, width: int, height: int) -> Camera:
-    """The camera of a text file with a 3x3 or 4x4 matrix, or with the four numbers fx fy cx cy."""
+    """The camera of a text file.
+
+    Args:
+        path: a 3x3 or 4x4 matrix, or the four numbers fx fy cx cy.
+        width: of the images, px.
+        height: of the images, px.
+
+    Raises:
+        DatasetError: another count of numbers, or as `camera_from_matrix`.
+    """
     numbers = read_numbers(path)
     if numbers.size == 4:
         fx, fy, cx, cy = numbers
@@ -120,7 +168,17 @@ def read_intrinsics_matrix(path: Path, width: int, height: int) -> Camera:
 
 
 def camera_from_matrix(matrix: np.ndarray, width: int, height: int, name: str) -> Camera:
-    """A camera whose principal point lies in the image; raises DatasetError that begins with ``name``."""
+    """A camera whose principal point lies in the image.
+
+    Args:
+        matrix: intrinsics [3, 3] or [4, 4].
+        width: of the images, px.
+        height: of the images, px.
+        name: what the error begins with.
+
+    Raises:
+        DatasetError: no intrinsics of a pinhole camera, or the principal point lies outside the image.
+    """
     try:
         camera = Camera.from_matrix(matrix, width, height)
     except ValueError as error:

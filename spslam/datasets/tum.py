@@ -1,10 +1,10 @@
-"""TUM RGB-D (Sturm et al. 2012): Kinect and Xtion sequences with motion-capture truth.
+"""TUM RGB-D (Sturm et al. 2012): Kinect and Xtion sequences with motion-capture ground truth.
 
-``rgb.txt`` and ``depth.txt`` list ``timestamp file``, ``groundtruth.txt`` lists ``timestamp tx ty tz qx qy qz qw``
-(camera to world, OpenCV axes). Depth is 16-bit with 5000 units a meter, registered to the color camera.
+`rgb.txt` and `depth.txt` list `timestamp file`, `groundtruth.txt` lists `timestamp tx ty tz qx qy qz qw`
+(camera to world, OpenCV axes). Depth is 16-bit with 5000 units per meter, registered to the color camera.
 
 Color and depth are taken at different moments, so each color image is paired with the depth image nearest in time,
-and the truth is interpolated at the color image's time. freiburg1's and freiburg2's color images are distorted,
+and the ground truth is interpolated at the color image's time. freiburg1's and freiburg2's color images are distorted,
 freiburg3's are not; the intrinsics are those the authors calibrated for each. Color is undistorted; depth is left as
 it is, because it comes from another lens: carried from view to view with the true poses, the depth images of
 freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15 frames) than undistorted with the color
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.datasets.base import MAX_FRAMES
 from spslam.datasets.files import FileDataset, FramePaths, Undistortion, require_folder
 from spslam.datasets.images import first_size
 from spslam.datasets.text import camera_from_matrix, read_numbers, read_rows
@@ -32,6 +33,8 @@ UNITS_PER_METER = 5000.0
 MAX_PAIR_DIFFERENCE_S = 0.02
 # Motion capture runs at 100 Hz or more; across a longer gap between two of its poses nothing is made up.
 MAX_GROUND_TRUTH_GAP_S = 0.1
+# A depth camera at 200 Hz has 8 images within that time.
+_MAX_CANDIDATES = 16
 CALIBRATION_FILE = "calibration.txt"
 
 
@@ -54,28 +57,32 @@ _CALIBRATIONS = {
 
 
 def open_tum(folder: Path) -> FileDataset:
-    """A sequence of the TUM RGB-D layout.
+    """Opens a sequence of the TUM RGB-D layout.
 
-    The camera is that of ``calibration.txt`` in the folder (fx fy cx cy, then up to five distortion coefficients), else
-    the one named in the folder's name (``freiburg1`` or ``fr1``, ...), else ROS's default. Lists may be unsorted; of
-    lines with the same timestamp the first counts. Color images without a depth image within 0.02 s are left out.
-    Frames outside the time of ``groundtruth.txt``, or in a gap of over 0.1 s in it, have no pose; its rows with a
-    number that isn't finite are left out, and the file may be missing.
+    The camera is that of `calibration.txt` in the folder (fx fy cx cy, then up to five distortion coefficients), else
+    the one named in the folder's name (`freiburg1` or `fr1`, ...), else ROS's default. Lists may be unsorted; of lines
+    with the same timestamp the first counts. Color images without a depth image within 0.02 s are left out. Frames
+    outside the time of `groundtruth.txt`, or in a gap of over 0.1 s in it, have no pose; its rows with a number that
+    isn't finite are left out, and the file may be missing.
 
-    Raises
-    ------
-    DatasetError
-        For a missing folder or list, a malformed line, no pair at all, unreadable calibration.
+    Args:
+        folder: the sequence.
+
+    Raises:
+        DatasetError: a missing folder or list, a malformed line, no pair at all, unreadable calibration.
     """
     colors = _read_list(require_folder(folder) / "rgb.txt")
     depths = _read_list(folder / "depth.txt")
-    pairs = associate(_times(colors), _times(depths), MAX_PAIR_DIFFERENCE_S)
+    try:
+        pairs = associate(_times(colors), _times(depths), MAX_PAIR_DIFFERENCE_S)
+    except ValueError as error:
+        raise DatasetError(f"{folder / 'rgb.txt'}: {error}") from None
     if not len(pairs):
         raise DatasetError(
             f"{folder}: must have color and depth images within {MAX_PAIR_DIFFERENCE_S} s of each other, got none "
             f"({len(colors)} in rgb.txt, {len(depths)} in depth.txt)"
         )
-    frames = [FramePaths(colors[c][1], depths[d][1], colors[c][0]) for c, d in pairs]
+    frames = [FramePaths(folder / colors[c][1], folder / depths[d][1], colors[c][0]) for c, d in pairs]
     camera, distortion = _find_calibration(folder, *first_size(frame.color for frame in frames))
     return FileDataset(
         f"tum/{folder.name}",
@@ -88,29 +95,52 @@ def open_tum(folder: Path) -> FileDataset:
 
 
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> np.ndarray:
-    """Pairs (i, j) of the nearest times of two ascending lists, int64 [P,2], ascending; each is in one pair at most.
+    """Pairs the nearest times of two lists; each time is in one pair at most.
 
-    The closest pairs are taken first, as by the data set's ``associate.py``; only those less than
-    ``max_difference`` apart.
+    The closest pairs are taken first, as by the data set's `associate.py`.
+
+    Args:
+        times_a: [A], ascending.
+        times_b: [B], ascending.
+        max_difference: pairs are less than this apart.
+
+    Returns:
+        Pairs (i, j), int64 [P, 2], ascending.
+
+    Raises:
+        ValueError: times are so close to each other that there are over 16 candidates for a pair on average.
     """
     first = np.searchsorted(times_b, times_a - max_difference)
     last = np.searchsorted(times_b, times_a + max_difference)
-    candidates = [(abs(times_a[i] - times_b[j]), i, j) for i in range(len(times_a)) for j in range(first[i], last[i])]
+    count = int((last - first).sum())
+    if count > _MAX_CANDIDATES * len(times_a):
+        raise ValueError(f"must have at most {_MAX_CANDIDATES} images within {max_difference} s of each, got {count}")
+    i = np.repeat(np.arange(len(times_a)), last - first)
+    j = np.arange(count) - np.repeat(np.cumsum(last - first) - last, last - first)
+    difference = np.abs(times_a[i] - times_b[j])
+    near = np.lexsort((j, i, difference))
+    near = near[difference[near] < max_difference]
     used_a: set[int] = set()
     used_b: set[int] = set()
     pairs = []
-    for difference, i, j in sorted(candidates):
-        if difference < max_difference and i not in used_a and j not in used_b:
-            used_a.add(i)
-            used_b.add(j)
-            pairs.append((i, j))
+    for pair in zip(i[near].tolist(), j[near].tolist(), strict=True):
+        if pair[0] not in used_a and pair[1] not in used_b:
+            used_a.add(pair[0])
+            used_b.add(pair[1])
+            pairs.append(pair)
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
 def interpolate_trajectory(trajectory: Trajectory, times: np.ndarray, max_gap: float) -> np.ndarray:
-    """Poses [F,4,4] at given times [F] between a trajectory's (timestamps strictly ascending), NaN outside it.
+    """Interpolates a trajectory.
 
-    A time that falls between two poses over ``max_gap`` seconds apart gets NaN too, unless it is one of theirs.
+    Args:
+        trajectory: its timestamps must be strictly ascending.
+        times: [F], s.
+        max_gap: between two poses further apart than this (s) nothing is interpolated.
+
+    Returns:
+        float64 [F, 4, 4], NaN outside the trajectory and in its gaps.
     """
     poses = np.full((len(times), 4, 4), np.nan)
     if len(trajectory) == 0:
@@ -126,8 +156,8 @@ def interpolate_trajectory(trajectory: Trajectory, times: np.ndarray, max_gap: f
     return poses
 
 
-def _read_list(path: Path) -> list[tuple[float, Path]]:
-    entries: dict[float, Path] = {}
+def _read_list(path: Path) -> list[tuple[float, str]]:
+    entries: dict[float, str] = {}
     for words in read_rows(path, columns=2):
         try:
             timestamp = float(words[0])
@@ -135,13 +165,15 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
             raise DatasetError(f"{path}: must list `timestamp file`, got {' '.join(words)[:80]!r}") from None
         if not np.isfinite(timestamp):
             raise DatasetError(f"{path}: timestamps must be finite, got {words[0]}")
-        entries.setdefault(timestamp, path.parent / words[1])
+        entries.setdefault(timestamp, words[1])
+        if len(entries) > MAX_FRAMES:
+            raise DatasetError(f"{path}: must list at most {MAX_FRAMES} images")
     if not entries:
         raise DatasetError(f"{path}: must list at least one image, got none")
     return sorted(entries.items())
 
 
-def _times(entries: list[tuple[float, Path]]) -> np.ndarray:
+def _times(entries: list[tuple[float, str]]) -> np.ndarray:
     return np.array([timestamp for timestamp, _ in entries])
 
 
@@ -153,6 +185,8 @@ def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tu
             raise DatasetError(
                 f"{path}: must hold fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
             )
+        if not np.isfinite(numbers).all():
+            raise DatasetError(f"{path}: must hold finite numbers, got {numbers.tolist()}")
         fx, fy, cx, cy = numbers[:4]
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         return camera_from_matrix(matrix, width, height, str(path)), tuple(

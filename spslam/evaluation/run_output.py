@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import trimesh
 
 from spslam.camera import Camera
-from spslam.errors import OutputError
+from spslam.datasets.images import check_image_size, read_color, read_depth
+from spslam.errors import DatasetError, OutputError
+from spslam.meshing import Mesh, load_mesh
+from spslam.reading import MAX_JSON_BYTES, parse_json, read_lines, read_text
 from spslam.run_folder import RunFolder
 from spslam.trajectory import Trajectory
 
+MAX_LOG_BYTES = 1 << 28  # 600 bytes per frame
 # Timestamps in files have a resolution of 1 microsecond.
 _SAME_TIME_S = 2e-6
 
@@ -33,21 +34,6 @@ class Preview:
     row: int
     color: np.ndarray
     depth: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A mesh as read from a file.
-
-    Attributes:
-        vertices: [V, 3], meters.
-        faces: [L, 3].
-        colors: uint8 [V, 3] RGB.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -83,13 +69,13 @@ class RunOutput:
         for required in (folder.trajectory, folder.metrics):
             if not required.is_file():
                 raise OutputError(f"{path}: must be the output folder of a finished run, but has no {required.name}")
-        trajectory = Trajectory.load_tum(folder.trajectory)
+        trajectory = _read_trajectory(folder.trajectory)
         return cls(
             folder,
             trajectory,
             _read_ground_truth(folder.preview_ground_truth, trajectory.timestamps),
-            _parse(folder.metrics, _read_text(folder.metrics)),
-            [_parse(folder.log, line) for line in _read_text(folder.log).splitlines()],
+            parse_json(_read_text(folder.metrics), str(folder.metrics), OutputError),
+            _read_log(folder.log),
             _read_text(folder.config),
             _read_camera(folder.preview_camera),
         )
@@ -117,13 +103,10 @@ class RunOutput:
         if not path.is_file():
             return None
         try:
-            mesh = trimesh.load(path, process=False)
-        except Exception as error:  # trimesh raises errors of many types
-            raise OutputError(f"{path}: can't be read as a mesh: {error}") from error
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            return None
-        colors = np.asarray(mesh.visual.vertex_colors)[:, :3]  # type: ignore[union-attr]
-        return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), colors)
+            mesh = load_mesh(path)
+        except DatasetError as error:
+            raise OutputError(str(error)) from None
+        return mesh if len(mesh.faces) else None
 
 
 def match_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -147,36 +130,38 @@ def match_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8") if path.is_file() else ""
-    except (OSError, UnicodeDecodeError) as error:
-        raise OutputError(f"{path}: can't be read: {error}") from error
+    return read_text(path, MAX_JSON_BYTES, OutputError) if path.is_file() else ""
 
 
-def _parse(path: Path, text: str) -> dict[str, Any]:
+def _read_log(path: Path) -> list[dict[str, Any]]:
+    if not path.is_file():
+        return []
+    return [parse_json(line, str(path), OutputError) for line in read_lines(path, OutputError, MAX_LOG_BYTES)]
+
+
+def _read_trajectory(path: Path) -> Trajectory:
     try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise OutputError(f"{path}: must be JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise OutputError(f"{path}: must contain a JSON object, got {type(value).__name__}")
-    return value
+        return Trajectory.load_tum(path)
+    except DatasetError as error:
+        raise OutputError(str(error)) from None
 
 
 def _read_camera(path: Path) -> Camera | None:
     if not path.is_file():
         return None
-    values = _parse(path, _read_text(path))
+    values = parse_json(_read_text(path), str(path), OutputError)
     try:
-        return Camera(**values)
-    except (TypeError, ValueError) as error:
-        raise OutputError(f"{path}: must contain a camera: {error}") from error
+        camera = Camera(**values)
+        check_image_size((camera.width, camera.height), str(path))
+        return camera
+    except (TypeError, ValueError, DatasetError) as error:
+        raise OutputError(f"{path}: must hold a camera: {error}") from error
 
 
 def _read_ground_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:
     if not path.is_file():
         return None
-    ground_truth = Trajectory.load_tum(path)
+    ground_truth = _read_trajectory(path)
     poses = np.full((len(timestamps), 4, 4), np.nan)
     rows = match_times(ground_truth.timestamps, timestamps)
     poses[rows >= 0] = ground_truth.poses[rows[rows >= 0]]
@@ -184,10 +169,11 @@ def _read_ground_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:
 
 
 def _read_preview(folder: RunFolder, row: int) -> Preview | None:
-    color = cv2.imread(str(folder.color_preview(row)), cv2.IMREAD_COLOR)
-    if color is None:
-        return None
     depth_path = folder.depth_preview(row)
-    depth = cv2.imread(str(depth_path), cv2.IMREAD_UNCHANGED) if depth_path.is_file() else None
-    meters = None if depth is None else depth.astype(np.float32) / 1000
-    return Preview(row, cv2.cvtColor(color, cv2.COLOR_BGR2RGB), meters)
+    try:
+        color = read_color(folder.color_preview(row))
+        size = color.shape[1], color.shape[0]
+        depth = read_depth(depth_path, 1000.0, size=size) if depth_path.is_file() else None
+    except DatasetError:
+        return None
+    return Preview(row, color, depth)

@@ -11,12 +11,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from spslam.errors import DatasetError
+from spslam.meshing import load_mesh
 
 # Nearest faces are found by sites: points spread over each face at about this spacing. No point of a face is farther
 # from its nearest site than 1.1 times the spacing.
 _SITE_SPACING_M = 0.02
 _REACH = 1.1
 _MOST_SITES_ALONG = 512
+# Of all faces together, unless there are as many faces: a building of 5,000 m2; they take half a gigabyte.
+_MOST_SITES = 1 << 24
 # Number of nearest sites compared in each round, until the nearest face is certain.
 _SITES_COMPARED = (8, 32, 128)
 
@@ -64,22 +67,11 @@ class TriangleSurface:
 
     @classmethod
     def load(cls, path: Path) -> TriangleSurface:
-        """Reads a mesh file (PLY, OBJ, GLB, ...).
-
-        Raises:
-            DatasetError: the file does not exist, cannot be read, or has no faces.
-        """
-        import trimesh
-
-        if not path.is_file():
-            raise DatasetError(f"{path}: no such mesh file")
-        try:
-            mesh = trimesh.load(path, process=False, force="mesh")
-        except Exception as error:  # trimesh raises errors of many types
-            raise DatasetError(f"{path}: can't be read as a mesh: {error}") from error
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        """Reads a mesh file; raises DatasetError as `spslam.meshing.load_mesh` does, and for a mesh without faces."""
+        mesh = load_mesh(path)
+        if not len(mesh.faces):
             raise DatasetError(f"{path}: must be a mesh with faces, got none")
-        return cls(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        return cls(mesh.vertices, mesh.faces)
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices [V, 3] and faces [L, 3], without faces of zero area."""
@@ -106,7 +98,7 @@ class TriangleSurface:
 
         The nearest sites of a point give the candidate faces: as many sites as needed to be certain that no other face
         is nearer, at most 128. So the distance is exact up to about 10 cm from the surface; farther away it may be a
-        few millimeters too large. Deterministic.
+        few millimeters too large. Deterministic. Raises DatasetError for a surface of thousands of square meters.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         distance = np.full(len(points), np.inf)
@@ -140,6 +132,11 @@ class TriangleSurface:
         frames = _BaseFrames.of(self._corners)
         counts = np.ceil(np.stack((frames.base, frames.height), axis=1) / _SITE_SPACING_M)
         counts = np.clip(counts, 1, _MOST_SITES_ALONG).astype(np.int64)
+        if counts.prod(axis=1).sum() > max(_MOST_SITES, 2 * len(counts)):
+            raise DatasetError(
+                f"a mesh of {len(counts)} faces and {self._areas.sum():.3g} m2 is too large to measure distances to; "
+                "is it in meters?"
+            )
         sites, owners = [], []
         for columns, rows in np.unique(counts, axis=0):
             faces = np.flatnonzero((counts == (columns, rows)).all(axis=1))

@@ -2,6 +2,16 @@
 
 from spslam.meshing.export import FORMATS, save_mesh
 from spslam.meshing.extract import cubes_per_cell, extract_mesh, extract_surface
+from spslam.meshing.load import Mesh, load_mesh
 from spslam.meshing.mesh import TriangleMesh
 
-__all__ = ["FORMATS", "TriangleMesh", "cubes_per_cell", "extract_mesh", "extract_surface", "save_mesh"]
+__all__ = [
+    "FORMATS",
+    "Mesh",
+    "TriangleMesh",
+    "cubes_per_cell",
+    "extract_mesh",
+    "extract_surface",
+    "load_mesh",
+    "save_mesh",
+]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 
 from spslam.errors import WeightsError
+from spslam.tensor_file import TensorFile, load_header, load_tensors
+from spslam.tensor_schema import PRIOR
 
 _DATA = Path(__file__).parent / "data"
 SHIPPED = _DATA / "prior.safetensors"
@@ -27,7 +27,12 @@ def parameter_count(widths: tuple[int, ...]) -> int:
     return sum(outputs * (inputs + 1) for inputs, outputs in zip(widths, widths[1:], strict=False))
 
 
-_LENGTHS = {"encoder": parameter_count(ENCODER_WIDTHS), "geometry_decoder": parameter_count(DECODER_WIDTHS)}
+_FILE = TensorFile("prior", PRIOR, header=_METADATA_KEY, error=WeightsError)
+# What `spslam.tensor_schema.PRIOR` leaves open.
+_SIZES = {
+    "encoder_parameters": parameter_count(ENCODER_WIDTHS),
+    "geometry_parameters": parameter_count(DECODER_WIDTHS),
+}
 
 
 @dataclass(frozen=True)
@@ -71,33 +76,15 @@ def load_prior(path: str | os.PathLike | None = None, neighborhood: int = 64) ->
         WeightsError: the file is missing or damaged, or has no weights of these networks. One line that names it.
     """
     path = shipped_weights(neighborhood) if path is None else Path(path)
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such weights file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            names = set(file.keys())
-            # Clones: reading from a memory-mapped file after it was overwritten would crash the process.
-            tensors = {name: file.get_tensor(name).clone() for name in _LENGTHS if name in names}
-            metadata = json.loads((file.metadata() or {}).get(_METADATA_KEY, "{}"))
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(f"{path}: not a readable safetensors file: {str(error).splitlines()[0]}") from error
-    for name, length in _LENGTHS.items():
-        _check_tensor(path, name, tensors.get(name), length)
-    return Prior(tensors["encoder"], tensors["geometry_decoder"], _neighborhood(path, metadata), metadata)
+    metadata = load_header(path, _FILE)
+    tensors = load_tensors(path, _FILE, _SIZES)
+    # Copies: reading on in a mapped file that somebody overwrites would kill the process.
+    encoder, decoder = tensors["encoder"].clone(), tensors["geometry_decoder"].clone()
+    return Prior(encoder, decoder, _neighborhood(path, metadata), metadata)
 
 
-def _check_tensor(path: Path, name: str, tensor: torch.Tensor | None, length: int) -> None:
-    if tensor is None:
-        raise WeightsError(f"{path}: tensor {name} is missing, so this is not a weights file of a scene prior")
-    if tensor.dtype != torch.float32 or tuple(tensor.shape) != (length,):
-        dtype = str(tensor.dtype).removeprefix("torch.")
-        raise WeightsError(f"{path}: tensor {name} must be float32 [{length}], got {dtype} {list(tensor.shape)}")
-    if not torch.isfinite(tensor).all():
-        raise WeightsError(f"{path}: tensor {name} must be finite, got NaN or infinity")
-
-
-def _neighborhood(path: Path, metadata: object) -> int:
-    settings = metadata.get("settings") if isinstance(metadata, dict) else None
+def _neighborhood(path: Path, metadata: dict) -> int:
+    settings = metadata.get("settings")
     if not isinstance(settings, dict) or settings.get("neighborhood") not in _NEIGHBORHOODS:
-        raise WeightsError(f"{path}: metadata {_METADATA_KEY} must have settings.neighborhood, 8 or 64")
-    return settings["neighborhood"]
+        raise WeightsError(f"{path}: metadata {_METADATA_KEY} must say settings.neighborhood, 8 or 64")
+    return int(settings["neighborhood"])

@@ -7,17 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from spslam.errors import WeightsError
 from spslam.io import atomic_write
+from spslam.prior.encoder import DECODER_WIDTHS, ENCODER_WIDTHS, parameter_count
+from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, whole_number
+from spslam.tensor_schema import PRETRAINING
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8
 _TENSORS = ("parameters", "exp_avg", "exp_avg_sq")
 # A single metadata key: safetensors does not keep the order of several.
 _KEY = "pretraining"
+_FILE = TensorFile("checkpoint of spslam pretrain", PRETRAINING, header=_KEY, error=WeightsError)
 
 
 @dataclass(frozen=True)
@@ -67,20 +70,29 @@ def save_state(path: Path, state: TrainingState, settings: dict) -> None:
 def load_state(path: Path, settings: dict) -> TrainingState:
     """Reads a checkpoint of a training with the same settings.
 
+    Args:
+        path: a file that `save_state` wrote.
+        settings: of this training, as they were given to `save_state`.
+
     Raises:
-        WeightsError: the file is no checkpoint, or an option differs; names the first one.
+        WeightsError: no readable checkpoint, or one of other settings; names the first option that differs.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {})[_KEY])
-            tensors = {name: file.get_tensor(name) for name in _TENSORS}
-            step, running_error = int(header["step"]), float(header["running_error"])
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise WeightsError(f"{path}: not a checkpoint of spslam pretrain: {error}") from error
+    header = load_header(path, _FILE)
+    before = header.get("settings")
+    if not isinstance(before, dict):
+        raise WeightsError(f"{path}: a damaged {_FILE.what} (settings must be an object, got {before!r})")
     for name, value in settings.items():
-        if header["settings"].get(name) != value:
+        if before.get(name) != value:
             raise WeightsError(
-                f"{path}: must be resumed with {name} = {header['settings'].get(name)}, got {value}; "
+                f"{path}: must be resumed with {name} = {before.get(name)}, got {value}; "
                 "remove the file to start from the beginning"
             )
+    tensors = load_tensors(
+        path, _FILE, {"parameters": parameter_count(ENCODER_WIDTHS) + parameter_count(DECODER_WIDTHS)}
+    )
+    try:
+        step = whole_number(header, "step", high=settings["steps"])
+        running_error = finite_number(header, "running_error", low=0)
+    except ValueError as fault:
+        raise WeightsError(f"{path}: a damaged {_FILE.what} ({fault})") from None
     return TrainingState(step, running_error=running_error, **tensors)

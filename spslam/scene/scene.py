@@ -1,18 +1,31 @@
 """The map: sparse volume, tri-planes and the two decoders, saved to and loaded from one file."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from spslam import ops
 from spslam.errors import SpslamError
+from spslam.options import SceneOptions
+from spslam.scene import sparse_volume, tri_planes
 from spslam.scene.decoders import COLOR_DECODER, GEOMETRY_DECODER, random_parameters
 from spslam.scene.sparse_volume import SparseVolume
-from spslam.scene.tensor_file import load_tensors, save_tensors
 from spslam.scene.tri_planes import TriPlanes
+from spslam.tensor_file import TensorFile, load_header, load_tensors, save_tensors, whole_number
+from spslam.tensor_schema import MAP
 
 FORMAT = "spslam-map-1"
+_FILE = TensorFile("map", MAP, FORMAT)
+# Sizes that `spslam.tensor_schema.MAP` leaves open.
+TENSOR_SIZES = {
+    "embedding": sparse_volume.FEATURES,
+    "features": tri_planes.FEATURES,
+    "geometry_parameters": GEOMETRY_DECODER.parameters,
+    "color_parameters": COLOR_DECODER.parameters,
+}
 _GEOMETRY, _COLOR = 1, 2  # `purpose` of the decoders' initialization
 
 
@@ -27,6 +40,10 @@ class SceneSettings:
         position_scale: scale of positions (m) at the input of the geometry decoder, 1/m.
         max_voxels: largest number of voxel vertices; more raise an error.
         max_texels: largest number of texels of the planes; more raise an error. None is no limit.
+
+    Raises:
+        ValueError: a length outside the range that `spslam.options.SceneOptions` has for it, a truncation distance
+            below a voxel's edge, or a limit that is no whole number of at least 1.
     """
 
     voxel_size_m: float
@@ -35,6 +52,15 @@ class SceneSettings:
     position_scale: float
     max_voxels: int
     max_texels: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("voxel_size_m", "truncation_m", "plane_cell_m", "position_scale"):
+            _check_within_option(name, getattr(self, name))
+        if self.truncation_m < self.voxel_size_m:
+            raise ValueError(f"SceneSettings: truncation_m must be at least voxel_size_m, got {self.truncation_m}")
+        whole_number(vars(self), "max_voxels", low=1)
+        if self.max_texels is not None:
+            whole_number(vars(self), "max_texels", low=1)
 
 
 class Scene:
@@ -145,9 +171,9 @@ class Scene:
         """Replaces the content by a `state_dict()`.
 
         Raises:
-            SpslamError: a tensor is missing or of another shape.
+            SpslamError: a tensor is missing, or not what `spslam.tensor_schema.MAP` says.
         """
-        _check_state(state)
+        MAP.check(state, TENSOR_SIZES)
         self.origin = state["origin"].to("cpu", copy=True)
         self.volume = self._empty_volume()
         volume = (state[f"volume.{name}"].to(self.device) for name in ("voxel_coords", "embeddings", "weights"))
@@ -173,9 +199,10 @@ class Scene:
         Raises:
             SpslamError: no such file, not a map, truncated, or with tensors of another shape.
         """
-        state, header = load_tensors(path, FORMAT, "map")
+        header = load_header(path, _FILE)
+        state = load_tensors(path, _FILE, TENSOR_SIZES)
         try:
-            scene = cls(SceneSettings(**header["settings"]), header["seed"], device=device)
+            scene = cls(SceneSettings(**header["settings"]), whole_number(header, "seed"), device=device)
             scene.load_state_dict(state)
         except (SpslamError, KeyError, TypeError, ValueError) as error:
             raise SpslamError(f"{path}: damaged map ({error})") from None
@@ -189,29 +216,11 @@ class Scene:
         return TriPlanes(settings.plane_cell_m, self.seed, self.device, settings.max_texels)
 
 
-_TENSORS: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {
-    "origin": (torch.float64, (3,)),
-    "volume.voxel_coords": (torch.int32, (None, 3)),
-    "volume.embeddings": (torch.float32, (None, 8)),
-    "volume.weights": (torch.float32, (None,)),
-    "planes.texels": (torch.float32, (None, COLOR_DECODER.inputs)),
-    "planes.layout": (torch.int64, (15,)),
-    "geometry_decoder": (torch.float32, (GEOMETRY_DECODER.parameters,)),
-    "color_decoder": (torch.float32, (COLOR_DECODER.parameters,)),
-}
-
-
-def _check_state(state: dict[str, torch.Tensor]) -> None:
-    for name, (dtype, shape) in _TENSORS.items():
-        if name not in state:
-            raise SpslamError(f"tensor {name} is missing")
-        tensor = state[name]
-        fits = tensor.dim() == len(shape) and all(
-            want in (None, got) for want, got in zip(shape, tensor.shape, strict=True)
-        )
-        if not fits or tensor.dtype != dtype:
-            wanted = ", ".join("any" if rows is None else str(rows) for rows in shape)
-            raise SpslamError(f"tensor {name} must be {dtype} [{wanted}], got {tensor.dtype} {list(tensor.shape)}")
-    rows = {len(state[name]) for name in ("volume.voxel_coords", "volume.embeddings", "volume.weights")}
-    if len(rows) != 1:
-        raise SpslamError("the volume's tensors differ in length")
+def _check_within_option(name: str, value: Any) -> None:
+    """Raises ValueError where a length is outside the range of the option of that name."""
+    limits = SceneOptions.model_fields[name].metadata
+    low = next(limit.gt for limit in limits if hasattr(limit, "gt"))
+    high = next((limit.le for limit in limits if hasattr(limit, "le")), math.inf)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (is_number and low < value <= high and math.isfinite(value)):
+        raise ValueError(f"SceneSettings: {name} must be above {low:g} and at most {high:g}, got {value!r}")

@@ -6,6 +6,7 @@ import torch
 
 from spslam import ops
 from spslam.errors import SpslamError
+from spslam.tensor_schema import check_plane_layout
 
 FEATURES = 32
 MARGIN_M = 1.0  # planes grow by this much more than needed, so that they grow rarely
@@ -97,14 +98,17 @@ class TriPlanes:
 
         Args:
             texels: float32 [P, 32].
-            layout: 15 ints.
+            layout: as `layout` of the class.
 
         Raises:
-            ValueError: `texels` does not have the rows that `layout` describes.
+            ValueError: the planes do not fill the texels exactly, one after the other.
         """
-        rows = sum(layout[5 * plane + 3] * layout[5 * plane + 4] for plane in range(3)) if len(layout) == 15 else -1
-        if texels.shape != (rows, FEATURES):
-            raise ValueError(f"TriPlanes: texels must have the rows of layout, got {list(texels.shape)}")
+        if texels.dim() != 2 or texels.shape[1] != FEATURES:
+            raise ValueError(f"TriPlanes.restore: texels must have shape [P, {FEATURES}], got {list(texels.shape)}")
+        try:
+            check_plane_layout(layout, len(texels))
+        except ValueError as fault:
+            raise ValueError(f"TriPlanes.restore: {fault}") from None
         self.texels = texels.to(self.texels.device, torch.float32).clone()
         self.layout = [int(value) for value in layout]
 

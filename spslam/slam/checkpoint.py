@@ -13,11 +13,16 @@ import torch
 
 from spslam.config import Config, read_shipped
 from spslam.errors import OutputError, SpslamError
-from spslam.scene.tensor_file import load_tensors, save_tensors
+from spslam.scene.scene import TENSOR_SIZES
 from spslam.slam.recovery.pose_confidence import MODEL_FILE
 from spslam.slam.state import Moments, SlamState
+from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
+from spslam.tensor_schema import CHECKPOINT
 
 FORMAT = "spslam-checkpoint-2"
+_FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
+# Iterations are numbered by int32; this many leave room to go on.
+_MOST_ITERATIONS = 2**30
 
 
 def fingerprint(config: Config) -> str:
@@ -108,15 +113,15 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, A
     Raises:
         OutputError: the file cannot be read, or belongs to a run with other options.
     """
-    try:
-        tensors, header = load_tensors(path, FORMAT, "checkpoint")
-    except SpslamError as error:
-        raise OutputError(str(error)) from None
+    header = load_header(path, _FILE)
+    # First: the shapes of a run with other settings differ as well.
     if header.get("config") != fingerprint(config):
         raise OutputError(f"{path}: belongs to a run with other options; use the same ones, or another --output")
+    tensors = load_tensors(path, _FILE, _sizes(state))
     try:
+        source = _checked_source(header, len(tensors["frames.poses"]))
         _restore(state, tensors, header)
-        return header["source"]
+        return source
     except (SpslamError, KeyError, TypeError, ValueError) as error:
         raise OutputError(f"{path}: a damaged checkpoint ({error})") from None
 
@@ -135,7 +140,38 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
         for name, first in _section(tensors, "moments.").items()
         if name.endswith(".first")
     }
-    state.steps, state.stamp, state.unmapped = header["steps"], header["stamp"], header["unmapped"]
+    state.steps, state.stamp = (whole_number(header, name, high=_MOST_ITERATIONS) for name in ("steps", "stamp"))
+    if not isinstance(header.get("unmapped"), bool):
+        raise ValueError(f"unmapped must be true or false, got {header.get('unmapped')!r}")
+    state.unmapped = header["unmapped"]
+
+
+def _sizes(state: SlamState) -> dict[str, int]:
+    """The sizes that `CHECKPOINT` leaves open."""
+    _, rows, columns = state.frames.depth_thumbnails.shape
+    images = (0, 0, 0) if state.depth_keyframes is None else tuple(state.depth_keyframes.images.shape)
+    return {
+        **TENSOR_SIZES,
+        "width": state.frames.camera.width,
+        "height": state.frames.camera.height,
+        "thumbnail_rows": rows,
+        "thumbnail_columns": columns,
+        **dict(zip(("depth_images", "depth_image_rows", "depth_image_columns"), images, strict=True)),
+    }
+
+
+def _checked_source(header: dict[str, Any], frames: int) -> dict[str, Any]:
+    """What names the data and where to go on; raises ValueError."""
+    source = header.get("source")
+    clock = source.get("clock") if isinstance(source, dict) else None
+    if not isinstance(source, dict) or not isinstance(clock, dict) or not isinstance(source.get("data"), dict):
+        raise ValueError("source must hold data, next and clock")
+    position = whole_number(source, "next", low=frames)
+    whole_number(source["data"], "frames", low=position)
+    whole_number(clock, "frames")
+    for name in ("wall_s", "decode_s"):
+        finite_number(clock, name, low=0)
+    return source
 
 
 def _prefixed(prefix: str, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -24,6 +24,9 @@ class FrameTable:
 
     The columns are views of buffers that double when they are full: to write to one changes the table, and a frame
     costs the same after ten thousand others as at first.
+
+    Attributes:
+        camera: of all frames.
     """
 
     def __init__(self, camera: Camera, device: torch.device | str = "cpu"):
@@ -31,6 +34,7 @@ class FrameTable:
         offset = THUMBNAIL_STEP_PX // 2
         rows = len(range(offset, camera.height, THUMBNAIL_STEP_PX))
         columns = len(range(offset, camera.width, THUMBNAIL_STEP_PX))
+        self.camera = camera
         self._count = 0
         self._columns = {
             "poses": torch.zeros(0, 7, device=device),

@@ -64,7 +64,7 @@ DAMAGES = {
     "must hold 7-Scenes frames": remove_frames,
     "color.png": break_images,
     "depth.png": break_depths,
-    "depth must be as large as color, got depth 10x10 and color 32x24": shrink_depths,
+    "depth.png: must be as large as the sequence's first image, 32x24, got 10x10": shrink_depths,
     "camera-intrinsics.txt": break_intrinsics,
 }
 

@@ -102,9 +102,7 @@ def test_a_missing_image(layout, image):
         check_one_broken_frame(layout.open(), path.name, "no such file")
     else:
         other = layout.depth if image == "color" else layout.color
-        check_one_broken_frame(
-            layout.open(), other.name, f"the {image.replace('or', 'our')} image of this frame is missing"
-        )
+        check_one_broken_frame(layout.open(), other.name, f"the {image} image of this frame is missing")
 
 
 def spoil_pose(layout, text):

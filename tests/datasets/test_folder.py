@@ -87,7 +87,7 @@ def test_intrinsics_files(tmp_path):
         ({"fx": "wide"}, "must hold numbers fx, fy, cx, cy, got fx: wide"),
         ({"fx": True}, "must hold numbers fx, fy, cx, cy, got fx: True"),
         ({"width": 640}, "width must be the images' 32, got 640"),
-        ({"depth_scale": -1}, "depth_scale must be a positive number, got -1"),
+        ({"depth_scale": -1}, "depth_scale must be a number from 0.001 to 1e.09, got -1"),
         ({"fy": -5}, "Camera: fy must be positive, got -5"),
     ],
 )
@@ -106,7 +106,7 @@ def test_depth_scale_comes_from_the_option_or_the_json(tmp_path):
     values = {"fx": 30, "fy": 31, "cx": 15.5, "cy": 11.5, "depth_scale": 5000}
     (folder / "intrinsics.json").write_text(json.dumps(values))
     assert open_folder(folder)[0].depth[0, 0] == pytest.approx(1, abs=1e-3)
-    with pytest.raises(DatasetError, match="depth_scale must be positive, got 0"):
+    with pytest.raises(DatasetError, match="depth_scale must be a number from 0.001 to 1e.09, got 0"):
         open_folder(folder, depth_scale=0)
 
 

@@ -43,7 +43,7 @@ def test_trajectories_may_be_short_or_absent(tmp_path):
     [
         ({"fx": None}, r"must hold numbers camera.\{w, h, fx, fy, cx, cy, scale\}"),
         ({"w": 64}, "must give the images' size 32x24, got 64x24"),
-        ({"scale": 0}, "camera.scale must be positive, got 0"),
+        ({"scale": 0}, "camera.scale must be a number from 0.001 to 1e.09, got 0"),
         ({"cx": 900}, "principal point must lie in the image"),
     ],
 )

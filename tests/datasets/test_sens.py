@@ -178,8 +178,14 @@ MATRICES, COMPRESSIONS = 12 + 15, 12 + 15 + 256
         (lambda content: changed(content, 0, struct.pack("<I", 3)), "must be a .sens file of version 4, got 3"),
         (lambda content: changed(content, 4, b"\xff" * 8), "its sensor's name would be 18446744073709551615 bytes"),
         (lambda content: changed(content, COMPRESSIONS, struct.pack("<2i", 2, 2)), "got 2 and 2"),
-        (lambda content: changed(content, COMPRESSIONS + 8, bytes(4)), r"image sizes must be within 1 and 32768 px"),
-        (lambda content: changed(content, COMPRESSIONS + 24, bytes(4)), "depth_shift must be positive, got 0.0"),
+        (
+            lambda content: changed(content, COMPRESSIONS + 8, bytes(4)),
+            "an image must have 1 to 33554432 pixels and at most 32768 along a side, got 0x24",
+        ),
+        (
+            lambda content: changed(content, COMPRESSIONS + 24, bytes(4)),
+            "depth_shift must be a number from 0.001 to 1e.09, got 0.0",
+        ),
         (
             lambda content: changed(content, MATRICES + 128, bytes(64)),
             "intrinsics of depth: .*matrix must have the form",

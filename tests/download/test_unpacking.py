@@ -116,3 +116,96 @@ def test_damaged_archives(tmp_path):
     ):
         with pytest.raises(DatasetError, match=f"{name}: {message}"):
             unpack(write(tmp_path, name, content), tmp_path / "out")
+
+
+def refused(archive, message):
+    with pytest.raises(DatasetError, match=message) as error:
+        unpack(archive, archive.parent / "out")
+    assert str(error.value).startswith(f"{archive.parent}/")
+    assert "\n" not in str(error.value)
+
+
+def test_an_archive_of_zeros_is_no_data_set(tmp_path):
+    """A thousand times its own size, beyond what small archives may hold anyway."""
+    zeros = {"zeros.bin": bytes(150 << 20)}
+    for name, pack in (("a.zip", zipped), ("a.tgz", tarred)):
+        refused(write(tmp_path, name, pack(zeros)), "must hold what an archive of its size can hold, got more")
+    assert tree(tmp_path / "out") == {}
+
+
+def test_archives_that_are_nested_deep(tmp_path):
+    content = zipped({"a.txt": b"end"})
+    for depth in range(1200):
+        content = zipped({f"{depth}.zip": content})
+    refused(write(tmp_path, "deep.zip", content), "must be nested at most 3 deep")
+
+
+def test_what_nested_archives_hold_counts_for_the_outer_one(tmp_path):
+    inner = zipped({f"{i}.bin": bytes(20 << 20) for i in range(3)})
+    refused(write(tmp_path, "a.zip", zipped({f"{i}.zip": inner for i in range(3)})), "must hold what an archive of its")
+
+
+@pytest.mark.parametrize("count", [11_000])
+def test_archives_of_many_members(tmp_path, count):
+    archive = write(tmp_path, "a.tgz", tarred({f"{i}": b"" for i in range(count)}))
+    refused(archive, "must hold what an archive of its size can hold, got more")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_sparse_files_and_long_headers_are_refused(tmp_path):
+    sparse = tarfile.TarInfo("a.bin")
+    sparse.type = tarfile.GNUTYPE_SPARSE
+    refused(write(tmp_path, "sparse.tgz", tarred(FILES, sparse)), "must hold whole files, but has sparse ones")
+    for name, content, message in (
+        ("long.tgz", b"3 a=" + bytes(1 << 20), "a header must have at most 16384 bytes"),
+        ("digits.tgz", b"1" * 8000, "a header must not hold numbers of over 20 digits"),
+    ):
+        buffer = io.BytesIO()
+        with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
+            member = tarfile.TarInfo("header")
+            member.type, member.size = tarfile.XHDTYPE, len(content)
+            archive.addfile(member, io.BytesIO(content))
+            archive.addfile(tarfile.TarInfo("a.txt"))
+        refused(write(tmp_path, name, buffer.getvalue()), message)
+
+
+def test_methods_that_inflate_without_a_limit_are_refused(tmp_path):
+    for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", method) as archive:
+            archive.writestr("a.bin", bytes(1000))
+        refused(write(tmp_path, "a.zip", buffer.getvalue()), "must be stored or deflated, but a.bin isn't")
+
+
+def test_an_encrypted_archive(tmp_path):
+    content = bytearray(zipped({"a.bin": b"secret"}))
+    content[6] |= 1
+    content[content.index(b"PK\x01\x02") + 8] |= 1
+    refused(write(tmp_path, "a.zip", bytes(content)), "must not be encrypted, but a.bin is")
+
+
+def test_an_archive_does_not_replace_itself_or_its_notes(tmp_path):
+    notes = tmp_path / "out" / ".downloads"
+    notes.mkdir(parents=True)
+    for name in (".downloads/a.zip", ".downloads/other.zip.json"):
+        archive = write(notes, "a.zip", zipped({name: b"mine"}))
+        before = archive.read_bytes()
+        with pytest.raises(DatasetError, match="must leave the folder that it lies in alone, but holds .downloads/"):
+            unpack(archive, tmp_path / "out")
+        assert tree(notes) == {"a.zip": before}
+    inner = zipped({"seq.zip": b"me"})
+    refused(write(tmp_path, "b.zip", zipped({"seq.zip": inner})), "must leave the folder that it lies in alone")
+
+
+@pytest.mark.parametrize(
+    "names", [["a" * 300], ["a", "a/b"], ["a/b", "a"], ["."], ["a//", "a"], ["a\0b"], ["x/" * 3000 + "y"]]
+)
+@pytest.mark.parametrize("suffix", ["zip", "tgz"])
+def test_names_that_no_file_can_have(tmp_path, names, suffix):
+    """Either the archive is refused or its files get the names that they can have."""
+    archive = write(tmp_path, f"a.{suffix}", {"zip": zipped, "tgz": tarred}[suffix]({name: b"x" for name in names}))
+    try:
+        unpack(archive, tmp_path / "out")
+    except DatasetError as error:
+        assert f"a.{suffix}: " in str(error)
+    assert {path.name for path in tmp_path.iterdir()} <= {"out", archive.name}

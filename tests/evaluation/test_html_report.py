@@ -145,9 +145,9 @@ def test_writing_again_gives_the_same_bytes(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("metrics.json", "{", "metrics.json: must be JSON"),
-        ("metrics.json", "[1]", "metrics.json: must contain a JSON object, got list"),
-        ("log.jsonl", "{}\nx\n", "log.jsonl: must be JSON"),
+        ("metrics.json", "{", "metrics.json: isn't valid JSON"),
+        ("metrics.json", "[1]", "metrics.json: must hold an object with named values, got list"),
+        ("log.jsonl", "{}\nx\n", "log.jsonl: isn't valid JSON"),
         ("trajectory.txt", "1 2 3\n", "trajectory.txt, line 1: must be"),
         ("mesh.ply", "nonsense", "mesh.ply: can't be read as a mesh"),
         ("previews/camera.json", '{"width": 3}', "camera.json: must contain a camera"),

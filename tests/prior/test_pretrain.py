@@ -1,10 +1,12 @@
 """Training of the prior: it reduces the error, and is reproducible for any number of workers and interruptions."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
+from safetensors.torch import save_file
+from spslam.prior.checkpoint import load_state
 
 from spslam.errors import WeightsError
 from spslam.prior import load_prior
@@ -101,8 +103,32 @@ def test_checkpoint_of_other_settings_is_refused(tmp_path):
 def test_damaged_checkpoint_gives_a_one_line_error(tmp_path):
     output = tmp_path / "prior.safetensors"
     training_files(output).checkpoint.write_bytes(b"no checkpoint")
-    with pytest.raises(WeightsError, match=r"prior\.checkpoint\.safetensors: not a checkpoint of spslam pretrain: .+"):
+    with pytest.raises(
+        WeightsError, match=r"prior\.checkpoint\.safetensors: not a readable checkpoint of spslam pretrain \(.+\)"
+    ):
         pretrain(output, SMALL, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "header", "message"),
+    [
+        ({"exp_avg": torch.zeros(7)}, {}, r"tensor exp_avg must be float32 \[6601\], got float32 \[7\]"),
+        ({"exp_avg_sq": torch.full((6601,), -1.0)}, {}, "tensor exp_avg_sq must be at least 0, got -1"),
+        ({"parameters": torch.full((6601,), torch.nan)}, {}, "tensor parameters must be finite"),
+        ({}, {"step": 10**6}, "step must be a whole number from 0 to 4000, got 1000000"),
+        ({}, {"step": "many"}, "step must be a whole number from 0 to 4000, got 'many'"),
+        ({}, {"running_error": float("nan")}, "running_error must be a finite number of at least 0, got nan"),
+        ({}, {"settings": []}, r"settings must be an object, got \[\]"),
+    ],
+)
+def test_a_checkpoint_changed_from_outside_gives_one_line(tmp_path, tensors, header, message):
+    path = tmp_path / "prior.checkpoint.safetensors"
+    settings = asdict(PretrainSettings())
+    header = {"settings": settings, "step": 5, "running_error": 0.5, **header}
+    tensors = {**{name: torch.zeros(6601) for name in ("parameters", "exp_avg", "exp_avg_sq")}, **tensors}
+    save_file(tensors, path, metadata={"pretraining": json.dumps(header)})
+    with pytest.raises(WeightsError, match=f"a damaged checkpoint of spslam pretrain .{message}"):
+        load_state(path, settings)
 
 
 @pytest.mark.parametrize("change", [{"steps": 0}, {"seed": -1}, {"patches_per_kind": 0}])

@@ -14,7 +14,7 @@ from tests.system.sequences import Recorded, settings
 
 SETTINGS = ("mapping.every=2", "mapping.first_iterations=10", "mapping.reset_moments=false")
 sync_nothing = bool  # a call that returns
-SOURCE = {"next": 4, "data": {}, "clock": {}}
+SOURCE = {"next": 4, "data": {"frames": 8}, "clock": {"frames": 4, "wall_s": 0.5, "decode_s": 0.1}}
 
 
 @pytest.fixture

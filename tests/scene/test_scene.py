@@ -1,5 +1,8 @@
 """Saving and loading maps: exactness, reproducible bytes, and errors for damaged files."""
 
+import json
+import struct
+
 import pytest
 import safetensors.torch
 import torch
@@ -74,12 +77,29 @@ def test_load_state_dict_copies(scene):
     assert scene.volume.embeddings.any()
 
 
-def damage(path, change):
+def damage(path, change=lambda tensors: None, change_header=lambda header: None):
+    """Writes the file anew with other tensors or another header."""
     with safetensors.safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
+        header = json.loads(file.metadata()["spslam"])
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
     change(tensors)
-    safetensors.torch.save_file(tensors, path, metadata=metadata)
+    change_header(header)
+    safetensors.torch.save_file(tensors, path, metadata={"spslam": json.dumps(header)})
+
+
+def refused(path, message):
+    with pytest.raises(SpslamError, match=f"map.safetensors: a damaged map .*{message}") as error:
+        Scene.load(path)
+    assert "\n" not in str(error.value)
+
+
+def put(name, place, value):
+    """A change of one number of a tensor."""
+
+    def change(tensors):
+        tensors[name][place] = value
+
+    return change
 
 
 @pytest.mark.parametrize(
@@ -88,24 +108,125 @@ def damage(path, change):
         (lambda t: t.pop("color_decoder"), "tensor color_decoder is missing"),
         (
             lambda t: t.update({"volume.embeddings": torch.zeros(4, 9)}),
-            r"must be torch.float32 \[any, 8\], got torch.float32 \[4, 9\]",
+            r"tensor volume.embeddings must be float32 \[\d+, 8\], got float32 \[4, 9\]",
         ),
         (
             lambda t: t.update({"volume.voxel_coords": t["volume.voxel_coords"].long()}),
-            r"must be torch.int32 \[any, 3\], got torch.int64",
+            r"must be int32 \[\d+, 3\], got int64",
         ),
-        (lambda t: t.update({"volume.weights": torch.zeros(4)}), "the volume's tensors differ in length"),
-        (lambda t: t.update({"planes.texels": torch.zeros(5, 32)}), "texels must have the rows of layout"),
+        (
+            lambda t: t.update({"volume.weights": torch.zeros(4)}),
+            r"tensor volume.weights must be float32 \[\d+\], got float32 \[4\]",
+        ),
+        (
+            lambda t: t.update({"planes.texels": torch.zeros(5, 32)}),
+            r"texels must have the \d+ rows of the layout, got 5",
+        ),
+        (lambda t: t.update({"planes.layout": t["planes.layout"].int()}), r"must be int64 \[15\], got int32 \[15\]"),
         (lambda t: t["volume.voxel_coords"].zero_(), "must be distinct"),
+        (put("volume.voxel_coords", (3, 1), 2**20), "tensor volume.voxel_coords must be at most"),
+        (put("volume.voxel_coords", (3, 1), -(2**31)), "tensor volume.voxel_coords must be at least"),
+        (put("volume.embeddings", (5, 2), float("nan")), "tensor volume.embeddings must be finite"),
+        (put("volume.weights", 7, -1.0), "tensor volume.weights must be at least 0, got -1"),
+        (put("planes.texels", (1, 1), float("inf")), "tensor planes.texels must be finite"),
+        (put("geometry_decoder", 1, float("nan")), "tensor geometry_decoder must be finite"),
+        (put("origin", 1, float("inf")), "tensor origin must be finite"),
     ],
 )
 def test_a_damaged_map_gives_a_one_line_error(scene, tmp_path, change, message):
     path = tmp_path / "map.safetensors"
     scene.save(path)
     damage(path, change)
-    with pytest.raises(SpslamError, match=f"map.safetensors: damaged map .*{message}") as error:
+    refused(path, message)
+
+
+@pytest.mark.parametrize("plane", [0, 1, 2])
+@pytest.mark.parametrize("offset", [2**63 - 1, 2**62, -1, -(2**63), 1])
+def test_planes_that_do_not_follow_each_other_are_refused(scene, tmp_path, plane, offset):
+    """An offset that overflows when its plane's rows are added once passed the binding's check."""
+    path = tmp_path / "map.safetensors"
+    scene.save(path)
+    rows = int(torch.prod(scene.state_dict()["planes.layout"][5 * plane + 3 : 5 * plane + 5]))
+    damage(path, put("planes.layout", 5 * plane, offset - rows if offset == 2**63 - 1 else offset))
+    refused(path, rf"layout of plane {plane} must begin at row \d+, got ")
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ((-1, -768), "must have sizes of at least 0, got -1 and -768"),
+        ((2**31, 2**33), r"must stay within 2\^30 texels of the origin"),
+        ((2**32 + 1, 0), r"must stay within 2\^30 texels of the origin"),
+    ],
+)
+def test_sizes_of_planes_that_overflow_are_refused(scene, tmp_path, sizes, message):
+    path = tmp_path / "map.safetensors"
+    scene.save(path)
+    damage(path, put("planes.layout", slice(3, 5), torch.tensor(sizes)))
+    refused(path, f"layout of plane 0 {message}")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("voxel_size_m", 50.0, "voxel_size_m must be above 0 and at most 1, got 50.0"),
+        ("voxel_size_m", 0, "voxel_size_m must be above 0 and at most 1, got 0"),
+        ("voxel_size_m", "0.04", "voxel_size_m must be above 0 and at most 1, got '0.04'"),
+        ("voxel_size_m", True, "voxel_size_m must be above 0 and at most 1, got True"),
+        ("voxel_size_m", 0.5, "truncation_m must be at least voxel_size_m, got 0.08"),
+        ("truncation_m", float("nan"), "truncation_m must be above 0 and at most 4, got nan"),
+        ("plane_cell_m", -0.04, "plane_cell_m must be above 0 and at most 4, got -0.04"),
+        ("position_scale", float("inf"), "position_scale must be above 0 and at most inf, got inf"),
+        ("max_voxels", 0, "max_voxels must be a whole number from 1 to"),
+        ("max_voxels", 10, "voxels must stay within scene.max_voxels = 10"),
+        ("max_texels", "many", "max_texels must be a whole number from 1 to .*, got 'many'"),
+        ("another", 1, "unexpected keyword argument 'another'"),
+    ],
+)
+def test_settings_outside_the_options_ranges_are_refused(scene, tmp_path, name, value, message):
+    path = tmp_path / "map.safetensors"
+    scene.save(path)
+    damage(path, change_header=lambda header: header["settings"].update({name: value}))
+    refused(path, message)
+
+
+@pytest.mark.parametrize("seed", ["seven", -1, 2**63, 1.5, None, True])
+def test_seeds_that_are_none_are_refused(scene, tmp_path, seed):
+    path = tmp_path / "map.safetensors"
+    scene.save(path)
+    damage(path, change_header=lambda header: header.update(seed=seed))
+    refused(path, "seed must be a whole number from 0 to 9223372036854775807, got ")
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("[" * 5000, "it is nested too deep"),
+        ('{"format": ' + "9" * 5000 + "}", "a whole number must have at most 20 digits, got 5000"),
+        ("[]", "must hold an object with named values, got list"),
+    ],
+)
+def test_a_header_that_is_none_is_one_line(scene, tmp_path, header, message):
+    path = tmp_path / "map.safetensors"
+    safetensors.torch.save_file(scene.state_dict(), path, metadata={"spslam": header})
+    with pytest.raises(SpslamError, match=rf"map.safetensors: not a readable map \(spslam.*{message}\)"):
         Scene.load(path)
-    assert "\n" not in str(error.value)
+
+
+def test_a_header_of_gigabytes_is_not_read(tmp_path):
+    path = tmp_path / "map.safetensors"
+    with path.open("wb") as file:
+        file.write(struct.pack("<Q", 90 << 20))
+        file.truncate(100 << 20)
+    with pytest.raises(SpslamError, match="its header must have at most 1048576 bytes, got 94371840"):
+        Scene.load(path)
+
+
+def test_unknown_tensors_are_ignored(scene, tmp_path):
+    path = tmp_path / "map.safetensors"
+    scene.save(path)
+    damage(path, lambda tensors: tensors.update(another=torch.zeros(3, dtype=torch.complex64)))
+    assert Scene.load(path).volume.num_voxels == scene.volume.num_voxels
 
 
 def test_a_file_that_is_not_a_map_gives_a_one_line_error(scene, tmp_path):

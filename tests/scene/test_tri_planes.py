@@ -69,7 +69,7 @@ def test_restore():
     planes.cover(_points([0, 0, 0], [1, 1, 1]))
     other.restore(planes.texels, planes.layout)
     assert torch.equal(other.texels, planes.texels) and other.layout == planes.layout
-    with pytest.raises(ValueError, match="TriPlanes: texels must have the rows of layout"):
+    with pytest.raises(ValueError, match="TriPlanes.restore: texels must have the 768 rows of the layout, got 767"):
         other.restore(planes.texels[:-1], planes.layout)
 
 
