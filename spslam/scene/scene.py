@@ -205,7 +205,7 @@ class Scene:
             scene = cls(SceneSettings(**header["settings"]), whole_number(header, "seed"), device=device)
             scene.load_state_dict(state)
         except (SpslamError, KeyError, TypeError, ValueError) as error:
-            raise SpslamError(f"{path}: damaged map ({error})") from None
+            raise SpslamError(f"{path}: a damaged map ({error})") from None
         return scene
 
     def _empty_volume(self) -> SparseVolume:
