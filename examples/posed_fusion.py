@@ -1,4 +1,4 @@
-"""Reconstructs an RGB-D sequence whose poses are known, with the kernels alone: no tracking, no optimization.
+"""Reconstructs an RGB-D sequence with known poses, using only the ops: no tracking, no optimization.
 
 python examples/posed_fusion.py mesh.ply                     the generated room
 python examples/posed_fusion.py mesh.ply --data recording    a folder with color/, depth/, intrinsics.txt, poses.txt
@@ -21,7 +21,7 @@ MIN_WEIGHT, FULL_WEIGHT, MAX_WEIGHT = 0.006, 2.5, 20.0  # sums of point weights 
 
 
 def surface_points(frame, camera, device):
-    """World points and unit normals [N, 3] of randomly drawn pixels."""
+    """World points and unit normals [N, 3] at random pixels of a frame."""
     depth = torch.from_numpy(frame.depth).to(device)
     measured = depth.flatten().nonzero()[:, 0]
     key = 0, ops.Stream.ENCODER_POINTS, frame.index, 0
@@ -36,7 +36,7 @@ def surface_points(frame, camera, device):
 
 
 def fuse(frames, camera, prior, device):
-    """Encodes every frame's points and averages the features at the vertices around them (equation 1)."""
+    """Encodes the points of every frame and fuses the features at the vertices around them (equation 1)."""
     cells = ops.VoxelHash(device=device)
     embeddings, weights = torch.zeros(0, 8, device=device), torch.zeros(0, device=device)
     for frame in frames:
@@ -52,7 +52,7 @@ def fuse(frames, camera, prior, device):
 
 
 def extract_mesh(cells, embeddings, prior):
-    """Decodes the distance on a grid in every cell (equation 2) and cuts it at zero."""
+    """Decodes the SDF on a grid in every cell (equation 2) and extracts its zero level set."""
     complete = cells.corner_ids[:, 0] >= 0
     coords, corners = cells.voxel_coords[complete], cells.corner_ids[complete]
     local = torch.cartesian_prod(*[torch.linspace(0, 1, CUBES + 1, device=coords.device)] * 3)
@@ -71,7 +71,7 @@ def main():
     parser = argparse.ArgumentParser(description="fuse an RGB-D sequence with known poses into a mesh")
     parser.add_argument("mesh", help="file to write, .ply, .obj or .glb")
     parser.add_argument("--data", help="folder with color/, depth/, intrinsics.txt and poses.txt")
-    parser.add_argument("--frames", type=int, default=60, help="of the generated room")
+    parser.add_argument("--frames", type=int, default=60, help="frames of the generated room")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     args = parser.parse_args()
     config = load_config(
@@ -79,7 +79,7 @@ def main():
     )
     dataset, prior = open_dataset(config.dataset, args.data), load_prior().to(torch.device(args.device))
     if dataset.poses() is None:
-        parser.error(f"{args.data}: poses.txt is needed here")
+        parser.error(f"{args.data}: must have poses.txt")
     cells, embeddings = fuse(dataset, dataset.camera, prior, args.device)
     vertices, faces = extract_mesh(cells, embeddings, prior)
     trimesh.Trimesh(vertices.cpu().numpy(), faces.cpu().numpy(), process=False).export(args.mesh)

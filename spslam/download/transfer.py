@@ -18,7 +18,7 @@ from typing import BinaryIO
 from spslam.errors import DatasetError
 from spslam.io import atomic_write
 
-# Called with the bytes downloaded and the total bytes (None if the server doesn't tell).
+# Called with the bytes downloaded and the total bytes (None if the server does not report it).
 Progress = Callable[[int, int | None], None]
 
 ATTEMPTS = 6

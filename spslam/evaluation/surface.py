@@ -189,7 +189,7 @@ class _BaseFrames:
         top, start, end = np.moveaxis(np.take_along_axis(corners, order[:, :, None], axis=1), 1, 0)
         base = lengths.max(axis=1)
         along = (end - start) / base[:, None]
-        # In a right triangle the foot would be an end of the base; it is moved inside, so that no side is vertical.
+        # The foot is kept off the ends of the base, so that both other sides have a finite slope.
         foot = np.clip(_dot(top - start, along), 1e-9 * base, (1 - 1e-9) * base)
         rise = top - start - foot[:, None] * along
         height = np.linalg.norm(rise, axis=1)

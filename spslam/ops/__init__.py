@@ -1,4 +1,4 @@
-"""Kernels for sparse neural reconstruction: the public op library, independent of the rest of spslam."""
+"""Public op library for sparse neural reconstruction, with CPU and CUDA kernels; independent of the rest of spslam."""
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.covisibility import frame_overlap, select_covisible_frames

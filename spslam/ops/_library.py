@@ -1,4 +1,4 @@
-"""Loads the compiled op libraries: one for this processor's instruction set, and CUDA's where torch has CUDA.
+"""Loads the compiled op libraries: one for the instruction set of this CPU, and the CUDA one if torch has CUDA.
 
 `SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, for tests and bug reports.
 """
@@ -63,9 +63,9 @@ CUDA_OFF_REASON: str | None = _load_cuda()
 
 @public_op()
 def set_num_threads(count: int) -> None:
-    """Lets the CPU kernels use `count` threads, the calling one included. Results do not depend on it.
+    """Sets the number of threads of the CPU kernels, including the calling one. Results do not depend on it.
 
-    At import it is torch's number of threads. Not to be called while another thread runs a kernel.
+    The initial value is torch's number of threads. Must not be called while another thread runs a kernel.
 
     Args:
         count: 1 to 4096. Where the system gives fewer, kernels run on those there are.
@@ -85,7 +85,7 @@ def set_num_threads(count: int) -> None:
 
 
 def get_num_threads() -> int:
-    """Threads the CPU kernels may use.
+    """Number of threads of the CPU kernels.
 
     Example:
         >>> get_num_threads() >= 1

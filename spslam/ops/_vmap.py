@@ -1,16 +1,16 @@
-"""How ops behave under `torch.vmap`."""
+"""Batching rules of ops for `torch.vmap`."""
 
 import torch
 
 
 def register_rows_vmap(op: str, rows: tuple[int, ...]) -> None:
-    """Lets `torch.vmap` fold its axis into the rows of an op, whose outputs have a row for each row of the inputs.
+    """Registers a batching rule that folds the mapped axis into the rows of an op.
 
-    Where an argument that is not one of `rows`, such as a table, has the mapped axis too, the op runs once for each
-    entry.
+    For ops whose outputs have one row per row of the inputs. If an argument not in `rows`, such as a table, has the
+    mapped axis too, the op runs once per entry.
 
     Args:
-        op: its name.
+        op: name of the op.
         rows: positions of the arguments whose first axis is the rows.
     """
 
@@ -18,13 +18,13 @@ def register_rows_vmap(op: str, rows: tuple[int, ...]) -> None:
         in_dims = _tensor_dims(in_dims, args)
         mapped = {i for i, dim in enumerate(in_dims) if dim is not None}
         if not mapped <= set(rows):
-            return _each(_overload(op), info.batch_size, in_dims, args)
+            return _run_per_entry(_overload(op), info.batch_size, in_dims, args)
         size = info.batch_size
         folded, count = list(args), 0
         for i in rows:
-            spread = args[i].movedim(in_dims[i], 0) if i in mapped else args[i].expand(size, *args[i].shape)
-            count = spread.shape[1]
-            folded[i] = spread.reshape(size * count, *spread.shape[2:])
+            expanded = args[i].movedim(in_dims[i], 0) if i in mapped else args[i].expand(size, *args[i].shape)
+            count = expanded.shape[1]
+            folded[i] = expanded.reshape(size * count, *expanded.shape[2:])
         outputs = _overload(op)(*folded)
         if isinstance(outputs, torch.Tensor):
             return outputs.unflatten(0, (size, count)), 0
@@ -34,10 +34,10 @@ def register_rows_vmap(op: str, rows: tuple[int, ...]) -> None:
 
 
 def register_each_vmap(op: str) -> None:
-    """Lets `torch.vmap` run an op once for each entry of its axis: for ops that reduce, or number their rows."""
+    """Registers a batching rule that runs an op once per entry: for ops that reduce over rows, or use row numbers."""
 
     def rule(info, in_dims, *args):
-        return _each(_overload(op), info.batch_size, _tensor_dims(in_dims, args), args)
+        return _run_per_entry(_overload(op), info.batch_size, _tensor_dims(in_dims, args), args)
 
     torch.library.register_vmap(f"spslam::{op}", rule)
 
@@ -47,11 +47,11 @@ def _overload(op: str):
 
 
 def _tensor_dims(in_dims, args) -> tuple[int | None, ...]:
-    """The mapped axis of each argument that is a tensor; lists of numbers come with lists of None."""
+    """The mapped axis of each tensor argument, None for all others: for a list torch passes a list of None."""
     return tuple(dim if isinstance(arg, torch.Tensor) else None for dim, arg in zip(in_dims, args, strict=True))
 
 
-def _each(function, size, in_dims, args):
+def _run_per_entry(function, size, in_dims, args):
     if size == 0:
         raise ValueError(f"{function.name()}: torch.vmap must map over at least one entry, got 0")
     entries = [

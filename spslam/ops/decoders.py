@@ -12,7 +12,7 @@ from spslam.ops._vmap import register_each_vmap, register_rows_vmap
 
 
 class Activation(IntEnum):
-    """What follows the last layer. Repeated in csrc/include/spslam/decoders.h."""
+    """Activation of the last layer. Duplicated in csrc/include/spslam/decoders.h."""
 
     NONE = 0
     TANH = 1
@@ -39,11 +39,11 @@ def mlp_num_params(inputs: int, hidden: int, outputs: int) -> int:
 def mlp(
     input: torch.Tensor, params: torch.Tensor, hidden: int, output: int, activation: int = Activation.NONE
 ) -> torch.Tensor:
-    """A network input -> hidden -> hidden -> output with ReLU between its three linear layers.
+    """A multi-layer perceptron with two hidden layers and ReLU between its three linear layers.
 
-    y = a(W3 relu(W2 relu(W1 x + b1) + b2) + b3), the decoders of equations (2) and (4). Every layer is computed on
-    tiles of samples held in the cache, on CUDA in a block's shared memory where there is room; nothing but the result
-    is kept for the gradient, which runs the network again.
+    y = a(W3 relu(W2 relu(W1 x + b1) + b2) + b3), the decoders of equations (2) and (4). All layers are computed for one
+    tile of samples at a time, in cache, or on CUDA in shared memory if it fits. No intermediate values are saved for
+    the backward pass, which recomputes them.
 
     Args:
         input: float32 or float64 [N, I].
@@ -51,14 +51,14 @@ def mlp(
             (`torch.nn.Linear`'s layout), one after another; P = `mlp_num_params(I, hidden, output)`.
         hidden: width H of both hidden layers.
         output: number of outputs, O.
-        activation: what follows the last layer, an `Activation`.
+        activation: activation of the last layer, an `Activation`.
 
     Returns:
         [N, O], differentiable with respect to `input` and `params`. N = 0 gives an empty tensor and zero gradients. A
         row of `input` with NaN gives a row of NaN.
 
-        Gradients of `params` are summed over the samples in an order that depends on N alone: the same bits for any
-        number of threads, and from run to run on CUDA.
+        Gradients of `params` are summed over the samples in an order that depends only on N: the same bits for any
+        number of threads, and in every run on CUDA.
 
     Raises:
         TypeError: `input` is not float32 or float64, or `params` of another dtype.

@@ -1,4 +1,4 @@
-"""A frame's surface points into a sparse volume in one call: allocate vertices, encode, fuse."""
+"""Fuses the surface points of a frame into a sparse volume in one call: allocates vertices, encodes, fuses."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from spslam.ops.prior_fusion import ENCODER_PARAMETERS, FEATURES
 
 @dataclass(frozen=True)
 class VolumeBuffers:
-    """The tensors of a sparse volume, with room for more vertices than it has.
+    """The buffers of a sparse volume, with unused rows for new vertices.
 
     Attributes:
-        hash_keys, hash_values: its table, see `spslam.ops.voxel_hash`.
+        hash_keys, hash_values: hash table, see `spslam.ops.voxel_hash`.
         voxel_coords: int32 [V, 3].
-        corner_ids: int32 [V, 8], -1 in the rows not yet in use.
-        embeddings: float32 [V, 8], 0 in the rows not yet in use.
-        weights: float32 [V], likewise.
+        corner_ids: int32 [V, 8], -1 in unused rows.
+        embeddings: float32 [V, 8], 0 in unused rows.
+        weights: float32 [V], 0 in unused rows.
     """
 
     hash_keys: torch.Tensor
@@ -32,11 +32,11 @@ class VolumeBuffers:
 
     @property
     def rows(self) -> int:
-        """V, the vertices that there is room for; the table must have twice as many slots."""
+        """V, the number of rows; the hash table must have twice as many slots."""
         return self.weights.shape[0]
 
     def check(self, function: str) -> None:
-        """Raises ValueError or TypeError unless the tensors fit each other."""
+        """Raises ValueError or TypeError if the tensors are inconsistent."""
         check_tensor(function, "hash_keys", self.hash_keys, ["capacity"], torch.int64)
         slots = self.hash_keys.shape[0]
         check(slots >= 2 and slots & (slots - 1) == 0, function, "hash_keys", "have a power of two of slots", slots)
@@ -49,16 +49,16 @@ class VolumeBuffers:
 
 @dataclass(frozen=True)
 class FrameFusion:
-    """How a frame is encoded and fused.
+    """Settings of the encoding and fusion of a frame.
 
     Attributes:
         voxel_size: m.
         neighborhood, min_pair_weight: see `encode_points`.
-        max_points: the first so many points that have a normal are taken.
-        min_weight: vertices whose points weigh this much or less in sum are left out.
-        kappa: sum of weights that counts as one observation; more counts no more.
-        max_weight: cap of a vertex's total weight.
-        fuse_known: whether vertices that the volume has already take part; else only new ones are filled.
+        max_points: only the first `max_points` points with a normal are used.
+        min_weight: vertices with a sum of point weights up to this value are left out.
+        kappa: sum of point weights that has the fusion weight 1; larger sums have the fusion weight 1 too.
+        max_weight: upper limit of the accumulated weight of a vertex.
+        fuse_known: also fuse into existing vertices; if false, only new vertices get features.
     """
 
     voxel_size: float
@@ -82,13 +82,13 @@ class FrameFusion:
 
 
 class EncodedFrame(NamedTuple):
-    """What became of a frame.
+    """Result of `encode_frame_`.
 
     Attributes:
-        new_voxels: vertices that the volume lacked.
-        fits: whether there was room for them; else nothing was changed.
-        bounds: float32 [2, 3] on the CPU, the least and the largest coordinates (m) of all finite points; infinite,
-            the first above the second, where there is none.
+        new_voxels: number of new vertices needed.
+        fits: whether there was room for them; if not, nothing was changed.
+        bounds: float32 [2, 3] on the CPU, the smallest and the largest coordinates (m) of all finite points; +infinity
+            and -infinity without such a point.
     """
 
     new_voxels: int
@@ -109,13 +109,14 @@ def encode_frame_(
 ) -> EncodedFrame:
     """Encodes a frame's points and fuses them into the volume, in place; section III.A and equation (1) of SP-SLAM.
 
-    The same as `encode_points`, then `voxel_hash_insert`, `voxel_hash_update_corner_ids` and `fuse_prior_` with the
-    share min(w / kappa, 1) for the vertices of weight w above `min_weight`, in one call that waits for CUDA once.
+    Equivalent to `encode_points`, `voxel_hash_insert`, `voxel_hash_update_corner_ids` and `fuse_prior_` with the weight
+    min(w / kappa, 1) for the vertices with a sum of point weights w above `min_weight`, but in one call, which
+    synchronizes with CUDA once.
 
     Args:
-        volume: contiguous tensors; changed.
-        num_voxels: vertices in use so far.
-        max_voxels: the most there may be, at most the rows of `volume` and half the slots of its table.
+        volume: contiguous tensors; changed in place.
+        num_voxels: number of vertices in use.
+        max_voxels: largest number of vertices, at most the rows of `volume` and half the slots of its hash table.
         points: float32 [N, 3], world, m.
         normals: float32 [N, 3], world, unit, towards the camera; 0 = unknown.
         encoder_params: float32 [5128], see `encode_points`.
@@ -123,13 +124,12 @@ def encode_frame_(
         tf32: see `encode_points`.
 
     Returns:
-        See `EncodedFrame`. Vertices, their numbers and their weights are the same on every device, as sums of weights
-        are kept in integers; embeddings are the same on every run and for any number of threads. On CUDA a feature that
-        is not finite or beyond 32768 makes all features of the call NaN. N = 0 changes nothing.
+        See `EncodedFrame`. Vertices, their ids and their weights are the same on every device, because weights are
+        summed as integers. Embeddings are the same in every run and for any number of threads. On CUDA a feature that
+        is not finite or exceeds 32768 makes all features of the call NaN. N = 0 changes nothing.
 
     Raises:
-        ValueError: wrong shapes or devices, a number out of range, `num_voxels` above `max_voxels` or that above the
-            room there is.
+        ValueError: wrong shapes or devices, or a number out of range.
         TypeError: wrong dtypes.
 
     Example:

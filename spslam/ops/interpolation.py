@@ -1,9 +1,9 @@
-"""Interpolation in sparse volumes, images and tri-planes, differentiable by the table and by the coordinates.
+"""Interpolation in sparse volumes, images and tri-planes, differentiable with respect to values and coordinates.
 
-All of them take float32 and float64, accept non-contiguous and empty input, and give the same bits for the same input:
-gradients of a table are summed in the order of the points on the CPU, whatever the number of threads, and in 64-bit
-fixed point on CUDA. First derivatives only. (On the CPU the sum into a table of rows shorter than a cache line, such as
-8 float32 embeddings, is the work of one thread; all else is shared.)
+All ops support float32 and float64, and non-contiguous and empty input. The same input gives the same bits: gradients
+of a table are summed in the order of the points on the CPU, for any number of threads, and in 64-bit fixed point on
+CUDA. First derivatives only. On the CPU, the gradient of a table with rows shorter than a cache line, such as 8 float32
+embeddings, is summed by a single thread; all other work is parallel.
 """
 
 from collections.abc import Sequence
@@ -26,15 +26,15 @@ def trilinear_interpolate(
     """Features of points inside the cells of a sparse volume (TriLerp of equation 2).
 
     Args:
-        embeddings: [V, C] float32 or float64, a feature vector for each voxel vertex.
+        embeddings: [V, C] float32 or float64, one feature vector per voxel vertex.
         corner_ids: int32 [N, 8], rows of `embeddings` at the corners of each point's cell; corner k lies at offset
             (k & 1, k >> 1 & 1, k >> 2 & 1) from the lowest one. A point with an id outside [0, V), such as the -1 of a
             missing vertex, gets the value 0 and no gradient.
-        local_coords: [N, 3] of the dtype of `embeddings`, position inside the cell in [0, 1], as x, y, z. What is not
-            finite gives NaN for its point.
+        local_coords: [N, 3] of the dtype of `embeddings`, position inside the cell in [0, 1], as x, y, z. A coordinate
+            that is not finite gives NaN for its point.
 
     Returns:
-        [N, C]. Differentiable by `embeddings` and `local_coords`. N = 0 gives an empty tensor.
+        [N, C]. Differentiable with respect to `embeddings` and `local_coords`. N = 0 gives an empty tensor.
 
     Raises:
         TypeError: a dtype is wrong.
@@ -55,16 +55,16 @@ def trilinear_interpolate(
 
 @public_op()
 def bilinear_interpolate(texels: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
-    """Values of an image or plane between its texels.
+    """Bilinear interpolation in an image or plane.
 
     Args:
         texels: [H, W, C] float32 or float64; H and W at least 1 unless N is 0.
         uv: [N, 2] of the same dtype, positions in texels, u along W and v along H: (0, 0) is the center of the first
-            texel, (W - 1, H - 1) that of the last. Positions outside are clamped to the border, with zero gradient, and
-            so is infinity; NaN gives NaN for its point.
+            texel, (W - 1, H - 1) that of the last. Positions outside, including infinity, are clamped to the border,
+            with zero gradient; NaN gives NaN for its point.
 
     Returns:
-        [N, C]. Differentiable by `texels` and `uv`. N = 0 gives an empty tensor.
+        [N, C]. Differentiable with respect to `texels` and `uv`. N = 0 gives an empty tensor.
 
     Raises:
         TypeError: a dtype is wrong.
@@ -91,14 +91,14 @@ def tri_plane_interpolate(
     Args:
         texels: [P, C] float32 or float64, the texels of all planes as rows of one table.
         points: [N, 3] of the same dtype, meters. NaN gives NaN for its point.
-        cell_size: distance between texels, meters; texel (iu, iv) lies at (iu, iv) * cell_size.
+        cell_size: distance between texels, meters; texel (iu, iv) is at (iu, iv) * cell_size.
         layout: 15 integers, (offset, origin_u, origin_v, size_u, size_v) for each of the planes with axes (u, v) =
             (x, y), (x, z), (y, z). Texel (iu, iv) is row offset + (iu - origin_u) * size_v + (iv - origin_v).
-            Points outside a plane are clamped to its border, with zero gradient by that coordinate. While a plane
-            has no texel, all values are 0.
+            Points outside a plane are clamped to its border, with zero gradient for that coordinate. If a plane has no
+            texel, all values are 0.
 
     Returns:
-        [N, C]. Differentiable by `texels` and `points`. N = 0 gives an empty tensor.
+        [N, C]. Differentiable with respect to `texels` and `points`. N = 0 gives an empty tensor.
 
     Raises:
         TypeError: a dtype is wrong.

@@ -1,4 +1,4 @@
-"""CUDA graphs that whole-call ops keep from call to call."""
+"""CUDA graphs that ops reuse from call to call."""
 
 import weakref
 
@@ -8,18 +8,18 @@ from spslam.ops import _library
 
 
 class LaunchGraph:
-    """The CUDA graph of one op at one place of a program; nothing on the CPU.
+    """A CUDA graph for the calls of one op from one place in a program; has no effect on the CPU.
 
-    An op that is given one runs its whole call as one graph. It is built in the first call and when the shape of a call
-    changes (iterations, rays, precision); other arguments, grown tensors among them, are brought up to date in it. One
-    graph is for one thread at a time. It is freed with this object.
+    An op with a launch graph runs as one graph launch. The graph is captured in the first call, and again when the
+    shape of the call changes (iterations, rays, precision). All other arguments, including reallocated tensors, are
+    updated in the existing graph. A graph must be used by one thread at a time. It is freed with this object.
     """
 
     def __init__(self) -> None:
         self._number = 0
 
     def number(self, device: torch.device) -> int:
-        """The number that names it to an op on `device`; 0 where that is not CUDA."""
+        """The handle that identifies the graph to an op on `device`; 0 on the CPU."""
         if device.type != "cuda":
             return 0
         if self._number == 0:
@@ -31,5 +31,5 @@ class LaunchGraph:
 
     @property
     def builds(self) -> int:
-        """How often the graph was built."""
+        """How often the graph was captured."""
         return torch.ops.spslam.launch_graph_builds(self._number) if self._number else 0

@@ -1,4 +1,4 @@
-"""Marching cubes over sparse cells: a welded triangle mesh of a level set. Not differentiable."""
+"""Marching cubes on sparse cells: an indexed triangle mesh of a level set, without seams. Not differentiable."""
 
 import torch
 
@@ -16,24 +16,25 @@ def marching_cubes(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Triangle mesh of the surface where a sampled field equals `level` (Lorensen and Cline 1987).
 
-    Space is cut into unit cells; M of them are given, each cut into n x n x n cubes with samples at their corners.
-    Sample (i, j, k) of a cell lies at its coordinates plus (i, j, k) / n. Cells that touch share samples, edges and
-    vertices: the mesh has no seams between them, and where the cells around the surface are complete it is a closed
-    manifold. A shared sample's value is that of the cell on its upper side (of the first other cell, where that one is
-    not given), so that differences between the cells' copies do no harm. On a face with two inside corners diagonally
-    opposite the surface separates these, seen from either side.
+    Input is M unit cells, each divided into n x n x n cubes with samples at their corners. Sample (i, j, k) of a cell
+    is at the cell coordinates plus (i, j, k) / n. Adjacent cells share samples, edges and vertices, so the mesh has no
+    seams between them. It is a closed manifold where all cells around the surface are given. The value of a shared
+    sample is taken from the cell on its upper side, or from the first other cell if that one is not given, so the
+    copies of the cells may differ. On a face with two diagonally opposite inside corners, the surface separates them,
+    in both cubes that share the face.
 
     Args:
         cell_coords: int32 [M, 3], distinct, in [-2^20, 2^20 - 1].
-        values: float32 [M, n + 1, n + 1, n + 1], indexed x, y, z; below the level is inside. NaN or infinity is
-            unknown: the cubes that touch such a sample have no faces.
+        values: float32 [M, n + 1, n + 1, n + 1], indexed x, y, z; values below the level are inside. NaN and infinity
+            are unknown: cubes with such a sample have no faces.
         level: the value on the surface.
 
     Returns:
-        vertices: float32 [K, 3] in cell units, one for each edge crossed, placed by linear interpolation.
-        faces: int64 [L, 3], indices of vertices, counter-clockwise seen from where values are above the level.
-        Every vertex has a face. Order: by cell as given, then within it; the same bits for any number of threads.
-        M = 0 or no crossing gives empty tensors. On CUDA this waits for the device, which counts before it writes.
+        vertices: float32 [K, 3] in cell units, one per edge with a crossing, placed by linear interpolation.
+        faces: int64 [L, 3], indices of vertices, counter-clockwise seen from the side with values above the level.
+        Every vertex belongs to a face. Vertices and faces are in the order of the cells. The same bits for any number
+        of threads. M = 0 or no crossing gives empty tensors. On CUDA the call synchronizes, to get the sizes of the
+        output.
 
     Raises:
         TypeError: a tensor of another dtype.
@@ -45,7 +46,7 @@ def marching_cubes(
         >>> x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
         >>> ball = (x**2 + y**2 + z**2).sqrt() - 0.6
         >>> vertices, faces = marching_cubes(torch.zeros(1, 3, dtype=torch.int32), ball[None])
-        >>> len(vertices) - 3 * len(faces) // 2 + len(faces)  # Euler's number of a closed surface without holes
+        >>> len(vertices) - 3 * len(faces) // 2 + len(faces)  # Euler characteristic of a sphere
         2
     """
     name = "marching_cubes"

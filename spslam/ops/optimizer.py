@@ -1,4 +1,4 @@
-"""Optimizer steps: Adam on the touched rows of a table, and Gauss-Newton's normal equations. Not differentiable."""
+"""Optimizer steps: Adam on selected rows of a table, and Gauss-Newton normal equations. Not differentiable."""
 
 import torch
 
@@ -22,19 +22,20 @@ def sparse_adam_(
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-8,
 ) -> None:
-    """One Adam step (Kingma and Ba 2015, algorithm 1) in place, on the rows whose stamp is the current one.
+    """One Adam step (Kingma and Ba 2015, algorithm 1), in place, on the rows with the current stamp.
 
-    With g the gradient of a touched row: m = beta1 m + (1 - beta1) g, v = beta2 v + (1 - beta2) g^2 and
-    param -= lr / (1 - beta1^step) * m / (sqrt(v / (1 - beta2^step)) + eps). The gradient rows used are then set to
-    zero, ready for the next accumulation; rows of another stamp are neither read nor written. With every row touched
-    the result is torch.optim.Adam's.
+    With g the gradient of such a row: m = beta1 m + (1 - beta1) g, v = beta2 v + (1 - beta2) g^2 and
+    param -= lr / (1 - beta1^step) * m / (sqrt(v / (1 - beta2^step)) + eps). The gradient of these rows is then set to
+    zero for the next accumulation. Rows with another stamp are neither read nor written. If all rows have the current
+    stamp, the result equals that of torch.optim.Adam. The result does not depend on the number of threads. A gradient
+    that is not finite affects only its own entry. V = 0 changes nothing.
 
     Args:
         param: float32 or float64 [V, C], or any shape with V rows along the first axis; contiguous, as the next three.
-        grad: its gradient, same shape and dtype; touched rows are zeroed.
+        grad: its gradient, same shape and dtype; rows with the current stamp are set to 0.
         exp_avg: first moment m, same shape and dtype.
         exp_avg_sq: second moment v, same shape and dtype.
-        stamps: int32 [V], the stamp each row was last touched with; None steps every row.
+        stamps: int32 [V], the last stamp of each row; None updates every row.
         stamp: the current stamp.
         lr: learning rate.
         step: 1-based number of the step, for the bias correction, common to all rows.
@@ -43,10 +44,7 @@ def sparse_adam_(
 
     Raises:
         TypeError: a tensor of another dtype.
-        ValueError: shapes or devices that do not fit, a tensor that is not contiguous, a rate out of range.
-
-    V = 0 changes nothing. The result does not depend on the number of threads. A gradient that is not finite spoils its
-    own entry alone.
+        ValueError: wrong shapes or devices, a tensor that is not contiguous, or a number out of range.
 
     Example:
         >>> param, grad, exp_avg, exp_avg_sq = torch.zeros(2, 1), torch.ones(2, 1), torch.zeros(2, 1), torch.zeros(2, 1)
@@ -85,17 +83,17 @@ def normal_equations(
     Args:
         residuals: float32 or float64 [F, N], r.
         jacobians: [F, N, 6], J = dr/dx.
-        weights: [F, N], w. Where w = 0 the entry is skipped, even if its residual or jacobian is not finite; else NaN
-            makes the sums of its problem NaN.
+        weights: [F, N], w. Entries with w = 0 are skipped, even if their residual or jacobian is not finite; any other
+            NaN makes the sums of its problem NaN.
 
     Returns:
         hessian [F, 6, 6] = sum_n w J J^T, gradient [F, 6] = sum_n w r J, cost [F] = sum_n w r^2, in the inputs' dtype.
-        Sums run in a fixed order (256 entries in that dtype, beyond that in float64): the same bits for any number of
-        threads. N = 0 gives zeros, F = 0 empty tensors.
+        Sums have a fixed order (blocks of 256 entries in that dtype, sums of blocks in float64): the same bits for any
+        number of threads. N = 0 gives zeros, F = 0 empty tensors.
 
     Raises:
         TypeError: a tensor of another dtype.
-        ValueError: shapes or devices that do not fit.
+        ValueError: wrong shapes or devices.
 
     Example:
         >>> hessian, gradient, cost = normal_equations(torch.ones(1, 4), torch.ones(1, 4, 6), torch.ones(1, 4))
@@ -120,16 +118,16 @@ def solve_normal_equations(
     Args:
         hessian: float32 or float64 [F, 6, 6], symmetric; only the lower triangle is read.
         gradient: [F, 6].
-        damping: added in proportion to the diagonal.
-        absolute_damping: added to the diagonal as it is.
+        damping: factor of the diagonal that is added to it.
+        absolute_damping: constant that is added to the diagonal.
 
     Returns:
-        delta [F, 6], solved by LDL^T in float64. A row is 0 where the damped matrix is not positive definite to the
-        dtype's precision, or where something is not finite. F = 0 gives an empty tensor. Deterministic.
+        delta [F, 6], solved by LDL^T in float64. A row is 0 if the damped matrix is not positive definite to the
+        precision of the dtype, or if its input is not finite. F = 0 gives an empty tensor. Deterministic.
 
     Raises:
         TypeError: a tensor of another dtype.
-        ValueError: shapes or devices that do not fit, negative damping.
+        ValueError: wrong shapes or devices, or negative damping.
 
     Example:
         >>> solve_normal_equations(2 * torch.eye(6)[None], torch.ones(1, 6))

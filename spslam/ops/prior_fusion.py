@@ -1,4 +1,4 @@
-"""The scene prior: normals of a depth image, the depth encoder, and its fusion into the sparse volume."""
+"""The scene prior: normals of a depth image, the point encoder, and fusion into the sparse volume."""
 
 import torch
 
@@ -27,20 +27,21 @@ def depth_normals(
 ) -> torch.Tensor:
     """Surface normals at pixels of a depth image.
 
-    Cross product of central differences over `step_px` of back-projected depth, which is smoothed before, at each of
-    the five pixels: over 5x5 pixels, with a Gaussian of 2 px in the image and a biweight of 6 cm in depth.
+    A normal is the cross product of central differences, over `step_px`, of back-projected depth. The depth at each of
+    the five pixels is smoothed before by a 5x5 bilateral filter: a Gaussian of 2 px in the image, a biweight of 6 cm in
+    depth.
 
     Args:
-        depth: float32 [H, W], meters; 0, negative and not finite are invalid.
+        depth: float32 [H, W], meters; values that are 0, negative or not finite are invalid.
         pixels: int32 [N, 2], (u, v): column, row.
         fx, fy, cx, cy: pinhole camera, px.
         step_px: distance of the differences, 1 to 65535.
         max_jump: a neighbor whose depth differs by this share of the pixel's, or more, is another surface.
 
     Returns:
-        float32 [N, 3] in camera axes, unit, turned to the camera (n . p < 0). 0 where unknown: invalid depth at one of
-        the five pixels, a depth jump, or nearer than `step_px` to the border or outside. Same on every run; N = 0 gives
-        an empty tensor.
+        float32 [N, 3] in camera axes, unit, facing the camera (n . p < 0). 0 where undefined: invalid depth at one of
+        the five pixels, a depth discontinuity, or a pixel outside the image or nearer than `step_px` to its border. The
+        same in every run. N = 0 gives an empty tensor.
 
     Raises:
         ValueError: wrong shapes or devices, `fx`, `fy` or `max_jump` not positive, `step_px` out of range.
@@ -74,26 +75,26 @@ def encode_points(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Encodes surface points into features at the voxel vertices around them; section III.A of SP-SLAM.
 
-    A point x (in voxels) with normal n gives to a vertex c the feature `encoder([(x - c) / r, n])`, with the weight
-    `prod(1 - |x - c| / r)^3` over the axes: r = 2 and the 4x4x4 vertices around the point for a neighborhood of 64,
-    r = 1 and the 8 corners of its cell for 8. The encoder is 6 -> 64 -> 64 -> 8 with ReLU.
+    The feature of a point x (in voxels) with normal n at a vertex c is `encoder([(x - c) / r, n])`, and its weight is
+    `prod(1 - |x - c| / r)^3` over the axes. A neighborhood of 64 has r = 2 and the 4x4x4 vertices around the point, a
+    neighborhood of 8 has r = 1 and the corners of its cell. The encoder is 6 -> 64 -> 64 -> 8 with ReLU.
 
     Args:
-        points: float32 [N, 3], world, meters. Not finite ones, and those beyond 2^20 voxels, are skipped.
+        points: float32 [N, 3], world, meters. Points that are not finite or beyond 2^20 voxels are skipped.
         normals: float32 [N, 3], unit, world, towards the camera; points whose normal is 0 are skipped.
         encoder_params: float32 [5128], flat, in the layout of `mlp`.
         voxel_size: meters.
         neighborhood: 64 or 8.
-        min_pair_weight: pairs of a point and a vertex with less weight are left out, and never looked at again.
-        tf32: on CUDA devices from sm_80 on, let tensor cores multiply factors rounded to 10 bits of mantissa, which
-            changes features by some 1e-3 of their size. Elsewhere, and without it, everything is float32; sums of
-            weights always are exact.
+        min_pair_weight: pairs of a point and a vertex with a smaller weight are left out.
+        tf32: on CUDA devices from sm_80 on, use tensor cores with factors rounded to 10 bits of mantissa, which changes
+            features by a relative 1e-3. Otherwise, and on other devices, everything is float32. Sums of weights are
+            always exact.
 
     Returns:
-        voxel_coords int32 [M, 3], the vertices reached, sorted by (x, y, z); features float32 [M, 8], weighted means;
-        weights float32 [M], sums of weights. Same on every run and for every thread count; not differentiable.
-        N = 0 gives M = 0. Coordinates and weights are the same on every device. On CUDA a feature that is not finite
-        or beyond 32768 makes all of them NaN, and the call waits for the device.
+        voxel_coords int32 [M, 3], all vertices with a pair, sorted by (x, y, z); features float32 [M, 8], weighted
+        means; weights float32 [M], sums of weights. The same in every run and for any number of threads; not
+        differentiable. N = 0 gives M = 0. Coordinates and weights are the same on every device. On CUDA a feature that
+        is not finite or exceeds 32768 makes all features NaN, and the call synchronizes with the device.
 
     Raises:
         ValueError: wrong shapes or devices, `voxel_size` not positive, another neighborhood, a negative minimum.
@@ -102,7 +103,7 @@ def encode_points(
     Example:
         >>> point, normal = torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([[0.0, 0.0, -1.0]])
         >>> coords, features, weights = encode_points(point, normal, torch.zeros(ENCODER_PARAMETERS), 1.0, 8)
-        >>> coords[0], features.shape, weights[0]  # each of the eight corners weighs 0.5^9
+        >>> coords[0], features.shape, weights[0]  # the weight of each of the eight corners is 0.5^9
         (tensor([0, 0, 0], dtype=torch.int32), torch.Size([8, 8]), tensor(0.0020))
     """
     name = "encode_points"
@@ -129,8 +130,8 @@ def fuse_prior_(
     """Fuses encoded features into the sparse volume, in place; equation (1) of SP-SLAM.
 
     E <- (W E + w f) / (W + w), then W <- min(W + w, max_weight). A weight w that is 0, negative or NaN changes nothing;
-    a feature that is NaN makes its voxel NaN. Each voxel has one writer: the same result on every run and for every
-    thread count.
+    a feature that is NaN makes its voxel NaN. Each voxel is written by one thread only: the same result in every run
+    and for any number of threads.
 
     Args:
         embeddings: float32 [V, 8], contiguous; changed.
@@ -138,7 +139,7 @@ def fuse_prior_(
         voxel_ids: int32 [M], distinct; rows outside [0, V) are skipped.
         features: float32 [M, 8].
         feature_weights: float32 [M], at least 0.
-        max_weight: cap of the total weight, positive.
+        max_weight: upper limit of the accumulated weight, positive.
 
     Raises:
         ValueError: wrong shapes or devices, or `max_weight` not positive.
@@ -163,7 +164,7 @@ def fuse_prior_(
 
 @public_op()
 def random_embeddings(voxel_coords: torch.Tensor, seed: int, scale: float = 0.01) -> torch.Tensor:
-    """Embeddings to start from without a prior: numbers from N(0, scale^2) that voxel and seed alone decide on.
+    """Initial embeddings without a prior: random numbers from N(0, scale^2) that depend only on voxel and seed.
 
     Args:
         voxel_coords: int32 [M, 3], any integers.
@@ -171,7 +172,7 @@ def random_embeddings(voxel_coords: torch.Tensor, seed: int, scale: float = 0.01
         scale: standard deviation, at least 0.
 
     Returns:
-        float32 [M, 8]; the same whatever else is in `voxel_coords`, up to rounding the same on every device.
+        float32 [M, 8]; independent of the other rows of `voxel_coords`, and up to rounding the same on every device.
 
     Raises:
         ValueError: wrong shape, or a negative scale.

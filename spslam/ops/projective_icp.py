@@ -1,8 +1,8 @@
 """Relative camera pose by point-to-plane ICP with projective association. Not differentiable.
 
-A source point x falls on the pixel pi(T x) of the target's maps, whose vertex v and normal n it is held against: the
-residual is r = n . (T x - v), its weight 1 / (1 + (r / k)^2)^2. Chen and Medioni 1992; association by projection after
-Blais and Levine 1995.
+A source point x is associated with the vertex v and normal n at the pixel pi(T x) of the target maps. The residual is
+r = n . (T x - v) with the robust weight 1 / (1 + (r / k)^2)^2. Point-to-plane ICP is by Chen and Medioni 1992,
+association by projection by Blais and Levine 1995.
 """
 
 import torch
@@ -27,31 +27,32 @@ def projective_icp(
     kernel_end: float = 0.03,
     damping: float = 1e-4,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Moves a cloud of points onto a surface that a camera sees; all iterations in one call, on CUDA in one kernel.
+    """Aligns a point cloud with the vertex and normal maps of a camera.
 
-    Each iteration associates anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the step
-    to a norm of 0.15 (m and rad). The kernel width k goes geometrically from `kernel_start` to `kernel_end`, reached
-    one iteration before the last.
+    All iterations run in one call, on CUDA in one kernel. Each iteration updates the associations, solves
+    (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the norm of the step to 0.15 (m and rad). The
+    kernel width k decreases geometrically from `kernel_start` to `kernel_end`, which it reaches one iteration before
+    the last.
 
     Args:
         points: float32 [N, 3] source points, m, in the source camera's axes.
         vertices: float32 [H, W, 3] target points, m, in the target camera's axes; z = 0 where there is none.
-        normals: float32 [H, W, 3] their unit normals; 0 where unknown. Such pixels take no part.
-        pose: float32 [7] start, unit quaternion (w, x, y, z) and translation (m), T_target_source.
-        intrinsics: of the maps, in their own pixels: a map of every s-th pixel has focal lengths f / s and principal
-            point (c + 1/2) / s - 1/2.
-        iterations: how many.
-        max_distance: farthest a point may lie from its vertex, m.
-        kernel_start: first width k of the robust kernel, m.
-        kernel_end: last width, m.
-        damping: relative Levenberg damping.
+        normals: float32 [H, W, 3] their unit normals; pixels with normal 0 are ignored.
+        pose: float32 [7] initial pose, unit quaternion (w, x, y, z) and translation (m), T_target_source.
+        intrinsics: of the maps, in their pixels: a map of every s-th pixel has focal lengths f / s and principal point
+            (c + 1/2) / s - 1/2.
+        iterations: number of iterations.
+        max_distance: largest distance between a point and its vertex, m.
+        kernel_start: initial width k of the robust kernel, m.
+        kernel_end: final width, m.
+        damping: relative Levenberg-Marquardt damping.
 
     Returns:
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of points
-        with a partner, the norms of the step in translation (m) and rotation (rad), and the mean weight over all
-        points, each before the iteration's step; float32 [6, 6] H of the last iteration. The same to the bit every time
-        on one device, and for any number of CPU threads. N = 0 or an empty map leaves the pose as it is. Points,
-        vertices and normals that are not finite take no part, and none does where the pose is not.
+        with an association, the norms of the step in translation (m) and rotation (rad), and the mean weight over all
+        points, each before the step of the iteration; float32 [6, 6] H of the last iteration. The same bits in every
+        run on one device, and for any number of CPU threads. N = 0 or an empty map does not change the pose. Points,
+        vertices and normals that are not finite are ignored; all are ignored if the pose is not finite.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.

@@ -1,4 +1,4 @@
-"""Random draws and samples along rays, from counter-based Philox numbers: no generator state, equal on every device."""
+"""Random numbers and samples along rays by the counter-based Philox generator: no state, the same on every device."""
 
 from enum import IntEnum
 
@@ -14,7 +14,7 @@ _COUNTER_RANGE = 2**32
 
 
 class Stream(IntEnum):
-    """What a draw is for; draws of different streams are independent. Repeated in csrc/core/philox.h."""
+    """Purpose of random numbers; different streams are independent. Duplicated in csrc/core/philox.h."""
 
     PIXEL_DATABASE = 0
     TRACKING_PIXELS = 1
@@ -32,15 +32,15 @@ class Stream(IntEnum):
 def philox_uniform(
     seed: int, stream: int, frame: int, iteration: int, count: int, device: torch.device | str = "cpu"
 ) -> torch.Tensor:
-    """Uniform random numbers keyed by (seed, stream, frame, iteration), element i from counter i.
+    """Uniform random numbers with the key (seed, stream, frame, iteration); element i uses counter i.
 
     Args:
         seed: 64-bit seed.
-        stream: purpose of the draw, see `Stream`.
+        stream: purpose of the numbers, see `Stream`.
         frame: frame index, 0 to 2^32 - 1.
         iteration: iteration index, 0 to 2^32 - 1.
-        count: how many numbers, N.
-        device: where the result lives.
+        count: number of elements, N.
+        device: device of the result.
 
     Returns:
         float32 [N] in [0, 1), multiples of 2^-24; bit-identical on every device. N = 0 gives an empty tensor.
@@ -62,17 +62,17 @@ def philox_uniform(
 def sample_indices(
     seed: int, stream: int, frame: int, iteration: int, count: int, upper: int, device: torch.device | str = "cpu"
 ) -> torch.Tensor:
-    """Uniform random integers in [0, upper), drawn with replacement, keyed as in `philox_uniform`.
+    """Uniform random integers in [0, upper), drawn with replacement.
 
     Args:
-        seed, stream, frame, iteration: key of the draw.
-        count: how many numbers, N.
+        seed, stream, frame, iteration: key, as in `philox_uniform`.
+        count: number of elements, N.
         upper: 1 to 2^32.
-        device: where the result lives.
+        device: device of the result.
 
     Returns:
-        int64 [N], floor(word * upper / 2^32) of each element's first word; bit-identical on every device. N = 0 gives
-        an empty tensor.
+        int64 [N], floor(word * upper / 2^32) of the first Philox word of each element; bit-identical on every device.
+        N = 0 gives an empty tensor.
 
     Raises:
         ValueError: `count` negative, or `upper` outside [1, 2^32].
@@ -102,25 +102,25 @@ def sample_along_rays(
     frame: int,
     iteration: int,
 ) -> torch.Tensor:
-    """Depths of the samples along each ray, guided by its measured depth D (section III-B).
+    """Depths of samples along each ray, based on its measured depth D (section III-B).
 
-    `num_uniform` samples are stratified over [near * D, far * D], `num_surface` over [D - truncation, D + truncation]:
-    one random place in each of as many equal parts. Both come merged in ascending order.
+    `num_uniform` samples are stratified over [near * D, far * D], and `num_surface` samples over
+    [D - truncation, D + truncation]. Both are merged in ascending order.
 
     Args:
-        depth: [R] float32 or float64, measured depth of each ray, meters. Rays whose depth is
-            not positive and finite get zeros.
+        depth: [R] float32 or float64, measured depth of each ray, meters. Rays with a depth that is not positive and
+            finite get zeros.
         num_uniform: samples between camera and surface (N_c), 0 to 2^20.
         num_surface: samples around the surface (N_f), 0 to 2^20.
         near: start of the uniform samples as a share of the depth (n_1).
-        far: their end (n_2), at least `near`.
+        far: end of the uniform samples (n_2), at least `near`.
         truncation: half width of the interval around the surface, meters.
-        seed, stream, frame, iteration: the key of the draw, as in `philox_uniform`. Sample s of ray r, with the uniform
-            samples first, uses counter element r * S + s, which must stay below 2^32.
+        seed, stream, frame, iteration: key, as in `philox_uniform`. Sample s of ray r, with the uniform samples first,
+            uses element r * S + s, which must be below 2^32.
 
     Returns:
         [R, S] with S = num_uniform + num_surface, of the dtype of `depth`, meters, ascending in each row. Not
-        differentiable. The same on every run; devices differ by rounding only. R = 0 or S = 0 gives an empty tensor.
+        differentiable. The same in every run; devices differ only by rounding. R = 0 or S = 0 gives an empty tensor.
 
     Raises:
         TypeError: a dtype is wrong.
@@ -159,5 +159,5 @@ def _(seed, stream, frame, iteration, upper, out):
     pass
 
 
-# Not folded: a ray's draws depend on its row.
+# Not folded into rows, because the random numbers of a ray depend on its row.
 register_each_vmap("sample_along_rays")

@@ -1,4 +1,4 @@
-"""Point queries of a scene. Not differentiable: `query_sdf` returns the gradient by the point where asked."""
+"""Point queries of a scene. Not differentiable; `query_sdf_gradient` returns the gradient of the SDF."""
 
 import torch
 
@@ -14,7 +14,7 @@ def query_sdf(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, tor
 
     Args:
         scene: the map.
-        points: float32 [N, 3], m. NaN counts as outside.
+        points: float32 [N, 3], m. NaN is outside.
 
     Returns:
         float32 [N] SDF divided by the truncation, in [-1, 1], 1 outside the complete cells; bool [N], whether inside.
@@ -32,11 +32,11 @@ def query_sdf(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, tor
 
 @public_op()
 def query_sdf_gradient(scene: SceneView, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """As `query_sdf`, and the derivative by the point.
+    """As `query_sdf`, with the gradient with respect to the point.
 
     Args:
         scene: the map.
-        points: float32 [N, 3], m. NaN counts as outside.
+        points: float32 [N, 3], m. NaN is outside.
 
     Returns:
         sdf, valid, and float32 [N, 3] d sdf / d point (1/m), 0 outside. N = 0 gives empty tensors.
@@ -56,7 +56,7 @@ def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
     """RGB at world points, c = F(f_xy + f_xz + f_yz) (eq. 3, 4).
 
     Args:
-        scene: the map; points beyond its planes take the border's color.
+        scene: the map; points outside its planes get the color of the border.
         points: float32 [N, 3], m. NaN gives NaN.
 
     Returns:
@@ -66,7 +66,7 @@ def query_color(scene: SceneView, points: torch.Tensor) -> torch.Tensor:
         TypeError, ValueError: a tensor of another dtype, shape or device.
 
     Example:
-        >>> query_color(SceneView.empty(), torch.zeros(1, 3))  # a decoder of zeros is gray
+        >>> query_color(SceneView.empty(), torch.zeros(1, 3))  # decoder parameters of 0 give gray
         tensor([[0.5000, 0.5000, 0.5000]])
     """
     scene.check("query_color")

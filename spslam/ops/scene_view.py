@@ -1,4 +1,4 @@
-"""The scene as the fused ops take it: the tensors of a map, its sizes, and where its planes lie."""
+"""Input of the fused ops that describes a scene: the tensors of a map, its sizes and the layout of its planes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ COLOR_PARAMS = 32 * 33 + 32 * 33 + 3 * 33  # of the 32 -> 32 -> 32 -> 3 decoder
 
 
 class Intrinsics(NamedTuple):
-    """A pinhole camera's focal lengths and principal point, px."""
+    """Focal lengths and principal point of a pinhole camera, px."""
 
     fx: float
     fy: float
@@ -23,13 +23,13 @@ class Intrinsics(NamedTuple):
 
 
 def check_intrinsics(function: str, intrinsics: Sequence[float], argument: str = "intrinsics") -> None:
-    """Raises ValueError unless a camera has its four numbers."""
+    """Raises ValueError unless `intrinsics` has four numbers."""
     check(len(intrinsics) == 4, function, argument, "be (fx, fy, cx, cy)", tuple(intrinsics))
 
 
 @dataclass(frozen=True)
 class SceneView:
-    """A map with V vertices and P texels, all tensors on one device.
+    """Tensors and sizes of a map with V vertices and P texels, all on one device.
 
     Attributes:
         hash_keys: int64 [capacity] packed voxel coordinates, capacity a power of two.
@@ -40,8 +40,8 @@ class SceneView:
         texels: float32 [P, 32] rows of the three feature planes.
         color_params: float32 [2211] of the decoder tri-plane feature -> RGB, sigmoid.
         voxel_size: m.
-        origin: world point (m) that positions entering the decoder are relative to.
-        position_scale: factor on them, 1/m.
+        origin: world point (m) that decoder positions are relative to.
+        position_scale: scale of positions at the input of the decoder, 1/m.
         plane_cell_size: m.
         plane_layout: 15 ints, (row offset, origin u, origin v, size u, size v) of the xy, xz and yz planes.
     """
@@ -61,7 +61,7 @@ class SceneView:
 
     @classmethod
     def empty(cls, voxel_size: float = 0.04, device: torch.device | str = "cpu") -> "SceneView":
-        """A scene without voxels and texels, whose decoders are all zeros; `dataclasses.replace` fills in the rest."""
+        """A scene without voxels and texels, with decoder parameters of 0; use `dataclasses.replace` to set others."""
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(shape, dtype=dtype, device=device)
@@ -82,7 +82,7 @@ class SceneView:
         )
 
     def check(self, function: str) -> None:
-        """Raises TypeError or ValueError, naming `function`, where a tensor does not fit."""
+        """Raises TypeError or ValueError, naming `function`, for a wrong tensor or number."""
         keys = self.hash_keys
         check_tensor(function, "hash_keys", keys, ("capacity",), torch.int64)
         capacity = len(keys)
@@ -105,7 +105,7 @@ class SceneView:
         check_plane_layout(function, self.plane_layout, len(self.texels), "plane_layout")
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
-        """The three lists that the op schemas take."""
+        """The three lists that the schemas of the ops have: tensors, scalars and plane layout."""
         tensors = [
             self.hash_keys,
             self.hash_values,

@@ -1,8 +1,8 @@
-"""Volume rendering of rays and the loss terms of tracking and mapping, differentiable by hand-written derivatives.
+"""Volume rendering of rays and the loss terms of tracking and mapping, with analytic first derivatives.
 
-float32 and float64, non-contiguous and empty input, first derivatives only. All sums run in a fixed order: the same
-input gives the same bits, whatever the number of threads. `sdf` is normalized throughout: the signed distance divided
-by the truncation distance, in [-1, 1], positive in front of surfaces.
+All ops support float32 and float64, and non-contiguous and empty input. Sums have a fixed order: the same input gives
+the same bits for any number of threads. `sdf` is always normalized: the signed distance divided by the truncation
+distance, in [-1, 1], positive in front of surfaces.
 """
 
 import torch
@@ -20,10 +20,10 @@ def volume_render(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Color and depth of rays as weighted sums over their samples (equations 5 and 6).
 
-    The weight of a sample is the bell sigmoid(sdf / truncation) * sigmoid(-sdf / truncation), taken as 0 below 1e-3,
-    where the sample is not valid, and where it lies deeper than the ray's first crossing (the smallest t of its valid
-    samples of negative sdf) plus truncation. The weights of a ray are then divided by their sum; a ray without any
-    weight renders as zeros.
+    The weight of a sample is sigmoid(sdf / truncation) * sigmoid(-sdf / truncation). It is set to 0 if it is below
+    1e-3, if the sample is not valid, or if the sample is deeper than the first crossing of its ray (the smallest t of
+    valid samples with negative sdf) plus truncation. The weights of a ray are then divided by their sum; a ray without
+    any weight renders as zeros.
 
     Args:
         sdf: [R, S] float32 or float64, normalized.
@@ -33,9 +33,9 @@ def volume_render(
         truncation: truncation distance tr, meters.
 
     Returns:
-        color [R, 3], depth [R] in meters, weights [R, S]. All three are differentiable by `sdf`, `color` and `t`; which
-        samples take part is not differentiated. R = 0 gives empty tensors, S = 0 zeros. NaN makes what it enters NaN,
-        in its own ray alone.
+        color [R, 3], depth [R] in meters, weights [R, S]. All three are differentiable with respect to `sdf`, `color`
+        and `t`, for a fixed selection of samples. R = 0 gives empty tensors, S = 0 zeros. NaN propagates within its own
+        ray only.
 
     Raises:
         TypeError: a dtype is wrong.
@@ -73,17 +73,17 @@ def rendering_losses(
     """The four terms of the objective (equations 8 to 11), each averaged over all R rays.
 
     The distance of a sample to the measured surface is e = (target_depth - t) * c, with c = max(cosine, 0.15) if
-    `cosine_targets` is set and the ray's cosine is known, else 1. A sample is near if |e| < truncation and it is valid,
-    free if e >= truncation, valid or not: outside the volume the field is 1, which adds nothing to the mean.
+    `cosine_targets` is set and the cosine of the ray is known, else c = 1. A sample is near if |e| < truncation and it
+    is valid. It is free if e >= truncation, valid or not: outside the volume the field is 1, so the sample adds 0.
 
-    - rgb: squared error of the rendered color, mean over the channels; rays that were rendered only.
-    - depth: squared error of the rendered depth, m^2; rays that were rendered only.
-    - free space: mean over a ray's free samples of (sdf - 1)^2.
-    - sdf: mean over a ray's near samples of (sdf * truncation - e)^2, m^2.
+    - rgb: squared error of the rendered color, mean over the channels; only for rendered rays.
+    - depth: squared error of the rendered depth, m^2; only for rendered rays.
+    - free space: mean over the free samples of a ray of (sdf - 1)^2.
+    - sdf: mean over the near samples of a ray of (sdf * truncation - e)^2, m^2.
 
-    A ray adds 0 to a term for which it has no sample, and to all of them if its target depth is not positive and
-    finite. A sample whose t is not finite is left out, and a cosine that is NaN is unknown; any other NaN of a ray that
-    takes part makes the terms it enters NaN.
+    A ray adds 0 to a term for which it has no sample, and to all terms if its target depth is not positive and finite.
+    A sample with a t that is not finite is ignored, and a cosine that is NaN is unknown. Any other NaN of a ray with
+    positive and finite target depth propagates to the terms that use it.
 
     Args:
         color: [R, 3] float32 or float64, rendered.
@@ -94,13 +94,14 @@ def rendering_losses(
         rendered: bool [R], whether any sample of the ray had a weight.
         target_color: [R, 3] of the same dtype, measured.
         target_depth: [R] of the same dtype, measured, meters.
-        cosine: [R] of the same dtype, surface normal times ray direction, the direction scaled to depth 1, so it may
-            exceed 1 towards the image's corners; 0 where the normal is unknown.
+        cosine: [R] of the same dtype, dot product of surface normal and ray direction, with the direction scaled to
+            depth 1, so it may exceed 1 near the image corners; 0 where the normal is unknown.
         truncation: truncation distance, meters.
-        cosine_targets: whether distances are measured to the surface instead of along the ray.
+        cosine_targets: whether distances are perpendicular to the surface instead of along the ray.
 
     Returns:
-        [4]: rgb, depth, free space, sdf. Differentiable by `color`, `depth`, `sdf` and `t`. R = 0 gives zeros.
+        [4]: rgb, depth, free space, sdf. Differentiable with respect to `color`, `depth`, `sdf` and `t`. R = 0
+        gives zeros.
 
     Raises:
         TypeError: a dtype is wrong.

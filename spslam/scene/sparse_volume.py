@@ -91,7 +91,7 @@ class SparseVolume:
 
     @property
     def corner_ids(self) -> torch.Tensor:
-        """int32 [V, 8], ids of the corners of the cell whose lowest vertex is i; all -1 if one is missing."""
+        """int32 [V, 8], ids of the corners of the cell whose lowest vertex is voxel i; all -1 if one is missing."""
         return self.cells.corner_ids
 
     @property

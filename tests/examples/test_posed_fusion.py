@@ -1,4 +1,4 @@
-"""The example reconstructs the generated room from its true poses."""
+"""The example reconstructs the generated room from its ground-truth poses."""
 
 import os
 import subprocess
@@ -27,7 +27,7 @@ def test_room_is_reconstructed(tmp_path):
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.startswith("10 frames, ")
     distance = np.abs(Room().signed_distance(np.asarray(trimesh.load(path, process=False).vertices)))
-    # Depth is noisy and voxels are 4 cm: what is left is the prior's exactness, and fringes at depth jumps.
+    # The tolerance covers noisy depth, the accuracy of the prior at 4 cm voxels, and fringes at depth discontinuities.
     assert np.median(distance) < 0.003
     assert np.mean(distance < 0.02) > 0.95
 
@@ -39,8 +39,8 @@ def test_poses_are_needed(tmp_path):
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_it_has_the_same_voxels(tmp_path):
-    """Vertices and their weights are exact on every device; the surface between them is up to rounding."""
+def test_voxels_are_the_same_on_a_gpu(tmp_path):
+    """Vertices and their weights are equal on every device; the surface differs by rounding."""
     finished = [run(tmp_path / f"{name}.ply", "--frames", 3, "--device", name) for name in ("cpu", "cuda")]
     assert [one.returncode for one in finished] == [0, 0], [one.stderr for one in finished]
     lines = [one.stdout.split(", ") for one in finished]

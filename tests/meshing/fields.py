@@ -36,7 +36,7 @@ def cells_within(half_extent, device="cpu"):
 
 
 def cells_near(field, half_extents_m, cell_size_m, reach_m, device="cpu"):
-    """The cells of a box whose center lies within `reach_m` of the surface."""
+    """The cells of a box whose center is within `reach_m` of the surface."""
     axes = [torch.arange(-int(h / cell_size_m) - 3, int(h / cell_size_m) + 3) for h in half_extents_m]
     coords = torch.cartesian_prod(*axes).int().to(device)
     distance, _ = field((coords + 0.5) * cell_size_m)
