@@ -15,7 +15,7 @@ void fuse_prior_(Tensor embeddings, Tensor weights, Tensor voxel_ids, Tensor fea
   const std::int64_t count = voxel_ids.numel();
   SPS_CHECK(features.numel() == 8 * count && feature_weights.numel() == count && embeddings.dim() == 2 &&
                 embeddings.size(1) == 8 && weights.numel() == embeddings.size(0),
-            "fuse_prior_: embeddings and features must have 8 channels and a row a weight");
+            "fuse_prior_: embeddings and features must have 8 channels and one row per weight");
   DeviceScope scope(embeddings);
   fuse_prior(scope.context, data<std::int32_t>(voxel_ids), data<float>(features), data<float>(feature_weights), count,
              embeddings.size(0), static_cast<float>(max_weight), mutable_data<float>(embeddings),
