@@ -1,4 +1,4 @@
-// What every binding shares: tensor access, last-line checks, device context. LibTorch's stable ABI only; each binding
+// What every binding shares: tensor access, last checks, device context. LibTorch's stable ABI only; each binding
 // file is compiled once for the CPU library and, with SPS_CUDA, once for the CUDA library.
 #pragma once
 
@@ -40,8 +40,8 @@ template <class... Words>
   throw std::runtime_error(text.str());
 }
 
-// Unless `condition` holds, a RuntimeError of these words alone: torch's own check begins with a file of the machine
-// that built it.
+// Unless `condition` holds, throws a RuntimeError with this message alone: torch's own check begins with a file name of
+// the machine that built it.
 #define SPS_CHECK(condition, ...)                          \
   do {                                                     \
     if (!(condition)) spslam::bindings::fail(__VA_ARGS__); \

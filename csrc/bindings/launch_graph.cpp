@@ -14,14 +14,14 @@ struct FreeLaunchGraph {
   void operator()(LaunchGraph* graph) const { free_launch_graph(graph); }
 };
 
-// Numbers are not used twice, so that a stale one is found out.
+// Numbers are not reused, so that a stale one is detected.
 struct Registry {
   std::mutex mutex;
   std::map<std::int64_t, std::unique_ptr<LaunchGraph, FreeLaunchGraph>> graphs;
   std::int64_t last = 0;
 };
 
-// Never destroyed: at exit the driver may be gone before.
+// Never destroyed: at exit the driver may already be unloaded.
 Registry& registry() {
   static Registry* const instance = new Registry;
   return *instance;

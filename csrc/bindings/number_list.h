@@ -1,4 +1,4 @@
-// Numbers that an op takes as one list, so that a further one is an entry of an enum and no further parameter.
+// Numbers that an op takes as one list: another one is another entry of an enum, not another parameter.
 #pragma once
 
 #include <type_traits>

@@ -62,7 +62,7 @@ class Moments {
   std::size_t next_ = 0;
 };
 
-// The frames on the kernel's device. A copy of so few numbers is taken by the driver at once: nothing waits.
+// The frames on the kernel's device. The driver stages so small a copy at once: nothing waits.
 Tensor frames_on_device(const Tensor& frames, const Tensor& like, std::int64_t rows, const Context& context) {
   Tensor list = contiguous(frames);
 #ifdef SPS_CUDA

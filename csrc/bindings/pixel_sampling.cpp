@@ -54,7 +54,7 @@ std::int64_t words_of_halves(std::int64_t count) {
   return (count + 1) / 2;
 }
 
-// Frames arrive on the CPU, so this op is there alone. One buffer for all: records [count, 3], normals [count, 3] as
+// For the CPU alone, where frames arrive. One buffer for all: records [count, 3], normals [count, 3] as
 // their bits, the depth thumbnail's halves in pairs, the depth image's 16-bit numbers in pairs.
 std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, std::vector<double> scalar_list,
                                                      std::vector<std::int64_t> integer_list) {

@@ -1,4 +1,4 @@
-// Sums of floating-point terms as 64-bit integers on CUDA: integers add in any order to the same bits.
+// Sums of floating-point terms as 64-bit integers on CUDA: integer addition gives the same bits in any order.
 #pragma once
 
 #include <cstdint>

@@ -1,4 +1,4 @@
-// Conversion to IEEE half precision, bit by bit: a type for it is not yet everywhere.
+// Conversion to IEEE half precision on its bits: not every compiler has a type for it.
 #pragma once
 
 #include <cstdint>

@@ -1,4 +1,4 @@
-// Exponentials that a compiler vectorizes on the host: the C library's are one call an element.
+// Exponentials that a compiler vectorizes on the host: the C library's are one call per element.
 #pragma once
 
 #include <cmath>

@@ -9,7 +9,7 @@ namespace spslam {
 namespace {
 
 constexpr std::int64_t kFrameGrain = 8;
-// Candidates looked at before it is asked whether there are enough: of thousands, most need not be.
+// Candidates tested at a time, until there are enough: of thousands, most need not be.
 constexpr std::int64_t kCandidatesAtOnce = 128;
 
 std::int64_t count_seen(const FrameThumbnails& frames, std::int64_t frame, const Vec3<double>* points,

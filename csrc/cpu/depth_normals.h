@@ -15,7 +15,7 @@ class PaddedDepth {
   PaddedDepth(std::int32_t width, std::int32_t height)
       : width_(width), height_(height), stride_(width + 2 * kSmoothingRadius) {}
 
-  // Memory for the whole, with the border set; `buffer` must outlive this. Fill the rows before the first look.
+  // Memory for the whole, with the border set; `buffer` must outlive this. Fill the rows before the first use.
   void allocate(ScratchBuffer<float>& buffer) {
     const std::int64_t rows = height_ + 2 * kSmoothingRadius;
     float* begin = buffer.reserve(rows * stride_);
@@ -45,7 +45,7 @@ inline void smoothed_depths(const PaddedDepth& depth, const std::int32_t (&place
                             float (&smoothed)[kPixelBatch]) {
   alignas(64) float center[kPixelBatch], weights[kPixelBatch] = {}, differences[kPixelBatch] = {};
   SPS_SIMD for (int i = 0; i < kPixelBatch; ++i) center[i] = depth.origin()[places[i]];
-  // Looked up before: a choice between constants within the loop keeps a compiler from unrolling it.
+  // Computed before the loop: a choice between constants in it prevents unrolling.
   const float spatial[kSmoothingRadius + 1] = {smoothing_weight(0), smoothing_weight(1), smoothing_weight(2)};
   for (int dv = -kSmoothingRadius; dv <= kSmoothingRadius; ++dv) {
     for (int du = -kSmoothingRadius; du <= kSmoothingRadius; ++du) {

@@ -22,7 +22,7 @@ std::vector<float> first_normals(const float* normals, std::int64_t n, std::int6
   return kept;
 }
 
-// Encoded vertices, those of too little weight taken out.
+// Encoded vertices without those of too little weight.
 struct EncodedVertices {
   EncodedVertices(const float* points, const float* normals, std::int64_t n, const float* params,
                   const FusionSettings& settings) {

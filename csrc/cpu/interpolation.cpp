@@ -76,7 +76,7 @@ void gather_gradient_points(const Field& field, const T* grad, const T* table, s
   }
 }
 
-// Channels a thread takes so that `slices` share a row: whole cache lines, two threads must not write to one.
+// Channels a thread takes so that `slices` share a row: whole cache lines, as two threads must not write to one.
 template <class T>
 std::int64_t slice_width(std::int64_t channels, std::int64_t slices) {
   constexpr std::int64_t kLine = 64 / static_cast<std::int64_t>(sizeof(T));
@@ -133,8 +133,8 @@ struct InterpolationLoops<Cpu> {
   }
 
   // A row is summed in the order of the points, by one thread: threads share the work by parts of the table and by
-  // cache lines of its rows. To deal out the rows themselves was measured and is slower, with any number of threads:
-  // neighboring points share rows, which a walk in order finds in the cache.
+  // cache lines of its rows. Sharing out the rows themselves was measured and is slower with any number of threads:
+  // neighboring points share rows, which are still in the cache when points are taken in order.
   template <class Field, class T>
   static void scatter(Cpu device, const Field& field, const T* grad, std::int64_t num_rows, std::int64_t channels,
                       std::int64_t num_points, T* out, std::int64_t*) {

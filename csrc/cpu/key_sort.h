@@ -8,12 +8,12 @@
 
 namespace spslam {
 
-// Ascending; keys are at least 0. By digits from the lowest one on, seven times as fast as comparisons on many keys;
-// digits that all keys share are passed over.
+// Ascending; keys are at least 0. Radix sort from the lowest digit on, seven times as fast as comparisons for many
+// keys; digits that all keys share are skipped.
 inline void sort_keys(std::int64_t* keys, std::int64_t n) {
   constexpr int kDigitBits = 11, kDigits = (63 + kDigitBits - 1) / kDigitBits;
   constexpr std::int64_t kBuckets = std::int64_t{1} << kDigitBits;
-  constexpr std::int64_t kFewKeys = 4096;  // the counts alone are three times as many numbers
+  constexpr std::int64_t kFewKeys = 4096;  // below, the counters alone are three times as many
   if (n <= kFewKeys) return std::sort(keys, keys + n);
 
   const auto digit = [](std::int64_t key, int d) { return key >> (d * kDigitBits) & (kBuckets - 1); };

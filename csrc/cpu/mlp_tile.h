@@ -13,12 +13,12 @@
 
 namespace spslam {
 
-// Rows that the inner kernel works on at once; tiles hold a multiple of it. With two vectors a row there are as many
-// sums in flight as the multiply-add units need, and they fit the registers.
+// Rows that the inner kernel works on at once; tiles hold a multiple of it. With two vectors per row there are enough
+// sums in flight for the multiply-add units, and they fit the registers.
 constexpr int kRowBlock = kVectorRegisters == 32 ? 8 : 4;
 constexpr int kColumnVectors = 2;
 
-// Samples of a tile whose forward and backward values stay in the first-level cache.
+// Samples of a tile whose forward and backward values stay in the L1 cache.
 constexpr std::int64_t kTileRows = 64;
 
 namespace detail {
@@ -126,7 +126,7 @@ inline void add_layer_weight_gradient(const T* g, std::int64_t g_stride, std::in
   });
 }
 
-// sums[c] += sum_r factor(r) * x[r][c]. Four sums a column, so that additions do not wait for each other.
+// sums[c] += sum_r factor(r) * x[r][c]. Four sums per column, so that additions do not wait for each other.
 template <class T, class Factor>
 inline void add_row_sums(const T* x, std::int64_t columns, std::int64_t rows, const Factor& factor, T* sums) {
   for (std::int64_t column = 0; column < columns; column += kLanes<T>) {

@@ -18,7 +18,7 @@ void update_span(const AdamCoefficients<T>& c, std::int64_t count, T* __restrict
 }
 
 // Rows of [begin, end) with the wanted stamp, into `found`. Most blocks hold none and cost one vectorized comparison;
-// the others are compacted without branches, since which rows are touched is as good as random.
+// the others are compacted without branches, since the branch would be unpredictable.
 std::int64_t find_stamped(const std::int32_t* stamps, std::int32_t stamp, std::int64_t begin, std::int64_t end,
                           std::int64_t* found) {
   std::int64_t count = 0;

@@ -9,14 +9,14 @@
 namespace spslam {
 namespace {
 
-// Kept by each thread that samples frames: fresh pages for every frame cost as much as the work in them.
+// Kept by each thread that samples frames: allocating pages for every frame takes as long as the sampling.
 struct FrameScratch {
   ScratchBuffer<float> depth;
   ScratchBuffer<std::int32_t> valid;
 };
 thread_local FrameScratch scratch;
 
-// Copies usable depth into the padded image, the rest as 0, and lists the places of usable pixels.
+// Copies usable depth into the padded image, the rest as 0, and lists the indices of usable pixels.
 std::int64_t list_valid(const RgbdImage& image, const PixelSampling& sampling, PaddedDepth& depth,
                         std::int32_t* valid) {
   const float low = sampling.min_depth, high = sampling.max_depth;
@@ -89,7 +89,7 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
                            const SampledPixels& out) {
   PaddedDepth depth(image.width, image.height);
   depth.allocate(scratch.depth);
-  // One place more than there are pixels: the list is written before it is known whether the pixel counts.
+  // One more than there are pixels: an entry is written before its pixel is known to be valid.
   std::int32_t* valid = scratch.valid.reserve(static_cast<std::int64_t>(image.width) * image.height + 1);
   const std::int64_t num_valid = list_valid(image, sampling, depth, valid);
   write_thumbnail(image, sampling.thumbnail_step, depth, out.depth_thumbnail);

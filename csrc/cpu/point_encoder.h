@@ -70,8 +70,8 @@ struct CellPoint {
   float x[4], y[4], z[4];
 };
 
-// Encodes points one after the other into `entries` (a cell's vertex each): weighted sums of features, and of weights
-// in units of 1 / weight_scale.
+// Encodes points one after the other into `entries` (one per vertex of the cell): weighted sums of features, and of
+// weights in units of 1 / weight_scale.
 class PointEncoder {
  public:
   PointEncoder(const PackedEncoder& net, std::int64_t max_entries, float weight_scale)
@@ -128,10 +128,10 @@ class PointEncoder {
 
  private:
   using V = Vector<float>;
-  static constexpr std::int64_t kRows = 32;  // two layers of a tile and the second matrix fit the first-level cache
+  static constexpr std::int64_t kRows = 32;  // two layers of a tile and the second matrix fit the L1 cache
 
-  // parts_[axis][vertex]: what the position along an axis adds to the first layer; the first also holds the bias and
-  // what the normal adds.
+  // parts_[axis][vertex]: the contribution of the position along an axis to the first layer; axis 0 also holds those of
+  // the bias and the normal.
   void first_layer(const Neighborhood& neighborhood, const CellPoint& point, const float* normal) {
     const float* positions[3] = {point.x, point.y, point.z};
     for (int c = 0; c < kEncoderHidden; c += kLanes<float>) {

@@ -9,7 +9,7 @@
 namespace spslam {
 namespace {
 
-constexpr std::int64_t kCellsAtOnce = 8192;  // bounds the memory of a long list of points
+constexpr std::int64_t kCellsAtOnce = 8192;  // limits the memory for a long list of points
 constexpr std::int64_t kCellGrain = 8;
 constexpr int kMaxCorners = 64;
 
@@ -83,7 +83,7 @@ class VertexSums {
   std::vector<float> sums_;
 };
 
-// The points of valid cells, those of a cell side by side, and where each cell begins.
+// The points of valid cells, grouped by cell, and where each cell begins.
 struct CellList {
   CellList(const float* points, const float* normals, std::int64_t n, float inverse_voxel_size) {
     members.resize(static_cast<std::size_t>(n));
@@ -143,7 +143,7 @@ class Encoding {
     }
   }
 
-  // Which vertices each cell reaches, and where their sums stand.
+  // Which vertices each cell reaches, and the indices of their sums.
   void find_entries(std::int64_t first, std::int64_t count) {
     corners_.assign(static_cast<std::size_t>(count), 0);
     entry_begins_.assign(static_cast<std::size_t>(count) + 1, 0);

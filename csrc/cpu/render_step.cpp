@@ -1,4 +1,4 @@
-// render_step on the CPU: chunks of rays go forward and back while their samples are in the cache.
+// render_step on the CPU: the forward and backward passes of a chunk of rays while its samples are in the cache.
 #include "spslam/render_step.h"
 
 #include "core/parallel.h"
@@ -73,7 +73,7 @@ class Step {
   std::int64_t partial_size() const { return geometry_.layout.size + color_.layout.size; }
   std::int64_t num_groups() const { return chunk_count(chunks_, chunks_per_group_); }
 
-  // Memory of the calling thread, kept between calls: fresh pages would cost more than the step's own work.
+  // Memory of the calling thread, kept between calls: allocating pages would take longer than the step itself.
   void reserve() {
     static thread_local ScratchBuffer<float> partials, embedding, texel;
     static thread_local ScratchBuffer<std::int64_t> num_embedding_runs, num_texel_runs;

@@ -1,7 +1,7 @@
 // First part of render_step on the CPU: rays, samples along them, and which samples lie in complete cells.
 //
-// The tables are far larger than the caches, so every look-up is split in passes over the chunk, and each pass fetches
-// what the next one reads.
+// The tables are far larger than the caches, so every look-up is split into passes over the chunk, and each pass
+// prefetches what the next one reads.
 #pragma once
 
 #include "cpu/render_step_chunk.h"

@@ -1,4 +1,4 @@
-// What render_step knows of a chunk of rays while it works on it: the unit of work of one thread.
+// The working memory of render_step for a chunk of rays, the unit of work of one thread.
 #pragma once
 
 #include <cstdint>
@@ -32,7 +32,7 @@ struct Ray {
   RayLosses<float> losses;
 };
 
-// What this call has to compute beyond the losses.
+// What a call has to compute besides the losses.
 struct Plan {
   bool color;  // the color term has a weight
   bool pose;   // gradients to sample positions
@@ -55,8 +55,8 @@ struct PlaneFraction {
   float u, v;
 };
 
-// Parts of the embeddings that are filled independently: blocks of 64 rows (ids are neighbors where vertices are),
-// dealt out in turn.
+// Parts of the embeddings that are filled independently: blocks of 64 rows (neighboring vertices have neighboring ids),
+// assigned in turn.
 constexpr int kEmbeddingParts = 4, kEmbeddingBlockShift = 6;
 
 // Consecutive samples in one cell: those from the end of the run before to `end`.
@@ -134,7 +134,7 @@ class Chunk {
   float *rgb, *grad_rgb;  // [3, rgb_stride]
   std::int64_t rgb_stride;
 
-  // One tile on its way back.
+  // Of one tile in the backward pass.
   float *g1, *g2, *grad_x;
 
  private:
@@ -146,7 +146,8 @@ class Chunk {
   ScratchBuffer<Vec3<float>> local_;
 };
 
-// Gradients of samples on their way to the tables: chunk c writes rows and runs from c * kChunkRays * num_samples on.
+// Gradients of samples before they are added to the tables: chunk c writes rows and runs from c * kChunkRays *
+// num_samples on.
 struct TableGradients {
   std::int64_t capacity;  // rows a chunk may write
   std::int64_t rows;      // of all chunks

@@ -1,4 +1,5 @@
-// Color in render_step on the CPU: texels of three planes gathered, decoded, and the way back to texels and positions.
+// Color in render_step on the CPU: texels of three planes gathered and decoded, and the gradients of texels and
+// positions.
 #pragma once
 
 #include <initializer_list>
@@ -69,7 +70,7 @@ inline void interpolate_texels(const PlaneTexels (&planes)[3], const PlaneSample
   }
 }
 
-// Fetches the cells that differ from those of the sample before.
+// Prefetches the cells that differ from those of the sample before.
 inline void prefetch_texels(const PlaneTexels (&planes)[3], const PlaneSample& sample, const PlaneSample& before) {
   for (int p = 0; p < 3; ++p) {
     if (sample.rows[p] == before.rows[p]) continue;
@@ -80,7 +81,7 @@ inline void prefetch_texels(const PlaneTexels (&planes)[3], const PlaneSample& s
   }
 }
 
-// Tells the tables which cells the rendered samples lie in, one after another.
+// Writes the runs of rendered samples that lie in the same cell.
 class TexelRunWriter {
  public:
   TexelRunWriter(std::int64_t first_row, const TableGradients& tables) : tables_(tables), first_row_(first_row) {}
@@ -166,8 +167,8 @@ inline void add_color_gradients(const float* grad_x, std::int64_t first, std::in
   }
 }
 
-// From grad_rgb back to parameters (added to `partial`, where given), to texels (rows written to `tables`, where given)
-// and to the rays.
+// Backward pass from grad_rgb to parameters (added to `partial`, where given), texels (rows written to `tables`, where
+// given) and rays.
 inline void color_backward(const PackedMlp<float>& net, const Plan& plan, std::int64_t first_row,
                            const TableGradients& tables, float* partial, Chunk& chunk) {
   const MlpLayout<float>& l = net.layout;

@@ -1,4 +1,4 @@
-// What the two decoders of a chunk share on the way back.
+// The backward pass of a decoder over the samples of a chunk.
 #pragma once
 
 #include "cpu/render_step_chunk.h"
@@ -13,9 +13,8 @@ struct DecoderRows {
   std::int64_t out_stride;
 };
 
-// From the gradients of the outputs back to the parameters (added to `partial`, unless null), to the rows of the table
-// that the input comes from (written to `table`, unless null) and, with add_points(grad_x, first, rows), where
-// `points`, to the samples' points.
+// From the gradients of the outputs to those of the parameters (added to `partial`, unless null), of the table's rows
+// (written to `table`, unless null) and, if `points`, of the samples' points, by add_points(grad_x, first, rows).
 template <class AddPoints>
 inline void decoder_backward(const PackedMlp<float>& net, const DecoderRows& decoder, float* partial, float* table,
                              bool points, Chunk& chunk, const AddPoints& add_points) {

@@ -1,4 +1,4 @@
-// Geometry in render_step on the CPU: embeddings gathered, decoded, and the way back to embeddings and positions.
+// Geometry in render_step on the CPU: embeddings gathered and decoded, and the gradients of embeddings and positions.
 #pragma once
 
 #include "cpu/render_step_decoder.h"
@@ -99,8 +99,8 @@ inline void add_geometry_gradients(const SceneView& scene, const float* grad_x, 
   }
 }
 
-// From grad_sdf back to parameters (added to `partial`, where given), to embeddings (rows written to `tables`, where
-// given) and to the rays.
+// Backward pass from grad_sdf to parameters (added to `partial`, where given), embeddings (rows written to `tables`,
+// where given) and rays.
 inline void geometry_backward(const SceneView& scene, const PackedMlp<float>& net, const Plan& plan,
                               std::int64_t first_row, const TableGradients& tables, float* partial, Chunk& chunk) {
   const MlpLayout<float>& l = net.layout;
@@ -118,7 +118,7 @@ inline void geometry_backward(const SceneView& scene, const PackedMlp<float>& ne
                    });
 }
 
-// Tells the tables which cells the samples inside lie in; returns the number of runs.
+// Writes the runs of samples that lie in the same cell; returns how many.
 inline std::int64_t store_embedding_runs(const SceneView& scene, std::int64_t first_row, const TableGradients& tables,
                                          const Chunk& chunk) {
   EmbeddingRun* runs = tables.embedding_runs + first_row;

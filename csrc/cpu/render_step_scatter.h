@@ -1,8 +1,8 @@
 // Last part of render_step on the CPU: gradient rows of samples added to the rows of the tables.
 //
-// Tables are cut into parts, each of which one thread fills alone by walking through all samples in order: sums have
-// one order, whatever the number of threads. Neighbors along a ray mostly share a cell, so sums are kept in registers
-// over a run of samples in one cell; the rows of runs to come are fetched ahead.
+// Tables are divided into parts, each filled by one thread that goes through all samples in order: sums have one
+// order, whatever the number of threads. Neighbors along a ray mostly share a cell, so sums are kept in registers
+// over a run of samples in one cell; the rows of later runs are prefetched.
 #pragma once
 
 #include "cpu/render_step_color.h"
@@ -10,7 +10,7 @@
 
 namespace spslam::render {
 
-// Parts of a plane: halves of its channels, a cache line each.
+// Parts of a plane: halves of its channels, one cache line each.
 constexpr std::int64_t kTexelParts = 2, kTexelPartChannels = kPlaneChannels / kTexelParts;
 constexpr std::int64_t kScatterParts = kEmbeddingParts + 3 * kTexelParts;
 constexpr std::int64_t kRunsAhead = 8;

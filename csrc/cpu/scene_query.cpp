@@ -14,7 +14,7 @@ Vec3<float> load_point(const float* points, std::int64_t i) {
   return {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
 }
 
-// Decodes what is in the tile into the rows it came from, and empties it.
+// Decodes the tile's points into their rows of the output, and empties the tile.
 void flush(const SceneView& scene, GeometryTile& tile, const std::int64_t* rows, float* sdf, float* gradient) {
   float values[kTileRows];
   Vec3<float> slopes[kTileRows];

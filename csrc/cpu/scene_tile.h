@@ -1,4 +1,4 @@
-// A tile of points on its way through the scene: gather features, decode, and back to positions.
+// The scene at a tile of points: features gathered and decoded, and gradients by position.
 #pragma once
 
 #include <cstdint>

@@ -71,7 +71,7 @@ constexpr std::int64_t round_up(std::int64_t n, std::int64_t multiple) {
   return (n + multiple - 1) / multiple * multiple;
 }
 
-// Memory that grows and is kept, for scratch that a thread needs again and again. Its content is lost when it grows.
+// Memory that only grows, for scratch that a thread reuses. Its content is lost when it grows.
 template <class T>
 class ScratchBuffer {
  public:
@@ -80,7 +80,7 @@ class ScratchBuffer {
   ScratchBuffer& operator=(const ScratchBuffer&) = delete;
   ~ScratchBuffer() { std::free(data_); }
 
-  // Never null, so that filling nothing is defined too.
+  // Never null, so that filling 0 elements is defined too.
   T* reserve(std::int64_t count) {
     if (count < 1) count = 1;
     if (count > capacity_) {

@@ -9,7 +9,7 @@ namespace spslam {
 namespace {
 
 constexpr std::int64_t kRayGrain = 32;
-// Rays are padded to full vectors: a tail of single samples would take longer than all the others.
+// Rays are padded to full vectors: a scalar remainder would take longer than all the rest.
 constexpr std::int64_t kLanes = 16;
 
 std::int64_t padded(std::int64_t count) {

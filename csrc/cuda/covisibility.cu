@@ -1,4 +1,4 @@
-// A block a frame counts the points that it sees; one block then takes the frames, by counting those before each.
+// One block per frame counts the points that it sees; one block then selects the frames, by ranks among the candidates.
 #include "core/for_each.h"
 #include "kernels/covisibility.h"
 

@@ -1,5 +1,5 @@
-// One kernel for all layers, a tile of rows a block, where the network fits into a block's shared memory; else one
-// layer after the other.
+// One kernel for all layers, one tile of rows per block, where the network fits a block's shared memory; else one layer
+// after the other.
 #include "core/cuda_check.cuh"
 #include "cuda/fused/column_sums.cuh"
 #include "cuda/mlp_layers.cuh"
@@ -11,7 +11,7 @@ namespace {
 using namespace mlp_tile;
 
 constexpr int kMaxThreads = kMaxWarps * kWarp;
-// Some blocks on each processor of an H100; fewer where each leaves sums to be added up.
+// Some blocks on each multiprocessor of an H100; fewer where each leaves partial sums.
 constexpr std::int64_t kMaxBlocks = 1056, kMaxGradientBlocks = 396;
 
 template <class T>
@@ -73,7 +73,7 @@ __global__ void __launch_bounds__(fused::kSumThreads)
   if (threadIdx.x < kWarp && column < num_params) grad_params[column] = sum;
 }
 
-// Whether a tile, its network and, if asked for, their gradients find room, whatever the type of their elements.
+// Whether a tile, its network and, if asked for, their gradients fit shared memory, for float and double.
 bool fits(const MlpShape& shape, bool gradients) {
   constexpr std::int64_t kMaxWidth = 1024;
   if (shape.input > kMaxWidth || shape.hidden > kMaxWidth || shape.output > kMaxWidth) return false;

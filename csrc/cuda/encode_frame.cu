@@ -82,8 +82,8 @@ __device__ int count_smaller(const VertexSums& sums, std::uint32_t count, unsign
   return smaller;
 }
 
-// Fuses what is there; enters what is not, a warp each. The number of a new vertex is that of smaller keys among the
-// new: counting them costs less than a sort, as a frame adds some hundreds to what earlier ones saw.
+// Fuses known vertices and inserts new ones, one warp each. The number of a new vertex is that of smaller keys among
+// the new: counting them is faster than a sort, as a frame adds some hundreds.
 __global__ void __launch_bounds__(kThreads) fuse_vertices(FuseFrame frame) {
   if (!frame.fits()) return;
   const VertexSums& sums = frame.sums;
@@ -104,7 +104,7 @@ __global__ void __launch_bounds__(kThreads) fuse_vertices(FuseFrame frame) {
   }
 }
 
-// update_corner_row by eight lanes, a corner each: one after the other, the searches would take most of the time.
+// update_corner_row by eight lanes, one per corner: in sequence the searches would take most of the time.
 __device__ void update_corner_row_together(const FuseFrame& frame, std::int32_t id, int k) {
   const int corner = threadIdx.x % kCellCorners, first_lane = threadIdx.x % kWarpSize - corner;
   const std::uint32_t together = 0xffu << first_lane;

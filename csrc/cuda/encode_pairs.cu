@@ -21,7 +21,7 @@ constexpr int encoder_warps() {
   return kPrecision == MlpPrecision::kTf32 ? 16 : 4;
 }
 
-// What a lane brings to the next 32 pairs of its warp.
+// A lane's part of the next 32 pairs of its warp.
 struct LoadedPair {
   std::int32_t block = -1;  // of the vertex; -1 past the end of the list
   std::uint32_t place = 0;
@@ -45,7 +45,7 @@ __device__ __forceinline__ LoadedPair load_pair(const VertexSums& sums, std::int
   return loaded;
 }
 
-// Encodes the pairs listed, 32 a warp at a time, and adds them to the sums of their vertices.
+// Encodes the listed pairs, 32 per warp at a time, and adds them to the sums of their vertices.
 template <MlpPrecision kPrecision>
 __global__ void __launch_bounds__(encoder_warps<kPrecision>() * kWarpSize)
     encode_listed(VertexSums sums, const float* points, const float* normals, const float* params,
@@ -74,7 +74,7 @@ __global__ void __launch_bounds__(encoder_warps<kPrecision>() * kWarpSize)
     *reinterpret_cast<float4*>(inputs[lane]) =
         make_float4(input.position[0], input.position[1], input.position[2], pair.normal[0]);
     *reinterpret_cast<float4*>(inputs[lane] + 4) = make_float4(pair.normal[1], pair.normal[2], 0.0f, 0.0f);
-    // Ahead of the products, so that the memory's latency passes behind them.
+    // Loaded before the products, which hide the latency.
     next = load_pair(sums, index + stride, count, points, normals, 3 * bits);
     if (pair.block >= 0) {
       atomicAdd(sums.weights + vertex, static_cast<unsigned long long>(weight_units(input.weight, sums.weight_scale)));

@@ -1,6 +1,5 @@
 // Tracking is one kernel for all iterations: each block sums its pixels' shares of the normal equations, waits for the
-// others at a barrier of the whole grid, and then takes the step by itself, so that one barrier per iteration is
-// enough.
+// others at a grid-wide barrier, and then computes the step redundantly, so that one barrier per iteration is enough.
 #include <cooperative_groups.h>
 
 #include <algorithm>
@@ -18,7 +17,7 @@ namespace {
 constexpr int kWarps = 4;
 constexpr int kThreads = kWarps * kWarp;
 constexpr int kBlockPixels = kWarps * fused::kTileRows;
-// A barrier of the whole grid needs all blocks resident at once: few enough for the smallest device.
+// A grid-wide barrier needs all blocks to be resident: few enough for the smallest device.
 constexpr std::int64_t kMaxTrackingBlocks = 16;
 constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kKeyframeTerms, one per lane
 static_assert(kTrackingTerms <= kPaddedTerms && kKeyframeTerms <= kPaddedTerms, "one lane per term");
@@ -33,7 +32,7 @@ std::int64_t tracking_block_count(std::int64_t pixels) {
   return std::min(block_count(pixels), kMaxTrackingBlocks);
 }
 
-// Which record pixel i of frame f is: drawn by Philox while tracking, the i-th of the frame otherwise.
+// The record of pixel i of frame f: drawn by Philox while tracking, the i-th of the frame otherwise.
 struct PixelSource {
   const std::int32_t* pixels;
   std::int64_t num_records, pixels_per_frame;
@@ -64,7 +63,8 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   }
   Vec3<float> gradient;
   const float sdf = geometry_tile(scene, network, point.world, cell.local, voxel, lane, gradient);
-  // Two lanes bring the same pixel; one adds it, and they share the depth keyframes.
+  // Two lanes hold the same pixel: one adds its residuals against the map and the reference, and they share the depth
+  // keyframes.
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
   const float certainty = depth_certainty(pixel.depth, options.noise_crossover_depth);
   if (pixel.depth > 0.0f) {
@@ -129,8 +129,8 @@ __device__ __forceinline__ double sum_block(const SceneView& scene, const Geomet
   return sum;
 }
 
-// terms[t] = sum over blocks of partials[block][t], t < kSums; each half of the block a strided share, the shares added
-// in order.
+// terms[t] = sum over blocks of partials[block][t], t < kSums; each half of the block sums every other block, and the
+// halves are added in order.
 __device__ void add_partials(const double* partials, std::int64_t blocks, double (&shares)[kThreads / kSums][kSums],
                              double* terms) {
   const int term = threadIdx.x % kSums, share = threadIdx.x / kSums;
@@ -153,7 +153,7 @@ __global__ void __launch_bounds__(kThreads, 1)
     track_kernel(const __grid_constant__ SceneView scene, const std::int32_t* pixels, std::int64_t num_records,
                  const __grid_constant__ GaussNewtonOptions options, double* partials, float* pose, float* stats,
                  float* hessian) {
-  // Devices without matrix units for tf32 compute in float32 all the same.
+  // Devices without tensor cores for tf32 compute in float32.
   constexpr Precision kUsed = fused::kArchitecture < fused::kTensorArchitecture ? Precision::kFp32 : kPrecision;
   __shared__ GeometryNetwork<kUsed> network;
   __shared__ float sums[kWarps][kSums];

@@ -10,8 +10,8 @@
 
 namespace spslam {
 
-// The geometry decoder in shared memory. Its inputs are ordered embedding (8), scaled position (3), one (the first
-// bias), and padded to 16.
+// The geometry decoder in shared memory. Its inputs are ordered embedding (8), scaled position (3), a constant 1 (for
+// the first bias), and padded to 16.
 template <Precision kPrecision>
 class GeometryNetwork {
  public:
@@ -36,7 +36,7 @@ class GeometryNetwork {
     if (threadIdx.x == 0) b3_ = params[kAt.b3];
   }
 
-  // sdf[r] of the lane's samples g and g + 8, all four lanes of a sample alike; keeps in `active` which units fired.
+  // sdf[r] of the lane's samples g and g + 8, the same in all four lanes of a sample; `active` says which ReLUs passed.
   __device__ void forward(const float (&x)[2][4], int lane, std::uint32_t (&active)[2], float (&sdf)[2]) const {
     float h1[4][4] = {}, h2[4][4];
     fused::layer<kPrecision>(w1_, x, h1, lane);
@@ -86,7 +86,7 @@ class GeometryNetwork {
   float b3_;
 };
 
-// The lane's own value, or that of the neighbor who brings the quad's other sample.
+// The lane's own value, or that of the neighboring lane with the quad's other sample.
 __device__ __forceinline__ float of_sample(float own, bool is_own) {
   const float other = __shfl_xor_sync(fused::kAllLanes, own, 1);
   return is_own ? own : other;
@@ -99,8 +99,8 @@ __device__ __forceinline__ Vec3<float> of_sample(const Vec3<float>& own, bool is
   return {of_sample(own.x, is_own), of_sample(own.y, is_own), of_sample(own.z, is_own)};
 }
 
-// values[r][e][k]: channel 2 q + e at corner k of sample r's cell, 0 outside. All loads are under way before the first
-// is waited for.
+// values[r][e][k]: channel 2 q + e at corner k of sample r's cell, 0 outside. All loads are issued before the first is
+// used.
 __device__ __forceinline__ void load_corner_channels(const SceneView& scene, const std::int32_t (&voxels)[2], int q,
                                                      float (&values)[2][2][kCellCorners]) {
   int4 ids[2][2];
@@ -125,13 +125,13 @@ __device__ __forceinline__ void load_corner_channels(const SceneView& scene, con
   }
 }
 
-// Which sample of a tile a lane brings: g of lanes 4 g and 4 g + 2, g + 8 of the other two.
+// The sample of a tile that a lane holds: g for lanes 4 g and 4 g + 2, g + 8 for the other two.
 __device__ __forceinline__ int lane_sample(int lane) {
   return lane / 4 + 8 * (lane % 2);
 }
 
-// SDF and gradient of the lane's own sample, at a world point in the cell of lowest vertex `voxel`; kNoVoxel stands for
-// a sample that is outside, whose result means nothing.
+// SDF and gradient of the lane's own sample, at a world point in the cell of lowest vertex `voxel`; kNoVoxel for a
+// sample outside, whose result is undefined.
 template <Precision kPrecision>
 __device__ __forceinline__ float geometry_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Vec3<float>& point, const Vec3<float>& local, std::int32_t voxel,

@@ -1,4 +1,4 @@
-// A series of kernel launches, and the CUDA graph that runs them without the host between.
+// A series of kernel launches, and the CUDA graph that runs them without the host in between.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -28,7 +28,7 @@ struct KernelLaunch {
 };
 using KernelLaunches = std::vector<KernelLaunch>;
 
-// One launch after the other, by the host.
+// Launches one after the other from the host.
 inline void run_launches(const KernelLaunches& launches, cudaStream_t stream) {
   for (const KernelLaunch& launch : launches) {
     void* arguments[] = {const_cast<unsigned char*>(launch.arguments.data())};
@@ -37,8 +37,8 @@ inline void run_launches(const KernelLaunches& launches, cudaStream_t stream) {
   }
 }
 
-// Keeps the graph of the last series. A series of the same shape only has its arguments replaced, so growing memory
-// costs no new graph.
+// Keeps the graph of the last series. For a series of the same shape only the arguments are replaced, so that memory
+// may grow without a new graph.
 class LaunchGraph {
  public:
   LaunchGraph() = default;
@@ -124,7 +124,7 @@ class LaunchGraph {
   int device_ = -1, builds_ = 0;
 };
 
-// As the graph if there is one to keep them in, else one after the other.
+// As a graph if there is one to keep it in, else one after the other.
 inline void run_launches(const KernelLaunches& launches, LaunchGraph* graph, cudaStream_t stream) {
   if (graph) {
     graph->run(launches, stream);

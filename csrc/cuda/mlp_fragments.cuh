@@ -1,4 +1,4 @@
-// Products of 16 x 8 tiles by one warp on matrix units (mma.sync), for the depth encoder; fused/fragment.cuh has whole
+// Products of 16 x 8 tiles by one warp on tensor cores (mma.sync), for the depth encoder; fused/fragment.cuh has whole
 // layers of the decoders.
 #pragma once
 
@@ -6,8 +6,8 @@
 
 namespace spslam {
 
-// kTf32 rounds the factors of a product to 10 bits of mantissa and adds in float32. Devices before sm_80 have no such
-// unit and compute in float32 all the same.
+// kTf32 rounds the factors of a product to 10 bits of mantissa and adds in float32. Devices before sm_80 have no
+// such tensor cores and compute in float32.
 enum class MlpPrecision { kFloat32, kTf32 };
 
 constexpr int kWarpSize = 32;

@@ -1,4 +1,4 @@
-// A network of any width, layer after layer through global memory, a thread a unit.
+// A network of any width, layer after layer through global memory, one thread per unit.
 #pragma once
 
 #include "core/for_each.h"
@@ -6,7 +6,7 @@
 
 namespace spslam::mlp_layers {
 
-// Samples whose parameter gradients one thread adds up, and the most partial sums a parameter has.
+// Samples whose parameter gradients one thread sums, and the most partial sums per parameter.
 constexpr std::int64_t kMinGradientChunk = 256, kMaxGradientChunks = 256;
 
 inline std::int64_t gradient_chunk(std::int64_t n) {

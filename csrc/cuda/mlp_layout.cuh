@@ -1,7 +1,6 @@
 // Where a network and a tile of its rows lie in a block's shared memory.
-//
-// Activations lie [unit][kStride], so that a lane has its rows of a unit in one vector, and the warp all of them.
-// Weights lie [output][input] as among the parameters, but padded with zeros to whole groups of units both ways.
+// Activations are [unit][kStride], so that a lane has its rows of a unit in one vector, and the warp all of them.
+// Weights are [output][input] as among the parameters, but padded with zeros to whole groups of units both ways.
 #pragma once
 
 #include <algorithm>
@@ -57,11 +56,11 @@ struct Layout {
   int bytes() const {
     return size * static_cast<int>(sizeof(T));
   }
-  // As many as the hidden layers have work for.
+  // As many warps as the hidden layers have work for.
   int warps() const { return std::min(std::max(padded(layers[0].outputs) / kGroup, kMinWarps), kMaxWarps); }
 };
 
-// No width may be so large that the layout overflows an int.
+// The layout must not overflow an int.
 template <class T>
 Layout make_layout(const MlpShape& shape, bool gradients) {
   const MlpOffsets at = shape.offsets();
@@ -74,7 +73,7 @@ Layout make_layout(const MlpShape& shape, bool gradients) {
   if (gradients) {
     places[0] = activations(input), places[1] = activations(hidden);
     places[2] = activations(hidden), places[3] = activations(output);
-  } else {  // two buffers in turns
+  } else {  // two buffers in turn
     places[0] = places[2] = activations(input > hidden ? input : hidden);
     places[1] = places[3] = activations(output > hidden ? output : hidden);
   }

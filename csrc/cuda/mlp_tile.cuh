@@ -9,13 +9,13 @@
 
 namespace spslam::mlp_tile {
 
-// Every step but the first two and the last ends with the block in step.
+// All steps but the first two and the last end with a __syncthreads().
 template <class T>
 class Tile {
  public:
   __device__ Tile(const Layout& layout, void* shared) : layout_(layout), shared_(static_cast<T*>(shared)) {}
 
-  // To be seen after the next step.
+  // Visible to the block after the next step.
   __device__ void load_network(const T* params) {
 #pragma unroll
     for (int l = 0; l < kLayers; ++l) {
@@ -31,7 +31,7 @@ class Tile {
     }
   }
 
-  // Likewise.
+  // The same.
   __device__ void clear_sums() {
     for (int i = threadIdx.x; i < layout_.num_params; i += blockDim.x) shared_[layout_.sums + i] = T(0);
   }
@@ -110,7 +110,7 @@ class Tile {
     T value;
   };
 
-  // Places what load(i) reads for i in [0, count). A thread has some reads under way before it waits for the first.
+  // Stores what load(i) reads for i in [0, count). A thread issues several reads before it uses the first.
   template <class F>
   __device__ void fill(int count, const F& load) {
     constexpr int kAtOnce = 8;
@@ -174,7 +174,7 @@ class Tile {
     }
   }
 
-  // y = b + w x, an element a thread: outputs are few, and all warps have a share so.
+  // y = b + w x, one element per thread: there are few outputs, and so all warps have a share.
   __device__ void last_layer(const Layer& layer) {
     for (int i = threadIdx.x; i < kRows<T> * layer.outputs; i += blockDim.x) {
       const int o = i / kRows<T>, row = i % kRows<T>;
@@ -217,7 +217,7 @@ class Tile {
     }
   }
 
-  // Each thread adds to a few parameters that no other has. Warps start at another place in each layer and block: few
+  // Each thread adds to a few parameters of its own. Warps start at a different place in each layer and block, as few
   // layers have work for all of them.
   __device__ void add_weight_gradients(const Layer& layer, int l) {
     const int output_blocks = (layer.outputs + kBlock - 1) / kBlock,
@@ -234,7 +234,7 @@ class Tile {
 
   // Outputs o, o + output_step, .. times inputs k, k + input_step, ..: neighboring threads read neighboring units.
   __device__ void add_block(const Layer& layer, int output, int output_step, int input, int input_step) {
-    int outputs[kBlock], inputs[kBlock];  // those beyond the last stand for it, and are left out in the end
+    int outputs[kBlock], inputs[kBlock];  // those beyond the last repeat it, and are not stored
 #pragma unroll
     for (int i = 0; i < kBlock; ++i) {
       outputs[i] = min(output + i * output_step, layer.outputs - 1);

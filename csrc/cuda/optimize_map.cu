@@ -1,5 +1,5 @@
-// A mapping call: two kernels an iteration, the whole call one graph. Where the ray kernel does not serve, the parts
-// one after the other.
+// A mapping call: two kernels per iteration, the whole call one graph. Where the ray kernel does not support it, the
+// launches of its parts one after the other.
 #include "cuda/fused/map_update.cuh"
 #include "cuda/fused/ray_step.h"
 #include "launch/optimize_map.h"
@@ -7,7 +7,7 @@
 namespace spslam {
 namespace {
 
-// Enough for all tables' rows to be looked at once, with some blocks on each processor.
+// Enough to read the stamps of all tables' rows once, with several blocks on each multiprocessor.
 constexpr int kUpdateBlocks = 1056;
 
 struct FusedMapBuffers {

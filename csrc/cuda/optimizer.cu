@@ -6,7 +6,7 @@ namespace {
 constexpr int kWarp = 32;
 constexpr int kWarps = static_cast<int>(kNormalChunk) / kWarp;
 
-// One block a chunk, one thread a residual; summed by shuffles within a warp, then over the warps in order.
+// One block per chunk, one thread per residual; summed by shuffles within a warp, then over the warps in order.
 template <class T>
 __global__ void accumulate_chunks(std::int64_t count, std::int64_t chunks, const T* residuals, const T* jacobians,
                                   const T* weights, double* partials) {

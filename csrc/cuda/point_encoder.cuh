@@ -1,8 +1,8 @@
 // The depth encoder by one warp, in registers: 32 pairs of a point and a vertex at a time, on tensor cores.
 //
 // The pairs are two tiles of 16, so that every weight read from shared memory serves two products. A tile's hidden
-// units lie over the warp as mma.sync lays its accumulators; the order of a layer's inputs is free as long as the
-// weights follow it, so they are stored such that one layer's result is the next one's input where it lies.
+// units have the layout of mma.sync's accumulators; the order of a layer's inputs is free as long as the weights follow
+// it, so weights are stored such that one layer's result is the next one's input without shuffles.
 #pragma once
 
 #include "cuda/mlp_fragments.cuh"
@@ -21,8 +21,8 @@ struct FactorTile {
   std::uint32_t low[kPrecision == MlpPrecision::kFloat32 ? 4 : 1];
 };
 
-// sum + a b on a 16 x 8 x 8 product where there are no tensor cores. A call of its own: in place a hundred times over
-// it would keep the compiler busy for many minutes.
+// sum + a b on a 16 x 8 x 8 product where there are no tensor cores. Not inlined: a hundred copies would keep the
+// compiler busy for many minutes.
 __device__ __noinline__ inline float4 multiply_tile_plainly(float4 sum, uint4 a, float2 b) {
   const int lane = threadIdx.x % kWarpSize, row = lane / 4, column = 2 * (lane % 4);
 #pragma unroll 1

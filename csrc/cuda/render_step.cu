@@ -1,4 +1,4 @@
-// The fused step where the ray kernel serves it, else the ops one after the other.
+// The fused step where the ray kernel supports it, else the ops one after the other.
 #include "core/for_each.h"
 #include "cuda/fused/block_sums.cuh"
 #include "cuda/fused/ray_step.h"

@@ -1,5 +1,5 @@
-// A tracking call: two kernels an iteration, the whole call one graph. Where the ray kernel does not serve, the parts
-// one after the other.
+// A tracking call: two kernels per iteration, the whole call one graph. Where the ray kernel does not support it, the
+// launches of its parts one after the other.
 #include "cuda/fused/block_sums.cuh"
 #include "cuda/fused/ray_step.h"
 #include "launch/track_adam.h"

@@ -18,7 +18,7 @@ constexpr int kPointsPerBlock = kWarpSize;  // whose bits are one word
 constexpr int kPointsPerWarp = kPointsPerBlock / kWarps;
 constexpr int kBlocksPerPoint = 8;  // of vertices, at most
 constexpr int kPairsPerThread = 8;
-constexpr int kMaxProbes = 1024;  // in a table at most half full, a longer search means that it is not
+constexpr int kMaxProbes = 1024;  // a longer search means that the table is more than half full
 static_assert(kPointsPerWarp * kBlocksPerPoint == kWarpSize, "a lane for each block of vertices");
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
@@ -27,7 +27,7 @@ __device__ bool is_finite(float x) {
   return fabsf(x) <= 3.40282347e38f;
 }
 
-// Empties the table, marks points that have a normal, and finds the bounds of the finite ones, a row for each block.
+// Empties the table, marks points that have a normal, and finds the bounds of the finite ones, one row per block.
 __global__ void __launch_bounds__(kThreads)
     prepare_points(VertexSums sums, const float* points, const float* normals, std::int64_t n) {
   const std::int64_t thread = blockIdx.x * static_cast<std::int64_t>(kThreads) + threadIdx.x;
@@ -155,8 +155,8 @@ __device__ std::uint32_t exclusive_sum(std::uint32_t own, std::uint32_t* shared,
   return earlier + running - own;
 }
 
-// Opens the blocks of vertices around 32 points and lists the pairs that count. Places in the list are given to whole
-// blocks of threads: one counter for all pairs is a bottleneck.
+// Opens the blocks of vertices around 32 points and lists the pairs that count. Places in the list are reserved by
+// whole blocks of threads: one counter for all pairs is a bottleneck.
 __global__ void __launch_bounds__(kThreads)
     list_pairs(VertexSums sums, const float* points, const float* normals, std::int64_t max_points, bool limited,
                EncoderSettings settings) {
@@ -167,7 +167,7 @@ __global__ void __launch_bounds__(kThreads)
   const std::uint32_t word = sums.known[blockIdx.x];
   const std::int64_t before = limited ? known_before(sums, shared) : 0;
   const float inverse_voxel_size = 1.0f / settings.voxel_size;
-  // Of the warp's four points eight lanes each: a lane asks for one block of vertices.
+  // Eight lanes for each of the warp's four points: a lane looks up one block of vertices.
   const int own_bit = warp * kPointsPerWarp + lane / kBlocksPerPoint;
   const std::int64_t own_point = static_cast<std::int64_t>(blockIdx.x) * kPointsPerBlock + own_bit;
   const bool taken =
@@ -181,7 +181,7 @@ __global__ void __launch_bounds__(kThreads)
   const VoxelCoord block{(upper & 1 ? last.x : first.x) >> kBlockSideBits,
                          (upper & 2 ? last.y : first.y) >> kBlockSideBits,
                          (upper & 4 ? last.z : first.z) >> kBlockSideBits};
-  // Where both ends of the neighborhood lie in one block, the lane of the lower end asks for it.
+  // Where both ends of the neighborhood lie in one block, the lane of the lower end looks it up.
   const bool repeated = (upper & 1 && block.x == first.x >> kBlockSideBits) ||
                         (upper & 2 && block.y == first.y >> kBlockSideBits) ||
                         (upper & 4 && block.z == first.z >> kBlockSideBits);

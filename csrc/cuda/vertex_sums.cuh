@@ -1,9 +1,8 @@
 // Encoded points summed over the voxel vertices around them: integer sums in blocks of 4 x 4 x 4 vertices, which a
 // scratch hash table finds.
-//
-// Integers add in any order to the same bits, so the points need not be sorted; and a point's 64 vertices lie in eight
-// blocks at most, so that it asks the table eight times. Pairs of a point and a vertex are listed first, the negligible
-// ones left out, and then encoded: every lane of a tensor core has work.
+// Integer sums do not depend on the order of additions, so the points need not be sorted; and a point's 64 vertices lie
+// in at most eight blocks, so it takes eight look-ups. Pairs of a point and a vertex are listed first, without the
+// negligible ones, and then encoded: every lane of a tensor core has work.
 #pragma once
 
 #include <cstddef>
@@ -28,7 +27,7 @@ constexpr int kBoundsRows = 128;
 // What a call counts, and all that the host reads back.
 struct SumCounters {
   std::uint32_t pairs, blocks, listed, found;
-  std::uint32_t overflow;        // the table was too small: nothing but this and the bounds means anything
+  std::uint32_t overflow;        // the table was too small: all but this and the bounds is undefined
   std::uint32_t poisoned;        // a feature was too large or not finite
   float bounds[kBoundsRows][6];  // of some finite points the least x, y, z, -x, -y and -z
 };
@@ -55,8 +54,8 @@ struct VertexSums {
   float feature_scale, weight_scale;
 };
 
-// Lays the arrays out from `workspace` on and says how many bytes they take. There are blocks as many as are
-// likely, sixteen times as many on each further attempt, and eight for each point at most: there can be no more.
+// Lays the arrays out from `workspace` on and says how many bytes they take. The number of blocks is an estimate,
+// sixteen times as many on each further attempt, and at most eight per point, which always suffice.
 VertexSums lay_out_sums(void* workspace, std::int64_t n, std::int64_t max_points, std::int32_t neighborhood,
                         int attempt, std::size_t* bytes);
 

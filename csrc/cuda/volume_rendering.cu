@@ -10,7 +10,7 @@ __device__ RaySamples<T, bool> ray_samples(const SampleTable<T>& samples, std::i
           static_cast<std::int32_t>(samples.num_samples)};
 }
 
-// One ray a thread. Lambdas for the device hold copies, never the references.
+// One ray per thread. Device lambdas hold copies, never references.
 
 template <class Device, class T>
 void volume_render(Device device, const SampleTable<T>& table, const T* color, T truncation, T* out_color, T* out_depth,

@@ -8,7 +8,8 @@ namespace spslam {
 using fused::kAllLanes;
 using fused::kWarp;
 
-// Sums 32 values a lane over the warp, in a fixed tree: lane i returns the total of values[i], which are spent.
+// Sums 32 values per lane over the warp, in a fixed tree: lane i returns the total of values[i]; `values` is
+// overwritten.
 template <int kWidth = kWarp / 2>
 __device__ __forceinline__ float transpose_sum(float (&values)[kWarp], int lane) {
   const bool upper = lane & kWidth;

@@ -1,7 +1,6 @@
 // Whether a frame sees a point.
-//
-// In float64, so that no rounding of one device decides otherwise than that of another: the selection of frames must be
-// the same on both.
+// In float64, so that CPU and CUDA decide alike despite different rounding: the selection of frames must be the same on
+// both.
 #pragma once
 
 #include <cmath>

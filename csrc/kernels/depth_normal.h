@@ -1,4 +1,4 @@
-// The normal of a depth image's surface at a pixel. Free of branches, so that a compiler may do many pixels at once.
+// The normal of a depth image's surface at a pixel. Without branches, so that a compiler can vectorize over pixels.
 #pragma once
 
 #include <cmath>

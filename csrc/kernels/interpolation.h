@@ -51,7 +51,7 @@ SPS_INLINE T lerp(T a, T b, T t) {
   return a + t * (b - a);
 }
 
-// d(sum_k weight[k] * values[k]) / d local, for one value a corner.
+// d(sum_k weight[k] * values[k]) / d local, for one value per corner.
 template <class T>
 SPS_INLINE Vec3<T> trilinear_gradient(const Vec3<T>& local, const T (&values)[8]) {
   const T* v = values;

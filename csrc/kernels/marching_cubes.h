@@ -1,8 +1,8 @@
 // Marching cubes of one cell: its own share of the samples, edges, vertices and faces.
 //
-// Cells that touch share samples, edges and so vertices. Each shared thing has one owner among the cells that exist:
-// its value, its bit and its number are the owner's. So neighbors agree whatever rounding their own samples had, and
-// vertices are welded without a search.
+// Cells that touch share samples, edges and so vertices. Each shared element has one owner among the cells that
+// exist, whose value, bit and index are used. So neighbors agree even if their own samples were rounded differently,
+// and vertices are shared without a search.
 #pragma once
 
 #include <cstdint>
@@ -31,7 +31,7 @@ struct MarchingCubesWork {
   std::int64_t* vertex_offsets;  // [count + 1]: counts first, then their running sum
   std::int64_t* face_offsets;    // [count + 1]
   std::uint64_t* faults;         // kCoord* flags
-  std::int64_t words;            // 64-bit words of edge bits a cell
+  std::int64_t words;            // 64-bit words of edge bits per cell
 };
 
 SPS_INLINE std::int64_t samples_per_cell(int n) {
@@ -42,7 +42,7 @@ SPS_INLINE void set_bits(std::uint64_t* word, std::uint64_t bits) {
 #if defined(__CUDA_ARCH__)
   atomicOr(reinterpret_cast<unsigned long long*>(word), static_cast<unsigned long long>(bits));
 #else
-  // Most edges are marked by several cubes: looking first saves the locked operation.
+  // Most edges are marked by several cubes: a test before the atomic operation saves most of these.
   if ((__atomic_load_n(word, __ATOMIC_RELAXED) & bits) != bits) __atomic_fetch_or(word, bits, __ATOMIC_RELAXED);
 #endif
 }

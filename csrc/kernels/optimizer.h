@@ -65,7 +65,7 @@ SPS_INLINE void solve_damped_6x6(const T* hessian, const T* gradient, double dam
                                  double tolerance, T* delta) {
   double l[6][6], d[6], inverse[6], x[6];
   bool solvable = true;
-  // Unrolled, as registers have no addresses; the only divisions are the six that nothing else waits beside.
+  // Unrolled, as registers have no addresses; the only divisions are the six reciprocals of the diagonal.
   SPS_UNROLL
   for (int a = 0; a < 6; ++a) {
     SPS_UNROLL

@@ -37,8 +37,8 @@ SPS_INLINE Pixel unpack_pixel(const std::int32_t* words) {
   return pixel;
 }
 
-// The record of a pixel of that depth, color [3] and surface normal [3] (0 = unknown) in the view of a camera. The
-// foreshortening is computed in double, so that its rounded step does not hang on the order of operations.
+// The record of a pixel of that depth, color [3] and surface normal [3] (0 = unknown) seen by a camera. The
+// foreshortening is computed in double, so that rounding to a step does not depend on the order of operations.
 SPS_INLINE void pack_pixel(std::int32_t u, std::int32_t v, float depth, const std::uint8_t* color, const float* normal,
                            double fx, double fy, double cx, double cy, std::int32_t* words) {
   const double facing = normal[0] * ((u - cx) / fx) + normal[1] * ((v - cy) / fy) + normal[2];
@@ -49,7 +49,7 @@ SPS_INLINE void pack_pixel(std::int32_t u, std::int32_t v, float depth, const st
   words[2] = static_cast<std::int32_t>(color[0] | color[1] << 8 | color[2] << 16 | c << 24);
 }
 
-// Direction of a pixel's ray in camera axes, with z = 1, so that a sample's depth is its factor.
+// Direction of a pixel's ray in camera axes, with z = 1: a point on it is depth times direction.
 SPS_INLINE Vec3<float> pixel_ray(const Pixel& pixel, const Intrinsics& k) {
   return {(pixel.u - k.cx) / k.fx, (pixel.v - k.cy) / k.fy, 1.0f};
 }

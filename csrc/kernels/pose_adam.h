@@ -40,7 +40,7 @@ SPS_INLINE void pose_adam(const AdamCoefficients<T>& rotation, const AdamCoeffic
   for (int k = 0; k < kQuaternionSize; ++k) pose[k] /= norm;
 }
 
-// A pose on its way, and the best one seen.
+// The current pose of an optimization with its moments, and the best pose so far.
 struct PoseSearch {
   float pose[kPoseSize], exp_avg[kPoseSize], exp_avg_sq[kPoseSize];
   float best[kPoseSize], best_loss;
@@ -53,8 +53,8 @@ SPS_INLINE PoseSearch start_pose_search(const float* start) {
   return search;
 }
 
-// Keeps the pose if its loss is the least yet, then takes the step. Where the loss is not a number the pose stays: one
-// that is none itself sees no surface, which costs nothing.
+// Keeps the pose if its loss is the least so far, then takes the step. Where the loss is NaN the pose stays. A pose of
+// NaN meets no surface and has a loss of 0.
 SPS_INLINE void step_pose_search(const AdamCoefficients<float>& rotation, const AdamCoefficients<float>& translation,
                                  float loss, const float* increment, PoseSearch& search) {
   if (loss < search.best_loss) {

@@ -62,8 +62,8 @@ SPS_INLINE bool pair_counts(float weight, float min_pair_weight) {
   return weight >= min_pair_weight && weight >= kSmallestNormal;
 }
 
-// Sums over at most n points are kept as integers, in which order does not matter: the weight of a vertex is the same
-// number on every device, and so is what hangs on it. Terms are below 2^headroom_bits.
+// Sums over at most n points are kept as integers, which do not depend on the order of additions: the weight of a
+// vertex is the same on every device, and so is what depends on it. Terms are below 2^headroom_bits.
 SPS_INLINE float sum_scale(std::int64_t n, int headroom_bits) {
   int bits = 62 - headroom_bits;
   for (; n > 0; n >>= 1) --bits;
@@ -74,7 +74,7 @@ SPS_INLINE float weight_scale(std::int64_t n) {
   return sum_scale(n, 0);
 }
 
-// A weight in units of 1 / scale, rounded towards 0, but 1 at least: a sum of 0 says that there was none.
+// A weight in units of 1 / scale, rounded towards 0, but 1 at least: a sum of 0 means that there was no pair.
 SPS_INLINE std::int64_t weight_units(float weight, float scale) {
   const std::int64_t units = static_cast<std::int64_t>(weight * scale);
   return units > 0 ? units : 1;

@@ -46,8 +46,8 @@ SPS_INLINE bool has_depth(T depth) {
   return depth > 0 && depth < std::numeric_limits<T>::infinity();
 }
 
-// Merges two ascending runs into `out`; of equal values those of `a` come first. Every value is put where its rank
-// says, found by counting: no branch depends on the values. `counts` has room for count_a.
+// Merges two ascending runs into `out`; of equal values those of `a` come first. The place of a value is its
+// rank, found by counting: no branch depends on the values. `counts` has room for count_a.
 template <class T>
 SPS_INLINE void merge_ascending(const T* a, std::int32_t count_a, const T* b, std::int32_t count_b, T* counts, T* out) {
   for (std::int32_t i = 0; i < count_a; ++i) counts[i] = 0;
@@ -65,7 +65,7 @@ SPS_INLINE void merge_ascending(const T* a, std::int32_t count_a, const T* b, st
   for (std::int32_t i = 0; i < count_a; ++i) out[i + static_cast<std::int32_t>(counts[i])] = a[i];
 }
 
-// Room that sample_ray needs.
+// Elements of scratch that sample_ray needs.
 template <class T>
 SPS_INLINE std::int32_t sample_ray_scratch(const RaySampling<T>& sampling) {
   return 2 * sampling.num_samples() + kDrawLanes;

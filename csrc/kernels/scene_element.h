@@ -1,4 +1,4 @@
-// The scene at one point, by one thread: the form of the decoders that needs no tile.
+// The scene at one point, evaluated by one thread without tiles of samples.
 #pragma once
 
 #include <cstdint>

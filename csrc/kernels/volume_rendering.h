@@ -11,7 +11,7 @@
 
 namespace spslam {
 
-// Bells below this are taken as zero: a sample that far from the surface is not rendered.
+// Weights before normalization (bells) below this are 0: samples that far from the surface are not rendered.
 constexpr double kMinBell = 1e-3;
 // Grazing rays: normal . direction is not taken below this.
 constexpr double kMinCosine = 0.15;
@@ -87,7 +87,7 @@ SPS_INLINE bool in_free_space(T distance, T truncation) {
   return distance >= truncation;
 }
 
-// The three above at once, for code that runs one sample at a time: a struct of flags keeps a loop out of vector lanes.
+// The three above at once, for code that runs one sample at a time: a struct of flags prevents vectorization of a loop.
 template <class T>
 struct SampleTarget {
   T distance;
@@ -112,7 +112,7 @@ SPS_INLINE T free_space_residual(T sdf) {
   return sdf - 1;
 }
 
-// 1 / count, 0 for none: the mean over a ray's samples of one kind. Counted in T, which vector lanes prefer.
+// 1 / count, 0 for none: the mean over a ray's samples of one kind. Counted in T, which vectorizes better.
 template <class T>
 SPS_INLINE T inverse_count(T count) {
   return count > 0 ? 1 / count : T(0);

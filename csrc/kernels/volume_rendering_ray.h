@@ -6,7 +6,8 @@
 
 namespace spslam {
 
-// Mask is bool, or T on the host: bytes beside floats would need four times as many lanes, more than a ray has samples.
+// Mask is bool, or T on the host: a loop over bytes and floats needs four times as many lanes, more than a ray has
+// samples.
 template <class T, class Mask>
 struct RaySamples {
   const T* sdf;       // normalized
@@ -100,7 +101,7 @@ SPS_INLINE void render_ray_backward(const RaySamples<T, Mask>& ray, const T* col
 template <class T>
 struct RayTarget {
   const T* color;  // [3]
-  T depth;         // m; the ray counts for nothing where it is not positive and finite
+  T depth;         // m; the ray is left out where it is not positive and finite
   T cosine;        // target_cosine of the ray
   bool rendered;
 };

@@ -1,4 +1,4 @@
-// The rays of one iteration of a whole call, drawn and put together as render_step takes them.
+// The rays of one iteration of a whole call, drawn and packed as render_step takes them.
 #pragma once
 
 #include "core/for_each.h"

@@ -1,4 +1,4 @@
-// Launches of interpolation in terms of three loops that each device brings: gather, gather_gradient, scatter.
+// Launches of interpolation in terms of three loops that each device implements: gather, gather_gradient, scatter.
 #pragma once
 
 #include "kernels/interpolation_stencils.h"

@@ -11,10 +11,10 @@
 
 namespace spslam {
 
-// A cell is n^3 cubes of work: few make a chunk.
+// Cells per chunk: each is n^3 cubes of work.
 constexpr std::int64_t kCellGrain = 32;
 
-// Lays the arrays out in the workspace; `bytes` is where they end.
+// Lays the arrays out in the workspace; `bytes` is their size.
 inline MarchingCubesWork marching_cubes_layout(std::int64_t count, int n, void* workspace, std::int64_t* bytes) {
   MarchingCubesWork work{};
   work.capacity = 2;
@@ -58,7 +58,7 @@ void clear_work(Device device, const MarchingCubesWork& work, std::int64_t count
   for_each(device, 1, [=] SPS_HOST_DEVICE(std::int64_t) { *work.faults = 0; });
 }
 
-// Everything up to the counts a cell; the device's own file adds these up.
+// Everything up to the counts per cell; the device's own file sums them.
 template <class Device>
 void marching_cubes_mark(Device device, const MarchingCubesCells& cells, const MarchingCubesWork& work) {
   clear_work(device, work, cells.count);

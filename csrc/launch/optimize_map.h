@@ -51,7 +51,7 @@ struct OptimizeMapLaunch {
             stamp(iteration)};
   }
 
-  // Zero has the same bits as float and as integer, so either may use the room of the other between calls.
+  // Zero has the same bits as float and as integer, so calls of either kind may share the memory.
   static float* table_gradients(const AdamTable& table) {
     return table.state.exp_avg ? static_cast<float*>(table.gradients) : nullptr;
   }

@@ -1,5 +1,5 @@
-// render_step put together from the launches of the single ops, for any device. One element function or op after the
-// other through global memory: plain, and as deterministic as its parts.
+// render_step composed of the launches of the single ops, for any device. One element function or op after the other
+// through global memory, and as deterministic as these.
 #pragma once
 
 #include "core/for_each.h"

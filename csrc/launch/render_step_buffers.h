@@ -1,4 +1,4 @@
-// Scratch memory of render_step where it is put together from the launches of the single ops.
+// Scratch memory of render_step where it is composed of the launches of the single ops.
 #pragma once
 
 #include "launch/workspace.h"

@@ -1,4 +1,4 @@
-// What the launches of volume_rendering share: views of one ray in the tables, and the instantiations.
+// What the launches of volume_rendering share: the targets of one ray, and the instantiations.
 #pragma once
 
 #include "kernels/volume_rendering_ray.h"

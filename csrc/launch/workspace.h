@@ -1,11 +1,11 @@
-// Pieces of one block of scratch memory.
+// Arrays in one block of scratch memory.
 #pragma once
 
 #include <cstdint>
 
 namespace spslam {
 
-// Hands them out one after the other; with a null base it only counts.
+// Allocates them one after the other; with a null base it only adds up their sizes.
 class Workspace {
  public:
   explicit Workspace(void* base) : base_(static_cast<char*>(base)) {}

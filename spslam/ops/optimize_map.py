@@ -156,9 +156,9 @@ def optimize_map_(
         intrinsics: of the cameras.
         options: of the first iteration; `pose_gradient` is not read.
         moments: what is optimized.
-        num_pixels: R, rays an iteration, at least 1.
+        num_pixels: R, rays per iteration, at least 1.
         iterations: I, at least 1.
-        fixed_frame: row of `poses` that holds the world in place; -1 for none.
+        fixed_frame: row of `poses` that is not changed, as the gauge of the reconstruction; -1 for none.
         first_step: 1-based number of the first Adam step since the moments were zero.
         first_stamp: stamp of the first iteration; the I from it on must be new to the tables.
         pixel_stream: random stream of the draw.
@@ -168,7 +168,7 @@ def optimize_map_(
         float32 [I, 5] losses of each iteration, as `RenderStep.losses`.
 
         Deterministic: the same bits for any number of CPU threads and, on CUDA, from run to run. On CUDA the ray kernel
-        takes up to 64 samples a ray; beyond that the single ops run one after the other, to the same effect.
+        takes up to 64 samples per ray; beyond that the single ops run one after the other, to the same effect.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -190,7 +190,7 @@ def optimize_map_(
     scene.check(name)
     options.check(name)
     check_tensor(name, "records", records, ("F", "P", 3), torch.int32, like=scene.embeddings)
-    check(records.shape[1] >= 1, name, "records", "hold at least one pixel a frame", list(records.shape))
+    check(records.shape[1] >= 1, name, "records", "hold at least one pixel per frame", list(records.shape))
     check_tensor(name, "poses", poses, (len(records), 7), torch.float32, like=scene.embeddings)
     check(poses.is_contiguous(), name, "poses", "be contiguous", f"strides {poses.stride()}")
     on_cpu = isinstance(frames, torch.Tensor) and frames.device.type == "cpu"

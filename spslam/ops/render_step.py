@@ -1,8 +1,8 @@
 """One step of tracking or mapping, fused: rays in, losses and gradients out (sections III.B, III.C).
 
-The composable ops say the same one at a time (`sample_along_rays`, `voxel_hash_find`, `trilinear_interpolate`, `mlp`,
-`volume_render`, `rendering_losses`); here a ray goes all the way and back while its samples are in the cache, and
-samples outside the allocated voxels are skipped.
+The composable ops compute the same one at a time (`sample_along_rays`, `voxel_hash_find`, `trilinear_interpolate`,
+`mlp`, `volume_render`, `rendering_losses`). Here the forward and backward pass of a ray run while its samples are in the
+cache, and samples outside the allocated voxels are skipped.
 """
 
 from dataclasses import dataclass
@@ -57,9 +57,9 @@ class RenderOptions:
             not evaluated where weight_rgb is 0.
         seed, stream, frame, iteration: keys of the sampling, see `philox_uniform`.
         pose_gradient: whether the gradient of the poses is wanted.
-        precision: "tf32" multiplies in the decoders as the matrix units do, 10 bits of mantissa summed in float32, and
-            sums the decoders' gradients of bfloat16 factors; "fp32" keeps to float32. For CUDA devices that have matrix
-            units, with up to 64 samples a ray; elsewhere it is float32.
+        precision: "tf32" multiplies in the decoders on tensor cores, with factors of 10 bits of mantissa summed in
+            float32, and sums the decoders' gradients of bfloat16 factors; "fp32" stays in float32. It applies to CUDA
+            devices with tensor cores and up to 64 samples per ray; elsewhere everything is float32.
     """
 
     num_uniform: int
@@ -157,7 +157,7 @@ class RenderStep:
 def render_step(
     scene: SceneView, rays: RayBatch, options: RenderOptions, gradients: SceneGradients | None = None
 ) -> RenderStep:
-    """Renders rays, compares them with what was measured, and differentiates.
+    """Renders rays, computes the losses against the measurements, and their gradients.
 
     Total = weight_rgb (8) + weight_depth (9) + weight_sdf (10) + weight_free_space (11) of the paper, all averaged over
     the R rays; a ray without a positive, finite depth adds nothing but counts, and so does one from a pose that is not

@@ -29,7 +29,7 @@ def track_adam(
     """Tracks one frame against a frozen scene; all iterations in one call.
 
     Iteration i draws `num_pixels` of the records as `sample_indices` does with `pixel_stream` and iteration
-    `options.iteration + i`, makes a `render_step` with them, keeps the pose if its total loss is the least yet, and
+    `options.iteration + i`, makes a `render_step` with them, keeps the pose if its total loss is the least so far, and
     takes an Adam step (beta 0.9 and 0.999, epsilon 1e-8) on quaternion and translation; the quaternion is then
     normalized. On CUDA nothing waits for the device.
 
@@ -39,7 +39,7 @@ def track_adam(
         pose: float32 [7] where to start: unit quaternion (w, x, y, z) and translation (m).
         intrinsics: of the camera.
         options: of the first iteration; `pose_gradient` is not read.
-        num_pixels: R, rays an iteration, at least 1.
+        num_pixels: R, rays per iteration, at least 1.
         iterations: I, at least 1.
         rotation_rate: learning rate of the quaternion.
         translation_rate: learning rate of the translation, m.
@@ -47,7 +47,7 @@ def track_adam(
         graph: where the call's CUDA graph is kept; without one the kernels are launched one after the other.
 
     Returns:
-        float32 [7], the pose of the least loss; `pose` where no loss is a number. And float32 [I, 5], the losses before
+        float32 [7], the pose with the least loss; `pose` where every loss is NaN. And float32 [I, 5], the losses before
         each step, as `RenderStep.losses`.
 
         Deterministic: the same bits for any number of CPU threads and, on CUDA, from run to run.

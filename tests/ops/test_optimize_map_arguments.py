@@ -12,7 +12,7 @@ from tests.ops.mapping_scene import RENDER_OPTIONS, Map
     ("change", "error", "message"),
     [
         (dict(records=torch.zeros(5, 9, 3)), TypeError, "records must be int32, got float32"),
-        (dict(records=torch.zeros(5, 0, 3).int()), ValueError, r"records must hold at least one pixel a frame"),
+        (dict(records=torch.zeros(5, 0, 3).int()), ValueError, r"records must hold at least one pixel per frame"),
         (dict(poses=torch.zeros(4, 7)), ValueError, r"poses must have shape \[5, 7\], got \[4, 7\]"),
         (dict(poses=torch.zeros(7, 5).T), ValueError, r"poses must be contiguous, got strides \(1, 5\)"),
         (dict(frames=torch.zeros(0).long()), ValueError, "frames must name at least one frame, got 0"),

@@ -1,5 +1,4 @@
-// What the ray kernel is told. Passed by value, so that a graph's kernels are brought up to date without capturing
-// anew.
+// Arguments of the ray kernel. Passed by value, so that a graph's kernels are updated without a new capture.
 #pragma once
 
 #include "kernels/ray_source.h"
@@ -7,7 +6,7 @@
 
 namespace spslam::fused {
 
-// Most samples of a ray: two for each lane of a warp.
+// Most samples per ray: two for each lane of a warp.
 constexpr int kMaxSamples = 64;
 
 // Gradients of a table's rows, summed as fixed-point integers; null: frozen.

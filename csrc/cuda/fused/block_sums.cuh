@@ -1,4 +1,4 @@
-// Sums of what the blocks and rays of a ray kernel left, in a fixed order.
+// Sums over the partial results of a ray kernel's blocks and rays, in a fixed order.
 #pragma once
 
 #include "cuda/fused/arguments.cuh"
@@ -8,7 +8,7 @@
 
 namespace spslam::fused {
 
-// Units of work of a block of kSumThreads: columns of partials a warp wide, and frames a warp each.
+// Units of work of a block of kSumThreads: warp-wide columns of partials, and one frame per warp.
 constexpr int kColumnUnits = kPartialSize / kWarp;
 
 // The five losses from the sum of term k in lane first + k.

@@ -1,4 +1,4 @@
-// Color of a tile of 16 rendered samples: texels gathered, decoded, and the way back.
+// Color of a tile of 16 rendered samples: texels gathered and decoded, and the gradients.
 //
 // Lanes 4 g + q hold rows g and g + 8, of the texel channels 4 q .. 4 q + 3 and 16 + 4 q .. 16 + 4 q + 3.
 #pragma once
@@ -28,7 +28,7 @@ __device__ __forceinline__ int step_v(const PlaneLayout& plane) {
   return plane.size_v > 1 ? 1 : 0;
 }
 
-// All lanes share in the 3 x 16 look-ups. Rows past the last one repeat it.
+// The lanes share the 3 x 16 look-ups. Rows past the last one repeat it.
 __device__ __forceinline__ void locate_in_planes(const RayStepArguments& a, const RayScratch& scratch, int base,
                                                  int rendered, int lane, PlanePlaces& places) {
   __syncwarp();
@@ -154,7 +154,7 @@ __device__ __forceinline__ void color_backward(const float* image, const ColorTi
   }
 }
 
-// The lane's share of d L / d point of row r. Reads the texels again: to keep their slopes would take 48 registers.
+// The lane's share of d L / d point of row r. Reads the texels again: keeping their slopes would take 48 registers.
 __device__ __forceinline__ Vec3<float> color_point_gradient(const RayStepArguments& a, const PlanePlaces& places,
                                                             const float (&grad_x)[4][4], int r, int lane) {
   Vec3<float> by_point{0.0f, 0.0f, 0.0f};

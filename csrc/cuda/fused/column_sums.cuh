@@ -1,4 +1,4 @@
-// Sums of columns over what blocks left, a row each, in a fixed order.
+// Sums of columns over the blocks' partial results, one row per block, in a fixed order.
 #pragma once
 
 #include <cstdint>
@@ -17,7 +17,7 @@ __device__ __forceinline__ T sum_column(const T* first, std::int64_t stride, int
   T sum = 0;
 #pragma unroll 8
   for (int row = warp; row < rows; row += kSumWarps) sum += __ldcg(first + row * stride);
-  __syncthreads();  // what was summed before may still be read
+  __syncthreads();  // the sums before may still be read
   shared[warp][lane] = sum;
   __syncthreads();
   T total = 0;

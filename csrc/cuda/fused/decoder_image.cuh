@@ -7,7 +7,7 @@
 namespace spslam::fused {
 
 constexpr int kHidden = static_cast<int>(kDecoderHidden);
-// Input slots of the geometry decoder, padded to whole fragments: the embedding, the position, a one that carries the
+// Input slots of the geometry decoder, padded to whole fragments: the embedding, the position, a constant 1 for the
 // first bias, zeros.
 constexpr int kGeometrySlots = 16, kPositionSlot = 8, kOneSlot = 11;
 constexpr int kGeometryInputs = static_cast<int>(kGeometryDecoder.input);
@@ -53,7 +53,7 @@ __host__ __device__ constexpr int geometry_parameter(int n, int k) {
   return k == kOneSlot ? kFlatGeometry.b1 + n : -1;
 }
 
-// Puts element (k, n) of a K x N matrix, and the same of its transpose.
+// Stores element (k, n) of a K x N matrix, and the same of its transpose.
 template <Precision kPrecision>
 __device__ __forceinline__ void put_weight(float* image, int forward, int back, int k, int n, int K, int N, float w) {
   if (kPrecision == Precision::kTf32) w = round_to_tf32(w);
@@ -61,8 +61,8 @@ __device__ __forceinline__ void put_weight(float* image, int forward, int back, 
   image[back + fragment_index<kPrecision>(n, k, N, K)] = w;
 }
 
-// Weights of one matrix that a thread carries from global to shared memory: all are asked for before the first is
-// needed.
+// Weights of one matrix that a thread copies from global to shared memory: all loads are issued before the first is
+// used.
 template <int kThreads, int kInputs>
 struct MatrixShare {
   static constexpr int kCount = kInputs * kHidden, kShare = (kCount + kThreads - 1) / kThreads;

@@ -2,7 +2,7 @@
 //
 // A fragment float[N][4] holds a 16 x 8N matrix the way mma.sync returns it: with g = lane / 4 and q = lane % 4,
 // element [j][2 r + e] is row g + 8 r, column 8 j + 2 q + e. The columns of a product may be taken in any order as long
-// as both operands agree, so what one layer returns is the next one's operand as it is.
+// as both operands agree, so the result of one layer is an operand of the next as it is.
 #pragma once
 
 #include <cuda_bf16.h>
@@ -10,6 +10,7 @@
 
 #include <cstdint>
 
+#include "core/vec.h"
 #include "spslam/render_step.h"
 
 namespace spslam::fused {
@@ -24,7 +25,7 @@ constexpr int kArchitecture = __CUDA_ARCH__;
 #else
 constexpr int kArchitecture = 0;
 #endif
-// Matrix units for tf32 and bf16.
+// Tensor cores for tf32 and bf16.
 constexpr int kTensorArchitecture = 800;
 
 __device__ __forceinline__ int lane_row(int lane) {
@@ -64,7 +65,7 @@ __device__ __forceinline__ void mma_bf16(float (&c)[4], const std::uint32_t (&a)
 #endif
 }
 
-// Where element (k, n) of a K x N matrix lies in shared memory, so that a lane reads its share in 16 bytes at a time.
+// Where element (k, n) of a K x N matrix lies in shared memory, so that a lane reads its share 16 bytes at a time.
 template <Precision kPrecision>
 __host__ __device__ constexpr int fragment_index(int k, int n, int K, int N) {
   if (kPrecision == Precision::kFp32) {

@@ -1,4 +1,4 @@
-// Geometry of a tile of 16 samples: embeddings gathered, decoded, and the way back.
+// Geometry of a tile of 16 samples: embeddings gathered and decoded, and the gradients.
 //
 // Lanes 4 g + q hold rows g and g + 8, of the embedding channels 2 q and 2 q + 1.
 #pragma once

@@ -1,4 +1,4 @@
-// The second kernel of a mapping iteration: adds up what the ray kernel left, and steps everything that it touched.
+// The second kernel of a mapping iteration: sums the ray kernel's partial results, and steps all parameters it touched.
 #pragma once
 
 #include "cuda/fused/block_sums.cuh"
@@ -38,7 +38,7 @@ __device__ __forceinline__ void step_parameter(const AdamTarget& t, std::int64_t
   adam_update(t.coefficients, t.param[i], gradient, t.exp_avg[i], t.exp_avg_sq[i]);
 }
 
-// A warp wide share of the decoders' parameters and of the loss terms.
+// A warp-wide share of the decoders' parameters and of the loss terms.
 __device__ __forceinline__ void step_column(const MapUpdateArguments& a, int unit, float (*shared)[kWarp]) {
   const int lane = threadIdx.x % kWarp;
   const int column = unit * kWarp + lane;
@@ -67,7 +67,7 @@ __device__ __forceinline__ void step_pose(const MapUpdateArguments& a, std::int6
             a.poses.exp_avg_sq + at);
 }
 
-// Takes four neighboring sums, and leaves zeros.
+// Returns four neighboring sums, and sets them to zero.
 __device__ __forceinline__ float4 take_sums(std::int64_t* sums, float inverse_scale) {
   longlong2* p = reinterpret_cast<longlong2*>(sums);
   const longlong2 low = __ldcg(p), high = __ldcg(p + 1);

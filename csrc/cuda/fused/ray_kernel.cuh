@@ -1,4 +1,4 @@
-// The ray kernel: a warp a ray, forward and back in one go.
+// The ray kernel: one warp per ray, forward and backward pass in one kernel.
 //
 // Blocks take groups of rays in a fixed order and leave their sums in partials, to be added in the order of the blocks:
 // where the scene is optimized the gradients of the decoders and the loss terms, where it is frozen the loss terms and
@@ -10,7 +10,7 @@
 
 namespace spslam::fused {
 
-// Shared memory a block may have, by compute capability.
+// Shared memory per block, by compute capability.
 constexpr int shared_memory_of(int architecture) {
   if (architecture < kTensorArchitecture) return 64 * 1024;
   if (architecture == 800 || architecture == 870) return 163 * 1024;
@@ -54,7 +54,7 @@ constexpr int warps_of(int architecture) {
   return 1;
 }
 
-// Whether code of an architecture has this variant: one width each, and the matrix units where they are asked for.
+// Whether code of an architecture has this variant: one width each, and tensor cores where they are asked for.
 template <Precision kPrecision, bool kTrain, int kWarps>
 constexpr bool has_variant(int architecture) {
   return (kPrecision == Precision::kFp32 || architecture >= kTensorArchitecture) &&

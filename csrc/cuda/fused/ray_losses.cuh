@@ -5,7 +5,7 @@
 
 namespace spslam::fused {
 
-// What a warp knows of its ray once it is rendered; equal in all lanes but for the bells.
+// A warp's rendered ray; equal in all lanes but for the bells.
 struct RayRendering {
   float bell_slope[2];  // of the lane's samples
   float inverse_sum;    // 0 where nothing is rendered

@@ -1,4 +1,4 @@
-// The ray kernel as the launches see it: whether it serves a step, and how it is launched.
+// Host interface of the ray kernel: whether it supports a step, and how it is launched.
 #pragma once
 
 #include "cuda/fused/arguments.cuh"
@@ -6,14 +6,13 @@
 
 namespace spslam::fused {
 
-// Whether the ray kernel serves such a step: not more than kMaxSamples samples a ray, tables at addresses that vectors
-// can be read from.
+// Whether the ray kernel supports such a step: at most kMaxSamples samples per ray, tables aligned for vector loads.
 bool covers(const SceneView& scene, const RenderOptions& options);
 
 // Blocks of a launch over that many rays, each of which leaves one partial sum; 0 rays take one.
 int num_blocks(Precision precision, bool train, std::int64_t num_rays);
 
-// Arguments that a step's own do not tell: gradients, partials and pose_gradients are left empty.
+// Arguments of a step; gradients, partials and pose_gradients are left empty.
 RayStepArguments make_arguments(const SceneView& scene, const RaySource& rays, const Intrinsics& camera,
                                 const RenderOptions& options);
 

@@ -1,4 +1,4 @@
-// The ray kernel's variants, compiled in a file each.
+// The ray kernel's variants, each compiled in a file of its own.
 #pragma once
 
 #include "spslam/render_step.h"

@@ -1,4 +1,4 @@
-// A warp takes a ray forward, through its losses, and back.
+// Forward pass, losses and backward pass of one ray by one warp.
 #pragma once
 
 #include <type_traits>
@@ -11,7 +11,7 @@
 
 namespace spslam::fused {
 
-// A warp's shared memory; where the scene is frozen, the last part is not there.
+// A warp's shared memory; GradientRows only where the scene is optimized.
 struct WarpMemory {
   RayScratch scratch;
   PlanePlaces places;
@@ -57,7 +57,7 @@ class RayWarp {
 
   __device__ __forceinline__ bool pending() const { return geometry_left_ > 0 || color_left_ > 0; }
 
-  // Takes one tile of each decoder back, the last first; returns which were staged.
+  // Backward pass of one tile of each decoder, the last first; returns which were staged.
   __device__ __forceinline__ int backward() {
     int staged = 0;
     if (geometry_left_ > 0) {
@@ -80,7 +80,7 @@ class RayWarp {
  private:
   static __device__ __forceinline__ int tiles(int samples) { return (samples + kTileRows - 1) / kTileRows; }
 
-  // Staging in the frozen scene is left out at compile time.
+  // Nothing is staged for a frozen scene, known at compile time.
   __device__ __forceinline__ Stage<kPrecision>* stage() const { return kTrain ? stage_ : nullptr; }
 
   __device__ __forceinline__ void decode_geometry(int tile) {

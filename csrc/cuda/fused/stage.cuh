@@ -1,11 +1,11 @@
-// What the gradients of the decoders' weights are made of: the inputs, hidden activations and deltas of a warp's tile.
+// Operands of the decoders' weight gradients: the inputs, hidden activations and deltas of a warp's tile.
 #pragma once
 
 #include "cuda/fused/decoder_image.cuh"
 
 namespace spslam::fused {
 
-// bf16 for the matrix units, float where all is float.
+// bf16 for tensor cores, float where everything is float.
 template <Precision kPrecision>
 struct StageElement {
   using type = __nv_bfloat16;
@@ -15,7 +15,7 @@ struct StageElement<Precision::kFp32> {
   using type = float;
 };
 
-// Row lengths are such that neighboring rows fall on different banks.
+// Row lengths avoid bank conflicts between neighboring rows.
 template <Precision kPrecision>
 struct alignas(16) Stage {
   using Element = typename StageElement<kPrecision>::type;
@@ -37,7 +37,7 @@ __device__ __forceinline__ void store_pair(float* out, float a, float b) {
   *reinterpret_cast<float2*>(out) = make_float2(a, b);
 }
 
-// A fragment to its rows.
+// Stores a fragment as rows.
 template <class Element, int NT, int kStride>
 __device__ __forceinline__ void store_tile(Element (&rows)[kTileRows][kStride], const float (&x)[NT][4], int lane) {
   const int row = lane_row(lane), quad = lane_quad(lane);
@@ -48,7 +48,7 @@ __device__ __forceinline__ void store_tile(Element (&rows)[kTileRows][kStride], 
   }
 }
 
-// Up to four output gradients a row, the rest zero; every lane of a row holds all of its row's.
+// Up to four output gradients per row, the rest zero; every lane of a row holds all of its row's.
 template <class Element>
 __device__ __forceinline__ void store_outputs(Element (&rows)[kTileRows][8], const float (&d)[2][4], int lane) {
   const int quad = lane_quad(lane);

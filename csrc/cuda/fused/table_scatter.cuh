@@ -1,4 +1,4 @@
-// Gradients of a tile's samples to the rows of the tables they were interpolated from.
+// Adds the gradients of a tile's samples to the rows of the tables that they were interpolated from.
 //
 // Samples lie in order of depth, so neighbors often share a cell: sums are kept while the cell stays the same and then
 // added to the table as fixed-point integers, whose order does not matter.
@@ -10,7 +10,7 @@
 
 namespace spslam::fused {
 
-// Gradient rows of a tile; a warp's shared memory. 48 floats put neighboring rows on different banks.
+// Gradient rows of a tile; a warp's shared memory. 48 floats per row avoid bank conflicts.
 struct GradientRows {
   float rows[kTileRows][48];
 };

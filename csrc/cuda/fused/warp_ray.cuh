@@ -1,4 +1,4 @@
-// One ray in the hands of a warp: its samples in order of depth, and those of them that lie in complete cells.
+// One warp's ray: its samples in order of depth, and those that lie in complete cells.
 #pragma once
 
 #include "cuda/fused/arguments.cuh"
@@ -66,7 +66,7 @@ __device__ __forceinline__ void place_samples(const RayStepArguments& a, std::in
   __syncwarp();
 }
 
-// One sample on its way into the list of those inside.
+// One sample before it is listed among those inside.
 struct LocatedSample {
   Vec3<float> point;
   float t;

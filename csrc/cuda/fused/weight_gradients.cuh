@@ -1,7 +1,7 @@
 // Sums of the decoders' weight gradients over the tiles that the warps of a block have staged.
 //
 // Each warp owns part of the parameters and adds the tiles of all warps in order, so that the sums have a fixed order
-// and need no atomics. One version for the matrix units, one in float.
+// and need no atomics. One version for tensor cores, one in float.
 #pragma once
 
 #include "cuda/fused/arguments.cuh"
@@ -20,7 +20,7 @@ __device__ __forceinline__ int second_layer_parameter(bool color, int k, int n) 
 template <Precision kPrecision, int kWarps>
 class WeightGradients;
 
-// ---- matrix units: 16-row strips of the matrices, activations transposed times deltas.
+// ---- tensor cores: 16-row strips of the matrices, activations transposed times deltas.
 
 __device__ __forceinline__ std::uint32_t shared_address(const void* p) {
   return static_cast<std::uint32_t>(__cvta_generic_to_shared(p));

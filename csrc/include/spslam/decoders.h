@@ -29,7 +29,7 @@ struct MlpShape {
   constexpr std::int64_t num_params() const { return offsets().size; }
 };
 
-// Elements of T of scratch that the launches below need for n samples.
+// Scratch of the launches below for n samples, in elements of T.
 template <class Device>
 std::int64_t mlp_workspace_size(Device device, const MlpShape& shape, std::int64_t n);
 template <class Device>

@@ -6,9 +6,9 @@ namespace spslam {
 class LaunchGraph;
 
 LaunchGraph* make_launch_graph();
-// Work under way is finished all the same.
+// Launches in progress finish all the same.
 void free_launch_graph(LaunchGraph* graph);
-// How often it was built anew: at first, and when the shape of a call changed.
+// How often it was built: for the first call, and after each change of a call's shape.
 int launch_graph_builds(const LaunchGraph* graph);
 
 }  // namespace spslam

@@ -10,18 +10,18 @@ namespace spslam {
 
 class LaunchGraph;
 
-// What Adam works on and keeps of one tensor of parameters [rows, channels]. Without moments the parameters are frozen.
+// One tensor of parameters [rows, channels] and its Adam moments. Without moments the parameters are frozen.
 struct AdamState {
   float* param;
   float *exp_avg, *exp_avg_sq;  // null: frozen
   double learning_rate;
 };
 
-// The same of a table that each iteration touches a few rows of.
+// The same for a table of which each iteration changes a few rows.
 struct AdamTable {
   AdamState state;
   // [rows, channels] sums of an iteration's gradients, zero before and after a call: float on the Cpu, std::int64_t on
-  // Cuda, where integers make the order of the additions not matter.
+  // Cuda, where integers make the sums independent of the order of additions.
   void* gradients;
   std::int32_t* stamps;  // [rows]
 };
@@ -34,7 +34,7 @@ struct MapOptimization {
   AdamTable embeddings, texels;
   AdamState geometry_params, color_params;
   AdamState poses;         // [rows, 7]
-  std::int64_t fixed_row;  // of the poses: it holds the world in place
+  std::int64_t fixed_row;  // of the poses: kept, as the gauge of the reconstruction
   std::int64_t iterations;
   std::int64_t first_step;   // 1-based, of the moments
   std::int32_t first_stamp;  // rows get first_stamp + iteration
@@ -46,7 +46,7 @@ template <class Device>
 std::int64_t optimize_map_workspace_size(Device device, const MapOptimization& call);
 
 // Changes the scene's tables, the decoders and the poses in place. Where `graph` is given (Cuda), the call runs as one
-// CUDA graph that is kept there.
+// CUDA graph, which is kept there.
 template <class Device>
 void optimize_map(Device device, const MapOptimization& call, void* workspace, LaunchGraph* graph);
 

@@ -27,7 +27,7 @@ inline std::int64_t normal_equations_partials(std::int64_t frames, std::int64_t 
   return frames * ((residuals + kNormalChunk - 1) / kNormalChunk) * kNormalTerms;
 }
 
-// hessian [F, 6, 6] = sum w J^T J, gradient [F, 6] = sum w r J, cost [F] = sum w r^2 over `count` residuals a frame.
+// hessian [F, 6, 6] = sum w J^T J, gradient [F, 6] = sum w r J, cost [F] = sum w r^2 over `count` residuals per frame.
 // `partials` is scratch of normal_equations_partials(frames, count) doubles. The order of the sums is fixed.
 template <class Device, class T>
 void normal_equations(Device device, std::int64_t frames, std::int64_t count, const T* residuals, const T* jacobians,

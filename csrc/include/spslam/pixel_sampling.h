@@ -19,7 +19,7 @@ struct RgbdImage {
 
 struct PixelSampling {
   std::int64_t count;             // pixels to draw
-  float min_depth, max_depth;     // m; others, 0 and not finite ones are not drawn
+  float min_depth, max_depth;     // m; depths outside, 0 and not finite ones are not drawn
   std::int32_t step_px;           // of the normals' differences
   float max_jump;                 // of depth beside a normal, as a share
   std::int32_t thumbnail_step;    // px; the first pixel of the depth thumbnail lies at half of it

@@ -8,7 +8,7 @@
 
 namespace spslam {
 
-// A surface as a camera sees it: at each pixel of a map a point and its unit normal, in camera axes.
+// A surface seen by a camera: a point and its unit normal at each pixel, in camera axes.
 struct SurfaceMaps {
   const float* vertices;  // [height, width, 3] m; z = 0 where there is none
   const float* normals;   // [height, width, 3]; 0 where unknown
@@ -18,7 +18,7 @@ struct SurfaceMaps {
 
 struct IcpOptions {
   std::int64_t iterations;
-  float max_distance;              // m, between a point and the vertex it is held against
+  float max_distance;              // m, between a point and its associated vertex
   float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
   double damping;
 };

@@ -26,8 +26,8 @@ struct LossWeights {
   float rgb, depth, free_space, sdf;
 };
 
-// Arithmetic of the decoders in the fused kernels on CUDA: products of tf32 on matrix units, where the device has them,
-// or float throughout. The CPU knows float alone.
+// Arithmetic of the decoders in the fused kernels on CUDA: tf32 products on tensor cores, where the device has them, or
+// float throughout. The CPU always computes in float.
 enum class Precision : std::int32_t { kTf32 = 0, kFp32 = 1 };
 
 struct RenderOptions {

@@ -8,7 +8,7 @@
 
 namespace spslam {
 
-// sdf[i] = SDF / truncation at points[i] (m), 1 outside the allocated voxels; valid[i] tells which are inside.
+// sdf[i] = SDF / truncation at points[i] (m), 1 outside the allocated voxels; valid[i] says which are inside.
 // gradient [n, 3] = d sdf / d point, 1/m, 0 outside; may be null.
 template <class Device>
 void query_sdf(Device device, const SceneView& scene, const float* points, std::int64_t n, float* sdf, bool* valid,

@@ -18,7 +18,7 @@ struct PoseTracking {
   std::int64_t iterations;
   double rotation_rate, translation_rate;
   const float* start;  // [7]
-  float* best;         // [7] the pose of the least total loss, the start where no loss is a number
+  float* best;         // [7] the pose with the least total loss; the start where every loss is NaN
   float* losses;       // [iterations, 5]
 };
 
@@ -26,7 +26,7 @@ struct PoseTracking {
 template <class Device>
 std::int64_t track_adam_workspace_size(Device device, const PoseTracking& call);
 
-// Where `graph` is given (Cuda), the call runs as one CUDA graph that is kept there.
+// Where `graph` is given (Cuda), the call runs as one CUDA graph, which is kept there.
 template <class Device>
 void track_adam(Device device, const PoseTracking& call, void* workspace, LaunchGraph* graph);
 

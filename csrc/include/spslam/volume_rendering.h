@@ -42,7 +42,7 @@ struct LossInputs {
   bool cosine_targets;    // whether distances to the surface are scaled by `cosine`
 };
 
-// Partial sums of each loss term: fixed, so that the order of additions is.
+// Partial sums of each loss term: a fixed number, so that the order of additions is fixed.
 constexpr std::int64_t kLossPartials = 64;
 
 // Elements of scratch memory that rendering_losses needs.

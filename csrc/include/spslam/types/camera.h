@@ -1,4 +1,4 @@
-// Camera intrinsics, and how a pose lies in memory.
+// Camera intrinsics, and the layout of a pose in memory.
 #pragma once
 
 namespace spslam {
