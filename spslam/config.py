@@ -18,7 +18,7 @@ from typing import Any
 import pydantic
 import yaml
 
-from spslam.errors import ConfigError
+from spslam.errors import ConfigError, brief
 from spslam.options import PRESETS, Config, Section
 from spslam.reading import MAX_DIGITS, read_text
 
@@ -144,7 +144,7 @@ def _read(path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold sections of options, got {_brief(content)}")
+        raise ConfigError(f"{path}: must hold sections of options, got {_shown(content)}")
     return content
 
 
@@ -182,7 +182,7 @@ def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict
             if value is None:  # a section whose lines are all commented out
                 continue
             if not isinstance(value, dict):
-                raise ConfigError(f"{prefix}{key} must be a section of options, got {_brief(value)}")
+                raise ConfigError(f"{prefix}{key} must be a section of options, got {_shown(value)}")
             merged[key] = _merge(base[key], value, f"{prefix}{key}.")
         else:
             merged[key] = value
@@ -191,12 +191,12 @@ def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict
 
 def _preset_section(presets: Any, name: str) -> dict[str, Any]:
     if not isinstance(presets, dict):
-        raise ConfigError(f"presets must be a section of options, got {_brief(presets)}")
+        raise ConfigError(f"presets must be a section of options, got {_shown(presets)}")
     for key, value in presets.items():
         if key not in PRESETS:
             raise ConfigError(f"presets.{key} is not an option; it must be one of {', '.join(PRESETS)}")
         if not isinstance(value, dict):
-            raise ConfigError(f"presets.{key} must be a section of options, got {_brief(value)}")
+            raise ConfigError(f"presets.{key} must be a section of options, got {_shown(value)}")
     return presets.get(name, {})
 
 
@@ -218,7 +218,7 @@ def _describe(fault: Any) -> str:
         return f"{path} must be given; the configuration file has to say it"
     if kind == "value_error":
         return str(context["error"])
-    return f"{_option_path(path)} must {_rule(kind, context)}, got {_brief(value)}"
+    return f"{_option_path(path)} must {_rule(kind, context)}, got {_shown(value)}"
 
 
 def _unknown(path: str) -> str:
@@ -256,6 +256,5 @@ def _rule(kind: str, context: Mapping[str, Any]) -> str:
     return rules.get(kind, "be valid ({kind})").format(kind=kind, **context).replace("'", "")
 
 
-def _brief(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
+def _shown(value: Any) -> str:
+    return brief(repr(value), 60)

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from spslam.download.transfer import require_space
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 
 # Of zip files within zip files; 7-Scenes has one level.
 MAX_DEPTH = 3
@@ -166,11 +166,11 @@ def _unpack_zip(archive: Path, folder: Path, budget: _Budget, depth: int) -> Non
 def _check_zip_member(archive: Path, member: zipfile.ZipInfo) -> None:
     kind = stat.S_IFMT(member.external_attr >> 16)
     if kind and not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-        raise ArchiveError(f"{archive}: must hold files and folders alone, but {member.filename} is a link")
+        raise ArchiveError(f"{archive}: must hold files and folders alone, but {brief(member.filename)} is a link")
     if member.flag_bits & _ENCRYPTED:
-        raise ArchiveError(f"{archive}: must not be encrypted, but {member.filename} is")
+        raise ArchiveError(f"{archive}: must not be encrypted, but {brief(member.filename)} is")
     if member.compress_type not in _METHODS:
-        raise ArchiveError(f"{archive}: must be stored or deflated, but {member.filename} isn't")
+        raise ArchiveError(f"{archive}: must be stored or deflated, but {brief(member.filename)} isn't")
 
 
 def _is_tar(archive: Path) -> bool:
@@ -189,7 +189,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: _Budget) -> None:
         for member in members:
             _place(archive, folder, member.name)
             if not (member.isfile() or member.isdir()):
-                raise ArchiveError(f"{archive}: must hold files and folders alone, but {member.name} is a link")
+                raise ArchiveError(f"{archive}: must hold files and folders alone, but {brief(member.name)} is a link")
             # Before the loop goes on and skips the content, which may have to be inflated for that.
             budget.spend(member.size)
             total += member.size
@@ -232,10 +232,10 @@ def _place(archive: Path, folder: Path, name: str) -> Path:
     resolved, root, source = place.resolve(), folder.resolve(), archive.resolve()
     # A link that stood in the folder before could lead out too.
     if not inside or not resolved.is_relative_to(root):
-        raise ArchiveError(f"{archive}: must stay in the folder that it is unpacked in, but holds {name}")
+        raise ArchiveError(f"{archive}: must stay in the folder that it is unpacked in, but holds {brief(name)}")
     # A folder of archives below the one that is unpacked into holds notes on them as well.
     if resolved == source or (root in source.parent.parents and resolved.is_relative_to(source.parent)):
-        raise ArchiveError(f"{archive}: must leave the folder that it lies in alone, but holds {name}")
+        raise ArchiveError(f"{archive}: must leave the folder that it lies in alone, but holds {brief(name)}")
     return place
 
 
@@ -253,10 +253,10 @@ def _faults_of(archive: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno is not None and error.errno not in _NAME_ERRORS:
             raise
-        raise ArchiveError(f"{archive}: the archive is damaged: {error.strerror or error}") from error
+        raise ArchiveError(f"{archive}: the archive is damaged: {brief(str(error.strerror or error))}") from error
     except DatasetError:
         raise
     except _RefusedError as error:
         raise ArchiveError(f"{archive}: {error}") from None
     except Exception as error:  # zipfile, tarfile and zlib raise a dozen classes, and none in common
-        raise ArchiveError(f"{archive}: the archive is damaged: {error}") from error
+        raise ArchiveError(f"{archive}: the archive is damaged: {brief(str(error) or type(error).__name__)}") from error
