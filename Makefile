@@ -78,6 +78,9 @@ test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined
 	cd build/asan-site && LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops
 
+fuzz: dev ## read spoiled files of every format for MINUTES (60), in JOBS processes; see docs/reliability.md
+	$(PYTHON) -m tests.fuzz --minutes $(or $(MINUTES),60) --jobs $(JOBS)
+
 lint: $(ENVIRONMENT) ## style and types
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .

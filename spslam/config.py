@@ -20,7 +20,7 @@ import yaml
 
 from spslam.errors import ConfigError
 from spslam.options import PRESETS, Config
-from spslam.options.faults import brief, describe_fault, describe_unused, option_paths
+from spslam.options.faults import describe_fault, describe_unused, option_paths, shown
 from spslam.reading import MAX_DIGITS, read_text
 
 __all__ = ["Config", "config_names", "dump_config", "load_config", "option_paths", "resolve_config_path"]
@@ -148,7 +148,7 @@ def _read(path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold sections of options, got {brief(content)}")
+        raise ConfigError(f"{path}: must hold sections of options, got {shown(content)}")
     return content
 
 
@@ -186,7 +186,7 @@ def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict
             if value is None:  # a section whose lines are all commented out
                 continue
             if not isinstance(value, dict):
-                raise ConfigError(f"{prefix}{key} must be a section of options, got {brief(value)}")
+                raise ConfigError(f"{prefix}{key} must be a section of options, got {shown(value)}")
             merged[key] = _merge(base[key], value, f"{prefix}{key}.")
         else:
             merged[key] = value
@@ -197,7 +197,7 @@ def _pop_resolved(file: dict[str, Any], path: Path, preset: str) -> bool:
     """Takes the mark of a resolved configuration off its content; returns whether it was there."""
     is_resolved = file.pop(RESOLVED, False)
     if not isinstance(is_resolved, bool):
-        raise ConfigError(f"{RESOLVED} must be true or false, got {brief(is_resolved)}")
+        raise ConfigError(f"{RESOLVED} must be true or false, got {shown(is_resolved)}")
     if is_resolved and file.get("preset") != preset:
         raise ConfigError(
             f"preset must be {file.get('preset')} or left out, got {preset}: {path} holds every option of a run already"
@@ -207,12 +207,12 @@ def _pop_resolved(file: dict[str, Any], path: Path, preset: str) -> bool:
 
 def _preset_section(presets: Any, name: str) -> dict[str, Any]:
     if not isinstance(presets, dict):
-        raise ConfigError(f"presets must be a section of options, got {brief(presets)}")
+        raise ConfigError(f"presets must be a section of options, got {shown(presets)}")
     for key, value in presets.items():
         if key not in PRESETS:
             raise ConfigError(f"presets.{key} is not an option; it must be one of {', '.join(PRESETS)}")
         if not isinstance(value, dict):
-            raise ConfigError(f"presets.{key} must be a section of options, got {brief(value)}")
+            raise ConfigError(f"presets.{key} must be a section of options, got {shown(value)}")
     return presets.get(name, {})
 
 

@@ -28,3 +28,10 @@ class DeviceError(SpslamError):
 
 class WeightsError(SpslamError):
     """A weights file is missing, has tensors of another shape, or is not one of spslam."""
+
+
+def brief(value: object, most: int = 80) -> str:
+    """A value or a name from outside as one short line of a message: its `repr`, cut after `most` characters."""
+    text = " ".join((value if isinstance(value, str) else repr(value)).split())
+    text = text.encode("utf-8", "backslashreplace").decode()
+    return text if len(text) <= most else text[: most - 3] + "..."

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from spslam.errors import SpslamError
+from spslam.errors import SpslamError, brief
 
 MAX_TEXT_BYTES = 32 << 20  # 100,000 poses of 16 numbers
 MAX_LINE_CHARACTERS = 1 << 20
@@ -64,9 +64,9 @@ def read_bytes(path: Path, max_bytes: int, error: type[SpslamError]) -> bytes:
         SpslamError: of class `error`: as `open_regular`, or the file is larger.
     """
     with open_regular(path, error) as file:
-        _check_size(path, file, max_bytes, error)
+        size = _checked_size(path, file, max_bytes, error)
         try:
-            return file.read(max_bytes)
+            return file.read(size)
         except OSError as refusal:
             raise error(f"{path}: can't be read: {refusal.strerror}") from refusal
 
@@ -91,7 +91,7 @@ def read_lines(path: Path, error: type[SpslamError], max_bytes: int = MAX_TEXT_B
         SpslamError: of class `error`: as `read_text`, or a line is longer than `MAX_LINE_CHARACTERS`.
     """
     with open_regular(path, error) as file:
-        _check_size(path, file, max_bytes, error)
+        _checked_size(path, file, max_bytes, error)
         text, number = io.TextIOWrapper(file, encoding="utf-8"), 0
         try:
             while line := text.readline(MAX_LINE_CHARACTERS + 1):
@@ -121,7 +121,7 @@ def parse_json(text: str, name: str, error: type[Exception]) -> dict[str, Any]:
     except RecursionError:
         raise error(f"{name}: isn't valid JSON: it is nested too deep") from None
     except ValueError as fault:
-        raise error(f"{name}: isn't valid JSON: {fault}") from None
+        raise error(f"{name}: isn't valid JSON: {brief(str(fault), 200)}") from None
     if not isinstance(content, dict):
         raise error(f"{name}: must hold an object with named values, got {type(content).__name__}")
     return content
@@ -133,7 +133,8 @@ def _whole_number(digits: str) -> int:
     return int(digits)
 
 
-def _check_size(path: Path, file: BinaryIO, max_bytes: int, error: type[SpslamError]) -> None:
+def _checked_size(path: Path, file: BinaryIO, max_bytes: int, error: type[SpslamError]) -> int:
     size = os.fstat(file.fileno()).st_size
     if size > max_bytes:
         raise error(f"{path}: must have at most {max_bytes} bytes, got {size}")
+    return size

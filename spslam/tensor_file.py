@@ -13,7 +13,7 @@ import safetensors
 import safetensors.torch
 import torch
 
-from spslam.errors import OutputError, SpslamError
+from spslam.errors import OutputError, SpslamError, brief
 from spslam.io import atomic_write
 from spslam.reading import parse_json
 from spslam.tensor_schema import Layout, TensorSchema
@@ -127,7 +127,7 @@ def whole_number(values: Mapping[str, Any], name: str, low: int = 0, high: int =
     """A whole number of a header; raises ValueError where it is missing, something else or out of range."""
     value = values.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise ValueError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
+        raise ValueError(f"{name} must be a whole number from {low} to {high}, got {_shown(value)}")
     return value
 
 
@@ -135,8 +135,12 @@ def finite_number(values: Mapping[str, Any], name: str, low: float) -> float:
     """A number of a header; raises ValueError where it is missing, something else, below `low` or not finite."""
     value = values.get(name)
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not low <= value < math.inf:
-        raise ValueError(f"{name} must be a finite number of at least {low:g}, got {value!r}")
+        raise ValueError(f"{name} must be a finite number of at least {low:g}, got {_shown(value)}")
     return float(value)
+
+
+def _shown(value: Any) -> str:
+    return repr(brief(value)) if isinstance(value, str) else brief(value)
 
 
 @contextlib.contextmanager
@@ -145,7 +149,7 @@ def _faults_of(path: Path, kind: TensorFile) -> Iterator[None]:
     try:
         yield
     except (safetensors.SafetensorError, ValueError, OSError) as fault:
-        raise kind.error(f"{path}: not a readable {kind.what} ({str(fault).splitlines()[0]})") from None
+        raise kind.error(f"{path}: not a readable {kind.what} ({brief(str(fault), 200)})") from None
     except SpslamError as fault:
         raise kind.error(f"{path}: a damaged {kind.what} ({fault})") from None
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.io import atomic_write
 from spslam.reading import read_lines
@@ -125,7 +125,5 @@ def _parse_row(path: Path, number: int, line: str, may_be_unknown: bool) -> list
     # Lengths whose square is 0 or infinite in floating point can't be divided by.
     is_turn = len(row) == 8 and (not is_finite or _SHORTEST < math.hypot(*row[4:]) < _LONGEST)
     if not is_turn or not (may_be_unknown or is_finite):
-        raise DatasetError(
-            f"{path}, line {number}: must be `timestamp tx ty tz qx qy qz qw`, got {line.strip()[:80]!r}"
-        )
+        raise DatasetError(f"{path}, line {number}: must be `timestamp tx ty tz qx qy qz qw`, got {brief(line)!r}")
     return row

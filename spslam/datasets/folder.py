@@ -20,7 +20,7 @@ from spslam.camera import Camera
 from spslam.datasets.files import FileDataset, FramePaths, attach_pose_table, paired, require_folder
 from spslam.datasets.images import DEPTH_SCALE_RULE, Size, first_size, is_depth_scale, read_depth
 from spslam.datasets.text import camera_from_matrix, read_intrinsics_matrix, read_json
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 
 COLOR_FOLDERS = ("color", "rgb", "images")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -105,13 +105,13 @@ def _read_json_intrinsics(path: Path, width: int, height: int) -> tuple[Camera, 
     values = read_json(path)
     for name in ("fx", "fy", "cx", "cy"):
         if not _is_number(values.get(name)):
-            raise DatasetError(f"{path}: must hold numbers fx, fy, cx, cy, got {name}: {values.get(name)}")
+            raise DatasetError(f"{path}: must hold numbers fx, fy, cx, cy, got {name}: {brief(values.get(name))}")
     for name, actual in (("width", width), ("height", height)):
         if name in values and values[name] != actual:
-            raise DatasetError(f"{path}: {name} must be the images' {actual}, got {values[name]}")
+            raise DatasetError(f"{path}: {name} must be the images' {actual}, got {brief(values[name])}")
     scale = values.get("depth_scale")
     if scale is not None and not is_depth_scale(scale):
-        raise DatasetError(f"{path}: depth_scale must be {DEPTH_SCALE_RULE}, got {scale}")
+        raise DatasetError(f"{path}: depth_scale must be {DEPTH_SCALE_RULE}, got {brief(scale)}")
     matrix = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path)), scale
 

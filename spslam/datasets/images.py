@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from spslam.datasets.image_header import image_size, is_truncated
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 from spslam.reading import read_bytes
 
 # Of an image whose size isn't known beforehand; about 33 million pixels. Pixel records have 16 bits for a coordinate.
@@ -196,20 +196,22 @@ def _load_array(path: Path, size: Size | None) -> np.ndarray:
         read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
         shape, fortran_order, dtype = read_header[version](file)
     except Exception as error:  # NumPy parses the header as Python and raises whatever that raises
-        raise DatasetError(f"{path}: can't be read as an array: {_first_line(error)}") from None
+        raise DatasetError(
+            f"{path}: can't be read as an array: {brief(str(error) or 'its header is damaged')}"
+        ) from None
     if len(shape) != 2 or min(shape) < 1 or dtype.type not in _DEPTH_TYPES:
-        raise DatasetError(f"{path}: depth must be 16-bit or floating-point [H, W], got {dtype} {list(shape)}")
-    height, width = shape
+        raise DatasetError(
+            f"{path}: depth must be 16-bit or floating-point [H, W], got {brief(str(dtype))} {brief(list(shape))}"
+        )
+    height, width = map(int, shape)  # True counts as a number in NumPy's headers
     _check_size((width, height), size, str(path))
     start = file.tell()
     if len(content) - start < height * width * dtype.itemsize:
         raise DatasetError(f"{path}: the array is truncated ({len(content)} bytes)")
-    stored = np.frombuffer(content, dtype, height * width, start).reshape(shape, order="F" if fortran_order else "C")
+    stored = np.frombuffer(content, dtype, height * width, start).reshape(
+        (height, width), order="F" if fortran_order else "C"
+    )
     return stored.astype(dtype.newbyteorder("="), copy=False)
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _image_bytes(path: Path) -> bytes:

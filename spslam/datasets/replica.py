@@ -15,7 +15,7 @@ from spslam.camera import Camera
 from spslam.datasets.files import FileDataset, attach_pose_table, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import DEPTH_SCALE_RULE, first_size, is_depth_scale
 from spslam.datasets.text import camera_from_matrix, read_json
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 
 CAMERA_FILE = "cam_params.json"
 FRAMES_PER_SECOND = 30.0
@@ -51,10 +51,12 @@ def _read_camera(path: Path, width: int, height: int) -> tuple[Camera, float]:
     values = read_json(path).get("camera")
     names = ("w", "h", "fx", "fy", "cx", "cy", "scale")
     if not isinstance(values, dict) or not all(isinstance(values.get(name), (int, float)) for name in names):
-        raise DatasetError(f"{path}: must hold numbers camera.{{{', '.join(names)}}}, got {values}")
+        raise DatasetError(f"{path}: must hold numbers camera.{{{', '.join(names)}}}, got {brief(values)}")
     if (values["w"], values["h"]) != (width, height):
-        raise DatasetError(f"{path}: must give the images' size {width}x{height}, got {values['w']}x{values['h']}")
+        raise DatasetError(
+            f"{path}: must give the images' size {width}x{height}, got {brief(values['w'])}x{brief(values['h'])}"
+        )
     if not is_depth_scale(values["scale"]):
-        raise DatasetError(f"{path}: camera.scale must be {DEPTH_SCALE_RULE}, got {values['scale']}")
+        raise DatasetError(f"{path}: camera.scale must be {DEPTH_SCALE_RULE}, got {brief(values['scale'])}")
     matrix = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path)), float(values["scale"])

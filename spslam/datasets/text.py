@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 from spslam.geometry import orthonormalize
 from spslam.reading import MAX_JSON_BYTES, parse_json, read_lines, read_text
 
@@ -35,7 +35,7 @@ def read_numbers(path: Path) -> np.ndarray:
         try:
             numbers.extend(map(float, line.replace(",", " ").split()))
         except ValueError as error:
-            raise DatasetError(f"{path}: must hold numbers only: {str(error)[:80]}") from None
+            raise DatasetError(f"{path}: must hold numbers only: {brief(str(error))}") from None
     return np.array(numbers, dtype=np.float64)
 
 
@@ -54,7 +54,7 @@ def read_rows(path: Path, columns: int) -> Iterator[list[str]]:
         if not words or words[0].startswith("#"):
             continue
         if len(words) < columns:
-            raise DatasetError(f"{path}, line {number}: must have {columns} columns, got {line.strip()[:80]!r}")
+            raise DatasetError(f"{path}, line {number}: must have {columns} columns, got {brief(line)!r}")
         yield words
 
 

@@ -24,7 +24,7 @@ from spslam.datasets.base import MAX_FRAMES
 from spslam.datasets.files import FileDataset, FramePaths, Undistortion, require_folder
 from spslam.datasets.images import first_size
 from spslam.datasets.text import camera_from_matrix, read_numbers, read_rows
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 from spslam.geometry import interpolate_pose
 from spslam.trajectory import Trajectory
 
@@ -162,9 +162,9 @@ def _read_list(path: Path) -> list[tuple[float, str]]:
         try:
             timestamp = float(words[0])
         except ValueError:
-            raise DatasetError(f"{path}: must list `timestamp file`, got {' '.join(words)[:80]!r}") from None
+            raise DatasetError(f"{path}: must list `timestamp file`, got {brief(' '.join(words))!r}") from None
         if not np.isfinite(timestamp):
-            raise DatasetError(f"{path}: timestamps must be finite, got {words[0]}")
+            raise DatasetError(f"{path}: timestamps must be finite, got {brief(words[0])}")
         entries.setdefault(timestamp, words[1])
         if len(entries) > MAX_FRAMES:
             raise DatasetError(f"{path}: must list at most {MAX_FRAMES} images")

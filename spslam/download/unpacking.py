@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from spslam.download.transfer import require_space
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 
 # Of zip files within zip files; 7-Scenes has one level.
 MAX_DEPTH = 3
@@ -166,11 +166,13 @@ def _unpack_zip(archive: Path, folder: Path, budget: _Budget, depth: int) -> Non
 def _check_zip_member(archive: Path, member: zipfile.ZipInfo) -> None:
     kind = stat.S_IFMT(member.external_attr >> 16)
     if kind and not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-        raise ArchiveError(f"{archive}: must contain only files and folders, but {member.filename} is a link or device")
+        raise ArchiveError(
+            f"{archive}: must contain only files and folders, but {brief(member.filename)} is a link or device"
+        )
     if member.flag_bits & _ENCRYPTED:
-        raise ArchiveError(f"{archive}: must not be encrypted, but {member.filename} is")
+        raise ArchiveError(f"{archive}: must not be encrypted, but {brief(member.filename)} is")
     if member.compress_type not in _METHODS:
-        raise ArchiveError(f"{archive}: must be stored or deflated, but {member.filename} isn't")
+        raise ArchiveError(f"{archive}: must be stored or deflated, but {brief(member.filename)} isn't")
 
 
 def _is_tar(archive: Path) -> bool:
@@ -190,7 +192,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: _Budget) -> None:
             _place(archive, folder, member.name)
             if not (member.isfile() or member.isdir()):
                 raise ArchiveError(
-                    f"{archive}: must contain only files and folders, but {member.name} is a link or device"
+                    f"{archive}: must contain only files and folders, but {brief(member.name)} is a link or device"
                 )
             # Before the loop goes on and skips the content, which may have to be inflated for that.
             budget.spend(member.size)
@@ -234,10 +236,10 @@ def _place(archive: Path, folder: Path, name: str) -> Path:
     resolved, root, source = place.resolve(), folder.resolve(), archive.resolve()
     # A link that was in the folder before could point outside too.
     if not inside or not resolved.is_relative_to(root):
-        raise ArchiveError(f"{archive}: must not contain paths outside the folder it is unpacked in, got {name}")
+        raise ArchiveError(f"{archive}: must not contain paths outside the folder it is unpacked in, got {brief(name)}")
     # The folder of archives may lie below the one that is unpacked into, and has notes on them.
     if resolved == source or (root in source.parent.parents and resolved.is_relative_to(source.parent)):
-        raise ArchiveError(f"{archive}: must not contain paths in the folder that it lies in, got {name}")
+        raise ArchiveError(f"{archive}: must not contain paths in the folder that it lies in, got {brief(name)}")
     return place
 
 
@@ -255,10 +257,10 @@ def _faults_of(archive: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno is not None and error.errno not in _NAME_ERRORS:
             raise
-        raise ArchiveError(f"{archive}: the archive is damaged: {error.strerror or error}") from error
+        raise ArchiveError(f"{archive}: the archive is damaged: {brief(str(error.strerror or error))}") from error
     except DatasetError:
         raise
     except _RefusedError as error:
         raise ArchiveError(f"{archive}: {error}") from None
     except Exception as error:  # zipfile, tarfile and zlib raise a dozen classes, and none in common
-        raise ArchiveError(f"{archive}: the archive is damaged: {error}") from error
+        raise ArchiveError(f"{archive}: the archive is damaged: {brief(str(error) or type(error).__name__)}") from error

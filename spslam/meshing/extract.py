@@ -7,12 +7,15 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
+from spslam.errors import SpslamError
 from spslam.meshing.cleaning import face_support, front_facing_in_view, in_large_component
 from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
 from spslam.meshing.sdf_sampling import SignedDistance, near_surface, near_surface_parts, sample_blocks
 from spslam.scene import Scene
 
 CHUNK_POINTS = 1 << 19
+# Of the field, near the surface: 5 GB, a hundred times what a floor of a building needs at 2 cm.
+MAX_SAMPLES = 1 << 29
 # The learned field is not an exact distance. Where its gradient exceeds this bound, surface could be missed.
 MAX_SLOPE = 1.5
 MIN_SUPPORT = 0.1
@@ -51,6 +54,7 @@ def extract_surface(
 
     Raises:
         ValueError: a size that is not positive, or `cell_coords` of another dtype or shape or with repeated rows.
+        SpslamError: more than `MAX_SAMPLES` samples would be needed.
     """
     for name, value in {"cell_size_m": cell_size_m, "resolution_m": resolution_m, "max_slope": max_slope}.items():
         if not value > 0:
@@ -63,11 +67,21 @@ def extract_surface(
     blocks, per_block = cubes_per_cell(cell_size_m, resolution_m)
     block_size_m = cell_size_m / blocks
     coords = near_surface(cell_coords, cell_size_m, sdf, max_slope, chunk_points)
+    _check_samples(max(len(coords), 1) * blocks**3, cell_size_m, resolution_m)
     if blocks > 1:
         coords = near_surface_parts(coords, blocks, block_size_m, sdf, max_slope, chunk_points)
+    _check_samples(len(coords) * (per_block + 1) ** 3, cell_size_m, resolution_m)
     values = sample_blocks(coords, block_size_m, per_block, sdf, chunk_points)
     vertices, faces = ops.marching_cubes(coords, values)
     return vertices * block_size_m, faces
+
+
+def _check_samples(samples: int, cell_size_m: float, resolution_m: float) -> None:
+    if samples > MAX_SAMPLES:
+        raise SpslamError(
+            f"extract_surface: cells of {cell_size_m:g} m must take at most {MAX_SAMPLES} samples, got {samples}; "
+            f"choose a resolution_m above {resolution_m:g}"
+        )
 
 
 def cubes_per_cell(cell_size_m: float, resolution_m: float) -> tuple[int, int]:

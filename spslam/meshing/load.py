@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, brief
 from spslam.reading import read_bytes
 
 READ_FORMATS = (".ply", ".obj", ".glb", ".stl", ".off")
@@ -69,7 +69,7 @@ def load_mesh(path: Path) -> Mesh:
         _check(vertices, faces)
         return Mesh(vertices, faces, _vertex_colors(mesh))
     except Exception as error:  # trimesh raises whatever the parser stumbles over
-        text = " ".join(str(error).split())[:200] or type(error).__name__
+        text = brief(str(error) or type(error).__name__, 200)
         raise DatasetError(f"{path}: can't be read as a mesh: {text}") from error
 
 

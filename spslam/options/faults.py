@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic.fields import FieldInfo
 
+from spslam.errors import brief
 from spslam.options import Config
 from spslam.options.needs import Need, in_yaml, needs_of, option_value
 from spslam.options.section import Section
@@ -74,13 +75,12 @@ def describe_fault(fault: Any) -> str:
         return f"{path} must be set in the configuration file"
     if kind == "value_error":
         return str(context["error"])
-    return f"{_option_path(path)} must {_rule(kind, context)}, got {brief(value)}"
+    return f"{_option_path(path)} must {_rule(kind, context)}, got {shown(value)}"
 
 
-def brief(value: Any) -> str:
-    """A value in one line of at most 60 characters."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
+def shown(value: Any) -> str:
+    """A value of the user as messages show it."""
+    return brief(repr(value), 60)
 
 
 def _unknown(path: str) -> str:

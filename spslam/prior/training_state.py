@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from spslam.errors import WeightsError
+from spslam.errors import WeightsError, brief
 from spslam.io import atomic_write
 from spslam.prior.encoder import DECODER_WIDTHS, ENCODER_WIDTHS, parameter_count
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, whole_number
@@ -80,11 +80,11 @@ def load_state(path: Path, settings: dict) -> TrainingState:
     header = load_header(path, _FILE)
     before = header.get("settings")
     if not isinstance(before, dict):
-        raise WeightsError(f"{path}: a damaged {_FILE.what} (settings must be an object, got {before!r})")
+        raise WeightsError(f"{path}: a damaged {_FILE.what} (settings must be an object, got {brief(before)})")
     for name, value in settings.items():
         if before.get(name) != value:
             raise WeightsError(
-                f"{path}: must be resumed with {name} = {before.get(name)}, got {value}; "
+                f"{path}: must be resumed with {name} = {brief(before.get(name))}, got {value}; "
                 "remove the file to start from the beginning"
             )
     tensors = load_tensors(

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from spslam import ops
-from spslam.errors import SpslamError
+from spslam.errors import SpslamError, brief
 from spslam.options import SceneOptions
 from spslam.scene import sparse_volume, tri_planes
 from spslam.scene.decoders import COLOR_DECODER, GEOMETRY_DECODER, random_parameters
@@ -205,7 +205,7 @@ class Scene:
             scene = cls(SceneSettings(**header["settings"]), whole_number(header, "seed"), device=device)
             scene.load_state_dict(state)
         except (SpslamError, KeyError, TypeError, ValueError) as error:
-            raise SpslamError(f"{path}: a damaged map ({error})") from None
+            raise SpslamError(f"{path}: a damaged map ({brief(str(error), 300)})") from None
         return scene
 
     def _empty_volume(self) -> SparseVolume:
@@ -223,4 +223,4 @@ def _check_within_option(name: str, value: Any) -> None:
     high = next((limit.le for limit in limits if hasattr(limit, "le")), math.inf)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not (is_number and low < value <= high and math.isfinite(value)):
-        raise ValueError(f"SceneSettings: {name} must be above {low:g} and at most {high:g}, got {value!r}")
+        raise ValueError(f"SceneSettings: {name} must be above {low:g} and at most {high:g}, got {brief(repr(value))}")

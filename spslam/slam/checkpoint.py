@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from spslam.config import Config, read_shipped
-from spslam.errors import OutputError, SpslamError
+from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
 from spslam.slam.recovery.pose_confidence import MODEL_FILE
 from spslam.slam.state import Moments, SlamState
@@ -123,7 +123,7 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, A
         _restore(state, tensors, header)
         return source
     except (SpslamError, KeyError, TypeError, ValueError) as error:
-        raise OutputError(f"{path}: a damaged checkpoint ({error})") from None
+        raise OutputError(f"{path}: a damaged checkpoint ({brief(str(error), 300)})") from None
 
 
 def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
@@ -142,7 +142,7 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
     }
     state.steps, state.stamp = (whole_number(header, name, high=_MOST_ITERATIONS) for name in ("steps", "stamp"))
     if not isinstance(header.get("unmapped"), bool):
-        raise ValueError(f"unmapped must be true or false, got {header.get('unmapped')!r}")
+        raise ValueError(f"unmapped must be true or false, got {brief(header.get('unmapped'))}")
     state.unmapped = header["unmapped"]
 
 

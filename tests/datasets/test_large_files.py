@@ -138,6 +138,12 @@ BAD_ARRAYS = {
         + struct.pack("<H", 5060)
         + b"{'descr': '<f4', 'fortran_order': False, 'shape': (1, %b)}" % (b"9" * 5000)
     ),
+    "truth": lambda path: path.write_bytes(
+        b"\x93NUMPY\1\0"
+        + struct.pack("<H", 60)
+        + b"{'descr': '<f4', 'fortran_order': False, 'shape': (True, 1)}".ljust(60)
+        + bytes(4)
+    ),
     "version": lambda path: path.write_bytes(b"\x93NUMPY\7\0" + bytes(100)),
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("not an array"),

@@ -5,6 +5,7 @@ import pytest
 import torch
 import trimesh
 
+from spslam.errors import SpslamError
 from spslam.meshing import cubes_per_cell, extract_surface
 from tests.meshing import fields
 
@@ -165,3 +166,13 @@ def test_errors(changes, message):
     arguments = dict(cell_coords=fields.cells_within(1), cell_size_m=CELL_M, resolution_m=0.01, sdf=fields.sphere(0.03))
     with pytest.raises(ValueError, match="^extract_surface: " + message):
         extract_surface(**{**arguments, **changes})
+
+
+@pytest.mark.parametrize("cell_size_m,resolution_m", [(1e6, 0.01), (1000.0, 0.02), (0.04, 1e-6)])
+def test_a_surface_of_more_samples_than_any_building_has_is_refused(cell_size_m, resolution_m):
+    """A map whose voxel size was changed would take gigabytes."""
+    for cells in (fields.cells_within(2), fields.cells_within(2)[:0]):
+        with pytest.raises(
+            SpslamError, match="must take at most 536870912 samples, got .*; choose a resolution_m above"
+        ):
+            extract_surface(cells, cell_size_m, resolution_m, fields.sphere(0.05))

@@ -1,0 +1,1 @@
+"""The formats: good examples, how they are spoiled, and how they are read."""
