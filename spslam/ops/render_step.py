@@ -1,8 +1,8 @@
 """One step of tracking or mapping, fused: rays in, losses and gradients out (sections III.B, III.C).
 
 The composable ops compute the same one at a time (`sample_along_rays`, `voxel_hash_find`, `trilinear_interpolate`,
-`mlp`, `volume_render`, `rendering_losses`). Here the forward and backward pass of a ray run while its samples are in the
-cache, and samples outside the allocated voxels are skipped.
+`mlp`, `volume_render`, `rendering_losses`). Here the forward and backward pass of a ray run while its samples are in
+the cache, and samples outside the allocated voxels are skipped.
 """
 
 from dataclasses import dataclass
