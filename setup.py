@@ -16,6 +16,12 @@ from spslam_build import cuda_setting, readme_for_index, torch_dir
 
 OPTIONS = ("SPSLAM_CUDA_ARCHS", "SPSLAM_CPU_ISAS")
 ROOT = pathlib.Path(__file__).parent.resolve()
+# Folders without modules are packages too, so that setuptools takes what lies in them.
+DATA_PACKAGES = {
+    "spslam.benchmark.data": ["*.yaml"],
+    "spslam.benchmark.data.suites": ["*.yaml"],
+    "spslam.prior.data": ["*.safetensors"],
+}
 REPOSITORY = load_file(ROOT / "pyproject.toml")["project"]["urls"]["Homepage"]
 
 
@@ -67,12 +73,11 @@ CONFIG_PACKAGES = {
 setup(
     long_description=readme_for_index((ROOT / "README.md").read_text(encoding="utf-8"), REPOSITORY),
     long_description_content_type="text/markdown",
-    packages=[*find_packages(include=["spslam", "spslam.*"]), *CONFIG_PACKAGES],
+    packages=[*find_packages(include=["spslam", "spslam.*"]), *DATA_PACKAGES, *CONFIG_PACKAGES],
     package_dir=CONFIG_PACKAGES,
     package_data={
         "spslam": ["py.typed"],
-        "spslam.benchmark": ["data/*.yaml", "data/suites/*.yaml"],
-        "spslam.prior": ["data/*.safetensors"],
+        **DATA_PACKAGES,
         **{name: ["*.yaml"] for name in CONFIG_PACKAGES},
     },
     ext_modules=[Extension("spslam._ops_cpu", sources=[])],
