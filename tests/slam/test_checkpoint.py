@@ -83,8 +83,8 @@ def test_an_unchanged_checkpoint_is_read(load, checkpoint):
         ("pixels.records", (2, 256, 2), r"must be int32 \[2, 256, 3\], got int32 \[2, 256, 2\]"),
         ("pixels.records", (1, 256, 3), r"must be int32 \[2, 256, 3\], got int32 \[1, 256, 3\]"),
         ("pixels.has_pixels", (5,), r"must be bool \[2\], got bool \[5\]"),
-        ("views.images", (6, 48, 63), r"must be uint16 \[6, 48, 64\], got uint16 \[6, 48, 63\]"),
-        ("views.frames", (7,), r"must be int64 \[6\], got int64 \[7\]"),
+        ("depth_keyframes.images", (6, 48, 63), r"must be uint16 \[6, 48, 64\], got uint16 \[6, 48, 63\]"),
+        ("depth_keyframes.frames", (7,), r"must be int64 \[6\], got int64 \[7\]"),
         ("moments.geometry_decoder.first", (7,), r"must be float32 \[1473\], got float32 \[7\]"),
         ("moments.embeddings.second", (9, 8), r"must be float32 \[\d+, 8\], got float32 \[9, 8\]"),
     ],
@@ -104,7 +104,7 @@ def test_a_tensor_of_another_shape_is_refused(load, name, shape, message):
         ("frames.consistent_frames", -7, "tensor frames.consistent_frames must be at least 0, got -7"),
         ("pixels.records", -1, "tensor pixels.records must lie in the image, got a pixel beyond its width"),
         ("pixels.records", 48 << 16, "tensor pixels.records must lie in the image, got a pixel beyond its height"),
-        ("views.frames", 2, "tensor views.frames must be below 2, got 2"),
+        ("depth_keyframes.frames", 2, "tensor depth_keyframes.frames must be below 2, got 2"),
         ("scene.planes.layout", 2**62, "layout of plane 0 must "),
         ("moments.poses.second", -1.0, "tensor moments.poses.second must be at least 0, got -1"),
     ],
@@ -120,7 +120,7 @@ def test_truth_values_other_than_0_and_1_are_refused(load):
     refused(load, change, "tensor frames.lost must be 0 or 1, got 2")
 
 
-@pytest.mark.parametrize("name", ["frames.poses", "scene.origin", "pixels.records", "views.images"])
+@pytest.mark.parametrize("name", ["frames.poses", "scene.origin", "pixels.records", "depth_keyframes.images"])
 def test_a_missing_tensor_is_named(load, name):
     refused(load, lambda tensors, _: tensors.pop(name), f"tensors? {name} ")
 

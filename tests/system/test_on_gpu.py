@@ -72,7 +72,7 @@ def test_the_host_waits_for_the_device_no_more_than_it_must(preset):
             with _noted_waits() as noted:
                 report = system.submit(item)
             waits.append(noted)
-            mapped.append(report.known["mapping_iterations"] > 0)
+            mapped.append(report.report.mapping_iterations > 0)
     # The map grows most with the first frames.
     for noted, is_mapped in list(zip(waits, mapped, strict=True))[11:]:
         allowed = WAITS_A_FRAME + WAITS_A_MAPPING_CALL * is_mapped
