@@ -51,7 +51,7 @@ LaunchGraph* find_launch_graph(std::int64_t number) {
   Registry& r = registry();
   const std::lock_guard<std::mutex> lock(r.mutex);
   const auto found = r.graphs.find(number);
-  SPS_CHECK(found != r.graphs.end(), "spslam: launch graph ", number, " does not exist any more");
+  SPS_CHECK(found != r.graphs.end(), "spslam: graph must name a launch graph that exists, got ", number);
   return found->second.get();
 }
 
