@@ -115,6 +115,8 @@ FeatureVolume checked_volume(const std::vector<Tensor>& tensors, std::int64_t nu
 
 FusionSettings load_fusion(const Tensor& encoder_params, const Scalars<Scalar>& scalars,
                            const Integers<Integer>& integers) {
+  SPS_CHECK(integers[Integer::kMaxPoints] >= 0, "encode_frame_: max_points must be at least 0, got ",
+            integers[Integer::kMaxPoints]);
   return {
       checked_settings("encode_frame_", encoder_params, scalars[Scalar::kVoxelSize], integers[Integer::kNeighborhood],
                        scalars[Scalar::kMinPairWeight], integers.as<bool>(Integer::kTf32)),

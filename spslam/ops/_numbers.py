@@ -9,6 +9,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Callable, Iterable, Sequence, Sized
+from enum import Enum
 from numbers import Integral, Real
 from typing import Any
 
@@ -120,7 +121,8 @@ class _Object(Rule):
 
 
 def _fits_64_bits(value: Any) -> bool:
-    return -(2**63) <= value < 2**63
+    # Members of an enum do; torch.compile of torch 2.11 can't compare them.
+    return isinstance(value, Enum) or -(2**63) <= value < 2**63
 
 
 def _is_sequence(value: Any) -> bool:
