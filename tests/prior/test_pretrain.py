@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 from safetensors.torch import save_file
-from spslam.prior.checkpoint import load_state
+from spslam.prior.training_state import load_state
 
 from spslam.errors import WeightsError
 from spslam.prior import load_prior

@@ -12,7 +12,7 @@ from random import Random
 
 import numpy as np
 import torch
-from spslam.prior.checkpoint import TrainingState, load_state, save_state
+from spslam.prior.training_state import TrainingState, load_state, save_state
 
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.generated import GeneratedDataset
