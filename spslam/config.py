@@ -50,7 +50,7 @@ def load_config(path: str | os.PathLike, preset: str | None = None, overrides: I
     defaults = _read(_config_dir() / "defaults.yaml")
     name = preset or dict(changes).get("preset") or file.get("preset") or defaults["preset"]
     if name not in PRESETS:
-        raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}")
+        raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {_shown(name)}")
     merged = _merge(defaults, _read(_config_dir() / "presets" / f"{name}.yaml"), "")
     merged = _merge(merged, file, "")
     merged = _merge(merged, _preset_section(merged.pop("presets", {}), name), "")
@@ -182,7 +182,7 @@ def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict
             if value is None:  # a section whose lines are all commented out
                 continue
             if not isinstance(value, dict):
-                raise ConfigError(f"{prefix}{key} must be a section of options, got {_shown(value)}")
+                raise ConfigError(f"{prefix}{brief(key)} must be a section of options, got {_shown(value)}")
             merged[key] = _merge(base[key], value, f"{prefix}{key}.")
         else:
             merged[key] = value
@@ -194,7 +194,7 @@ def _preset_section(presets: Any, name: str) -> dict[str, Any]:
         raise ConfigError(f"presets must be a section of options, got {_shown(presets)}")
     for key, value in presets.items():
         if key not in PRESETS:
-            raise ConfigError(f"presets.{key} is not an option; it must be one of {', '.join(PRESETS)}")
+            raise ConfigError(f"presets.{brief(key)} is not an option; it must be one of {', '.join(PRESETS)}")
         if not isinstance(value, dict):
             raise ConfigError(f"presets.{key} must be a section of options, got {_shown(value)}")
     return presets.get(name, {})
@@ -229,7 +229,7 @@ def _unknown(path: str) -> str:
     near = near or [option for option in known if option.rpartition(".")[2] == key]
     near = near or difflib.get_close_matches(path, known, n=1, cutoff=0.8)
     hint = f"did you mean {near[0]}?" if near else "docs/configuration.md lists them all"
-    return f"{path} is not an option; {hint}"
+    return f"{brief(path)} is not an option; {hint}"
 
 
 def _option_path(path: str) -> str:

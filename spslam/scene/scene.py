@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -202,11 +203,11 @@ class Scene:
         return TriPlanes(settings.plane_cell_m, self.seed, self.device, settings.max_texels)
 
 
-def _check_within_option(name: str, value: object) -> None:
+def _check_within_option(name: str, value: Any) -> None:
     """Raises ValueError where a length is outside the range of the option of that name."""
     limits = SceneOptions.model_fields[name].metadata
     low = next(limit.gt for limit in limits if hasattr(limit, "gt"))
     high = next((limit.le for limit in limits if hasattr(limit, "le")), math.inf)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (is_number and low < value <= high and math.isfinite(value)):
+    if not is_number or not low < value <= high or not math.isfinite(value):
         raise ValueError(f"SceneSettings: {name} must be above {low:g} and at most {high:g}, got {brief(repr(value))}")
