@@ -18,7 +18,7 @@ from typing import Any
 import pydantic
 import yaml
 
-from spslam.errors import ConfigError
+from spslam.errors import ConfigError, brief
 from spslam.options import PRESETS, Config
 from spslam.options.faults import describe_fault, describe_unused, option_paths, shown
 from spslam.reading import MAX_DIGITS, read_text
@@ -51,7 +51,7 @@ def load_config(path: str | os.PathLike, preset: str | None = None, overrides: I
     defaults = _read(_config_dir() / "defaults.yaml")
     name = preset or dict(changes).get("preset") or file.get("preset") or defaults["preset"]
     if name not in PRESETS:
-        raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}")
+        raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {shown(name)}")
     is_resolved = _pop_resolved(file, path, name)
     merged = _merge(defaults, _read(_config_dir() / "presets" / f"{name}.yaml"), "")
     given: set[str] = set()
@@ -186,7 +186,7 @@ def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict
             if value is None:  # a section whose lines are all commented out
                 continue
             if not isinstance(value, dict):
-                raise ConfigError(f"{prefix}{key} must be a section of options, got {shown(value)}")
+                raise ConfigError(f"{prefix}{brief(key)} must be a section of options, got {shown(value)}")
             merged[key] = _merge(base[key], value, f"{prefix}{key}.")
         else:
             merged[key] = value
@@ -210,7 +210,7 @@ def _preset_section(presets: Any, name: str) -> dict[str, Any]:
         raise ConfigError(f"presets must be a section of options, got {shown(presets)}")
     for key, value in presets.items():
         if key not in PRESETS:
-            raise ConfigError(f"presets.{key} is not an option; it must be one of {', '.join(PRESETS)}")
+            raise ConfigError(f"presets.{brief(key)} is not an option; it must be one of {', '.join(PRESETS)}")
         if not isinstance(value, dict):
             raise ConfigError(f"presets.{key} must be a section of options, got {shown(value)}")
     return presets.get(name, {})

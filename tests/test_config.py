@@ -205,6 +205,9 @@ ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
         ("seed: 0001-01-01 00:00:00 +23:59", "seed must be a whole number, got datetime"),
         ("seed: 99999999999999999999", "seed must be below 9223372036854775808, got 99999999999999999999"),
         ("seed: text", "seed must be a whole number, got 'text'"),
+        ("preset: " + "x" * 5000, "preset must be one of paper, balanced, fast, got 'xxx"),
+        ("? " + "x" * 5000 + "\n: 1", "xxx[.]{3} is not an option"),
+        ("presets: {" + "x" * 500 + ": 1}", "presets.xxxx*[.]{3} is not an option"),
         ("# " + "x" * (1 << 20), "must have at most 1048576 bytes, got 1048578"),
     ],
 )

@@ -42,7 +42,7 @@ def image_size(content: bytes) -> tuple[int, int]:
             return _jpeg_size(content)
         if content[:4] in _TIFF:
             return _tiff_size(content)
-    except (struct.error, IndexError, KeyError) as error:
+    except (struct.error, IndexError, KeyError, OverflowError) as error:
         raise ValueError("damaged header") from error
     raise ValueError("neither PNG, JPEG nor TIFF")
 

@@ -123,8 +123,9 @@ def check_image_size(size: Size, name: str) -> None:
 
 def is_depth_scale(units_per_meter: Any) -> bool:
     """Whether something is a number that can be the stored value of one meter."""
-    is_number = isinstance(units_per_meter, (int, float)) and not isinstance(units_per_meter, bool)
-    return is_number and _LEAST_UNITS <= units_per_meter <= _MOST_UNITS
+    if not isinstance(units_per_meter, (int, float)) or isinstance(units_per_meter, bool):
+        return False
+    return _LEAST_UNITS <= units_per_meter <= _MOST_UNITS
 
 
 def first_size(paths: Iterable[Path], read: Callable[[Path], np.ndarray] = read_color) -> Size:

@@ -31,6 +31,7 @@ _LONGEST_NAME = 4096
 # A compressed image may be larger than the pixels it holds, but not much; PNG and JPEG may carry notes.
 _MOST_COMPRESSED_SHARE, _MOST_NOTES_BYTES = 2, 1 << 16
 _COLOR_BYTES, _DEPTH_BYTES = 3, 2
+_FRAME_SIZES = struct.Struct("<QQ")  # bytes of color and of depth, the last of a frame's head
 _FRAME_HEAD = np.dtype(
     [
         ("pose", "<f4", 16),
@@ -40,7 +41,6 @@ _FRAME_HEAD = np.dtype(
         ("depth_bytes", "<u8"),
     ]
 )
-_SIZES_AT = _FRAME_HEAD.itemsize - 16  # of color_bytes and depth_bytes
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def _read_index(file: BinaryIO, frames: int) -> SensIndex:
             break
         file.seek(offset)
         head = file.read(_FRAME_HEAD.itemsize)
-        color_bytes, depth_bytes = struct.unpack_from("<QQ", head, _SIZES_AT)
+        color_bytes, depth_bytes = _FRAME_SIZES.unpack(head[-_FRAME_SIZES.size :])
         offset = begin + color_bytes + depth_bytes
         if offset > end:
             break

@@ -29,7 +29,7 @@ MAX_DEPTH = 3
 _FREE_BYTES, _BYTES_PER_BYTE = 64 << 20, 100
 _FREE_MEMBERS, _BYTES_PER_MEMBER = 10_000, 200
 # Read at a time, so that neither a directory nor a header takes much memory; a zip's directory comes in one piece.
-_TAR_CHUNK_BYTES, _ZIP_CHUNK_BYTES = 16 << 10, 64 << 20
+_TAR_CHUNK_BYTES, _ZIP_CHUNK_BYTES = 16 << 10, 16 << 20
 _TAR_BLOCK_BYTES = 512
 # Python's parser of tar headers goes over a row of digits once for each of them.
 _LONG_NUMBER = re.compile(rb"\d{21}")
@@ -38,6 +38,8 @@ _ENCRYPTED = 1
 _GZIP_MARK = b"\x1f\x8b"
 # What the system says of a name that no file can have here.
 _NAME_ERRORS = {errno.ENAMETOOLONG, errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.EINVAL, errno.ELOOP, errno.EILSEQ}
+# And of a nested archive that another one took away by holding a name twice.
+_NAME_ERRORS |= {errno.ENOENT}
 
 
 class ArchiveError(DatasetError):
@@ -157,7 +159,7 @@ def _unpack_zip(archive: Path, folder: Path, budget: _Budget, depth: int) -> Non
                 _write(source, place)
             if place.suffix.lower() == ".zip":
                 nested.append(place)
-    for inner in nested:
+    for inner in dict.fromkeys(nested):
         with _faults_of(inner):
             _unpack_zip(inner, inner.parent, budget, depth - 1)
         inner.unlink()

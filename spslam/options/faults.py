@@ -93,7 +93,7 @@ def _unknown(path: str) -> str:
     near = near or [option for option in known if option.rpartition(".")[2] == key]
     near = near or difflib.get_close_matches(path, known, n=1, cutoff=0.8)
     hint = f"did you mean {near[0]}?" if near else "docs/configuration.md lists them all"
-    return f"{path} is not an option; {hint}"
+    return f"{brief(path)} is not an option; {hint}"
 
 
 def _option_path(path: str) -> str:

@@ -222,5 +222,5 @@ def _check_within_option(name: str, value: Any) -> None:
     low = next(limit.gt for limit in limits if hasattr(limit, "gt"))
     high = next((limit.le for limit in limits if hasattr(limit, "le")), math.inf)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (is_number and low < value <= high and math.isfinite(value)):
+    if not is_number or not low < value <= high or not math.isfinite(value):
         raise ValueError(f"SceneSettings: {name} must be above {low:g} and at most {high:g}, got {brief(repr(value))}")

@@ -62,6 +62,7 @@ def test_a_tile_may_be_larger_than_the_image():
         (b"\xff\xd8\xff" + b"\0\xff" * 10**6, "damaged header"),
         (tiff("<", False, {256: 37}), "damaged header"),
         (b"II*\0" + struct.pack("<I", 2**31), "damaged header"),
+        (b"II+\0" + struct.pack("<HHQ", 8, 0, 2**64 - 1), "damaged header"),
     ],
 )
 def test_damaged_headers(content, message):

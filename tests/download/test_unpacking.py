@@ -197,6 +197,18 @@ def test_an_archive_does_not_replace_itself_or_its_notes(tmp_path):
     refused(write(tmp_path, "b.zip", zipped({"seq.zip": inner})), "must leave the folder that it lies in alone")
 
 
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_nested_archives_of_one_name(tmp_path):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in ("one.txt", "two.txt"):
+            archive.writestr("seq.zip", zipped({name: b"x"}))
+    unpack(write(tmp_path, "a.zip", buffer.getvalue()), tmp_path / "out")
+    assert tree(tmp_path / "out") == {"two.txt": b"x"}
+    taken = zipped({"a.zip": zipped({"b.zip": zipped(FILES)}), "b.zip": zipped(FILES)})
+    refused(write(tmp_path, "c.zip", taken), "the archive is damaged: No such file or directory")
+
+
 @pytest.mark.parametrize(
     "names", [["a" * 300], ["a", "a/b"], ["a/b", "a"], ["."], ["a//", "a"], ["a\0b"], ["x/" * 3000 + "y"]]
 )

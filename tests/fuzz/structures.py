@@ -221,7 +221,7 @@ def _resize(random: Random, parts: TensorFileContent) -> None:
     """Fewer or more rows, and a shape that says so."""
     tensor = _any_tensor(random, parts)
     width = TYPES.get(tensor.dtype, 4) * math.prod(tensor.shape[1:])
-    if not tensor.shape or not 0 < width <= len(tensor.content):
+    if not tensor.shape or not 0 < width * tensor.shape[0] <= 2 * len(tensor.content):
         return
     rows = max(tensor.shape[0] + random.choice((-1, 1, -tensor.shape[0], 2, 100, -(tensor.shape[0] // 2))), 0)
     tensor.content = (tensor.content * 2 + bytes(rows * width))[: rows * width]
@@ -231,7 +231,7 @@ def _resize(random: Random, parts: TensorFileContent) -> None:
 def _edit_values(random: Random, parts: TensorFileContent) -> None:
     """Other numbers at a few places, or everywhere."""
     tensor = _any_tensor(random, parts)
-    if tensor.dtype not in _NUMPY or not tensor.content:
+    if tensor.dtype not in _NUMPY or not tensor.content or len(tensor.content) % TYPES[tensor.dtype]:
         return
     values = np.frombuffer(tensor.content, _NUMPY[tensor.dtype]).copy()
     count = random.choice((1, 1, 2, 15, len(values)))

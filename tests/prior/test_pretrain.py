@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 from safetensors.torch import save_file
-from spslam.prior.training_state import load_state
 
 from spslam.errors import WeightsError
 from spslam.prior import load_prior
@@ -14,6 +13,7 @@ from spslam.prior import pretrain as pretraining
 from spslam.prior.patches import PatchSettings
 from spslam.prior.pretrain import pretrain, training_files
 from spslam.prior.training import PretrainSettings, initial_networks, split_networks
+from spslam.prior.training_state import load_state
 from spslam.prior.validation import first_zero_crossing, validate
 
 SMALL = PretrainSettings(steps=20, patches_per_kind=2, views=PatchSettings(rays=48))

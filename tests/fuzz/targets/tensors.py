@@ -12,13 +12,13 @@ from random import Random
 
 import numpy as np
 import torch
-from spslam.prior.training_state import TrainingState, load_state, save_state
 
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.generated import GeneratedDataset
 from spslam.meshing import extract_mesh
 from spslam.prior.encoder import load_prior, shipped_weights
 from spslam.prior.training import PretrainSettings
+from spslam.prior.training_state import TrainingState, load_state, save_state
 from spslam.scene import Scene
 from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapshot
 from spslam.slam.encode_frame import encode_frame
