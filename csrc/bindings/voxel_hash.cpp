@@ -69,6 +69,8 @@ Tensor voxel_hash_insert(Tensor hash_keys, Tensor hash_values, Tensor voxel_coor
   const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
   check_coords(name, voxel_coords);
   SPS_CHECK(first_id >= 0, name, ": first_id must be at least 0, got ", first_id);
+  std::int64_t* const keys = mutable_data<std::int64_t>(hash_keys);  // before they are read as contiguous
+  std::int32_t* const values = mutable_data<std::int32_t>(hash_values);
   DeviceScope scope(hash_keys);
   const Absent absent(scope.context, hash_keys, hash_values, contiguous(voxel_coords));
   const AbsentVoxels& found = absent.found;
@@ -77,8 +79,8 @@ Tensor voxel_hash_insert(Tensor hash_keys, Tensor hash_values, Tensor voxel_coor
   check_room(name, capacity, first_id + found.count);
   SPS_CHECK(found.count <= found.empty_slots, name, ": first_id must be the number of voxels in the table, got ",
             first_id, " for a table with ", found.empty_slots, " empty slots of ", capacity);
-  voxel_hash_assign(scope.context, mutable_data<std::int64_t>(hash_keys), mutable_data<std::int32_t>(hash_values),
-                    capacity, data<std::int64_t>(absent.keys), found.count, to_int32(name, "first_id", first_id));
+  voxel_hash_assign(scope.context, keys, values, capacity, data<std::int64_t>(absent.keys), found.count,
+                    to_int32(name, "first_id", first_id));
   return absent.coords(scope.context);
 }
 
@@ -89,12 +91,13 @@ void voxel_hash_build(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords)
   voxel_coords = contiguous(voxel_coords);
   const std::int64_t n = voxel_coords.size(0);
   check_room(name, capacity, n);
+  std::int64_t* const keys = mutable_data<std::int64_t>(hash_keys);
+  std::int32_t* const values = mutable_data<std::int32_t>(hash_values);
   DeviceScope scope(hash_keys);
-  const Tensor keys = empty(hash_keys, {n}, ScalarType::Long);
-  voxel_hash_pack(scope.context, data<std::int32_t>(voxel_coords), n, mutable_data<std::int64_t>(keys));
+  const Tensor packed = empty(hash_keys, {n}, ScalarType::Long);
+  voxel_hash_pack(scope.context, data<std::int32_t>(voxel_coords), n, mutable_data<std::int64_t>(packed));
   torch::stable::fill_(hash_keys, -1);
-  voxel_hash_assign(scope.context, mutable_data<std::int64_t>(hash_keys), mutable_data<std::int32_t>(hash_values),
-                    capacity, data<std::int64_t>(keys), n, 0);
+  voxel_hash_assign(scope.context, keys, values, capacity, data<std::int64_t>(packed), n, 0);
 }
 
 Tensor voxel_hash_find(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords) {

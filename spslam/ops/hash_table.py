@@ -108,9 +108,12 @@ class VoxelHash:
             VoxelLimitError: more than `max_voxels` would exist. The set is then as before.
             RuntimeError: a coordinate out of range. The set is then as before.
         """
-        new = absent_voxels("VoxelHash.insert", self.hash_keys, self.hash_values, voxel_coords)
-        if new.shape[0] > 0:
-            self._enter(new)
+        check_tensor("VoxelHash.insert", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=self.hash_keys)
+        voxel_ids = self.find(voxel_coords)
+        missing = voxel_coords[voxel_ids < 0]
+        if missing.shape[0] == 0:
+            return voxel_ids
+        self._enter(absent_voxels("VoxelHash.insert", self.hash_keys, self.hash_values, missing))
         return self.find(voxel_coords)
 
     def build(self, voxel_coords: torch.Tensor) -> None:

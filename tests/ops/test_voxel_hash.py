@@ -220,6 +220,15 @@ def test_an_insertion_without_a_slot_is_refused(taken, device):
     assert torch.equal(keys, before)
 
 
+def test_a_table_that_is_changed_is_contiguous(device):
+    """One that is not, even one number seen as many, is refused before it is read."""
+    keys, values = ops.new_voxel_hash(32, device)
+    one = torch.full((1,), -1, device=device)
+    for bad in (keys[::2], one.expand(16)):
+        with pytest.raises(RuntimeError, match="spslam: an in-place argument must be contiguous"):
+            ops.voxel_hash_insert(bad, values[:16], coords([[1, 2, 3]], device), 0)
+
+
 def test_coordinates_out_of_range_leave_the_table_alone(device):
     keys, values = ops.new_voxel_hash(16, device)
     batch = coords([[0, 0, 0], [LIMIT, 0, 0], [0, -LIMIT - 1, 0]], device)

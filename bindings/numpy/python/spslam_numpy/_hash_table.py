@@ -109,9 +109,11 @@ class VoxelHash:
             raise RuntimeError(
                 f"VoxelHash.insert: voxel_coords must lie in [-2^20, 2^20 - 1], got {outside} rows outside"
             )
-        new = kernels.voxel_hash_absent(self.hash_keys, self.hash_values, voxel_coords)
-        if len(new):
-            self._enter(new)
+        voxel_ids = self.find(voxel_coords)
+        missing = voxel_coords[voxel_ids < 0]
+        if len(missing) == 0:
+            return voxel_ids
+        self._enter(kernels.voxel_hash_absent(self.hash_keys, self.hash_values, missing))
         return self.find(voxel_coords)
 
     def build(self, voxel_coords: Integers) -> None:
