@@ -1,9 +1,12 @@
 """The look through a data set: an analytic room whose data is then spoilt in the ways that happen."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from spslam.camera import Camera
+from spslam.datasets import inspection
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.inspection import inspect_dataset
 from spslam.datasets.replica import open_replica
@@ -64,6 +67,35 @@ def cast(pose):
     with np.errstate(divide="ignore"):
         walls = (np.sign(directions) * HALF_SIZE - pose[:3, 3]) / directions
     return np.min(np.where(directions != 0, walls, np.inf), axis=-1)
+
+
+def test_large_images_are_thinned_without_another_finding(monkeypatch):
+    whole = inspect_dataset(BoxRoom())
+    monkeypatch.setattr(inspection, "_MAX_PIXELS_KEPT", CAMERA.width * CAMERA.height // 4)
+    thinned = inspect_dataset(BoxRoom())
+    assert thinned.problems == whole.problems == []
+    assert thinned.depth.median_m == pytest.approx(whole.depth.median_m, rel=0.05)
+    assert thinned.poses.agreement.relative < 0.02
+
+
+def test_images_of_17_million_pixels_are_inspected_in_bounded_memory():
+    """40 of them whole would be 2.7 GB."""
+
+    class Large(BoxRoom):
+        camera = Camera(4096, 4096, 4000.0, 4000.0, 2047.5, 2047.5)
+
+        def read(self, index):
+            color = np.broadcast_to(np.uint8(0), (4096, 4096, 3))
+            return RgbdFrame(index, self.times[index], color, np.full((4096, 4096), 2.0, np.float32))
+
+    tracemalloc.start()
+    try:
+        found = inspect_dataset(Large())
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found.frames_read == 40
+    assert most < 500e6
 
 
 def test_sound_data_has_no_problem():
