@@ -185,7 +185,7 @@ def _check_size(actual: Size, expected: Size | None, name: str) -> None:
 
 
 def _text(size: Size) -> str:
-    return f"{size[0]}x{size[1]}"
+    return brief(f"{size[0]}x{size[1]}")
 
 
 def _load_array(path: Path, size: Size | None) -> np.ndarray:
