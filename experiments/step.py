@@ -24,7 +24,7 @@ OPTIONS = ops.RenderOptions(
     weight_free_space=20.0,
     weight_sdf=1000.0,
     seed=0,
-    stream=ops.Stream.MAPPING_RAYS,
+    stream=ops.RandomStream.MAPPING_RAYS,
     frame=0,
     iteration=0,
 )

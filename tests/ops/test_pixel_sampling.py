@@ -18,7 +18,7 @@ SAMPLING = ops.PixelSampling(
 )
 # Float32 points within some meters.
 POINT_TOLERANCE_M = 2e-6
-KEY = (2**33 + 5, ops.Stream.PIXEL_DATABASE, 17)
+KEY = (2**33 + 5, ops.RandomStream.PIXEL_DATABASE, 17)
 
 
 def frame(generator, height=50, width=70, noise=0.004):
