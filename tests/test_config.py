@@ -144,7 +144,7 @@ def test_wrong_option_is_one_clear_line(override, message):
     ("text", "message"),
     [
         ("", "dataset.type must be set in the configuration file"),
-        ("- 3", "{path}: must hold sections of options, got [3]"),
+        ("- 3", "{path}: must contain sections of options, got [3]"),
         ("a: b: c", "{path}:1: must be YAML: mapping values are not allowed here"),
         ("seed: 1\nseed: 2", "{path}:2: must be YAML: seed is given twice"),
         ("{[1]: 2}", "{path}:1: must be YAML: found unhashable key"),

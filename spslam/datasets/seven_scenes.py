@@ -47,7 +47,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
     depths = find_numbered(sequence_folder, _DEPTH_NAME)
     if not colors and not depths:
         raise DatasetError(
-            f"{sequence_folder}: must hold 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
+            f"{sequence_folder}: must contain 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
             + _hint(sequence_folder)
         )
     camera = _find_camera(sequence_folder, list(colors.values()))
@@ -87,7 +87,7 @@ def _choose_sequence(folder: Path, sequence: str | int | None) -> Path:
     names = list_sequences(folder)
     if not names:
         if sequence is not None and folder.name != _sequence_name(sequence):
-            raise DatasetError(f"{folder}: must hold {_sequence_name(sequence)}, got no seq-XX folder")
+            raise DatasetError(f"{folder}: must contain {_sequence_name(sequence)}, got no seq-XX folder")
         return folder
     if sequence is None:
         return folder / names[0]

@@ -35,7 +35,7 @@ def read_numbers(path: Path) -> np.ndarray:
         try:
             numbers.extend(map(float, line.replace(",", " ").split()))
         except ValueError as error:
-            raise DatasetError(f"{path}: must hold numbers only: {brief(str(error))}") from None
+            raise DatasetError(f"{path}: must contain numbers only: {brief(str(error))}") from None
     return np.array(numbers, dtype=np.float64)
 
 

@@ -183,10 +183,10 @@ def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tu
         numbers = read_numbers(path)
         if not 4 <= numbers.size <= 9:
             raise DatasetError(
-                f"{path}: must hold fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
+                f"{path}: must contain fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
             )
         if not np.isfinite(numbers).all():
-            raise DatasetError(f"{path}: must hold finite numbers, got {numbers.tolist()}")
+            raise DatasetError(f"{path}: must contain finite numbers, got {numbers.tolist()}")
         fx, fy, cx, cy = numbers[:4]
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         return camera_from_matrix(matrix, width, height, str(path)), tuple(

@@ -106,7 +106,9 @@ class OutputFolder(RunFolder):
         if self.metrics.exists():
             raise OutputError(f"{self.path}: holds a finished run; use another --output")
         if self.checkpoint.exists():
-            raise OutputError(f"{self.path}: holds an interrupted run; go on with --resume, or use another --output")
+            raise OutputError(
+                f"{self.path}: contains an interrupted run; continue it with --resume, or use another --output"
+            )
         if self.config.exists() and not resume:
             raise OutputError(
                 f"{self.path}: holds a run that ended before its first checkpoint; "

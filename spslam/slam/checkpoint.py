@@ -165,7 +165,7 @@ def _checked_source(header: dict[str, Any], frames: int) -> dict[str, Any]:
     source = header.get("source")
     clock = source.get("clock") if isinstance(source, dict) else None
     if not isinstance(source, dict) or not isinstance(clock, dict) or not isinstance(source.get("data"), dict):
-        raise ValueError("source must hold data, next and clock")
+        raise ValueError("source must contain data, next and clock")
     position = whole_number(source, "next", low=frames)
     whole_number(source["data"], "frames", low=position)
     whole_number(clock, "frames")

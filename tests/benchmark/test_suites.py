@@ -114,9 +114,9 @@ def test_folders_from_a_file(tmp_path):
     [
         (None, "can't be read: No such file"),
         ("a: [", "must be YAML"),
-        ("- quick", "must hold SUITE: {SEQUENCE: FOLDER}, got"),
+        ("- quick", "must contain SUITE: {SEQUENCE: FOLDER}, got"),
         ("quik: {kitchen: x}", "suite must be one of .*quick.*, got quik"),
-        ("quick: kitchen", "quick must hold SEQUENCE: FOLDER, got kitchen"),
+        ("quick: kitchen", "quick must contain SEQUENCE: FOLDER, got kitchen"),
         ("quick: {kitschen: x}", "a sequence of quick must be one of kitchen, .*, got kitschen"),
         ("quick: {room: x}", "a sequence of quick must be one of kitchen, .*, got room"),
         ("quick: {kitchen: 3}", "the folder of quick, kitchen must be text, got 3"),

@@ -151,7 +151,7 @@ MISSING_INTRINSICS = {
     "replica": ("cam_params.json", "cam_params.json: no such file"),
     "synthetic_rgbd": ("focal.txt", "focal.txt: no such file"),
     "scannet": ("intrinsic/intrinsic_*.txt", "intrinsic_depth.txt: no such file"),
-    "folder": ("intrinsics.txt", "must hold the intrinsics in one of intrinsics.txt"),
+    "folder": ("intrinsics.txt", "must contain the intrinsics in one of intrinsics.txt"),
 }
 
 

@@ -190,7 +190,7 @@ MATRICES, COMPRESSIONS = 12 + 15, 12 + 15 + 256
             lambda content: changed(content, MATRICES + 128, bytes(64)),
             "intrinsics of depth: .*matrix must have the form",
         ),
-        (lambda content: content[:350], "must hold a whole frame, got none of 2"),
+        (lambda content: content[:350], "must contain a whole frame, got none of 2"),
     ],
 )
 def test_a_broken_file(tmp_path, spoil, message):
