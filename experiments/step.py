@@ -85,7 +85,7 @@ def main() -> None:
                     }
                 )
     samples = OPTIONS.num_uniform + OPTIONS.num_surface
-    title = f"{len(scene.embeddings)} vertices, {len(scene.texels)} texels, {samples} samples a ray"
+    title = f"{len(scene.embeddings)} vertices, {len(scene.texels)} texels, {samples} samples per ray"
     timing.report(title, rows, device, args.json)
 
 

@@ -1,6 +1,6 @@
 """Replica as rendered for iMAP and NICE-SLAM.
 
-`results/frameNNNNNN.jpg` and `results/depthNNNNNN.png` (16-bit), `traj.txt` with 16 numbers a line (4x4 camera
+`results/frameNNNNNN.jpg` and `results/depthNNNNNN.png` (16-bit), `traj.txt` with 16 numbers per line (4x4 camera
 to world, OpenCV axes) and `cam_params.json` beside the scene or in its parent folder: `{"camera": {"w", "h", "fx",
 "fy", "cx", "cy", "scale"}}`, `scale` being the depth value of one meter.
 """

@@ -182,7 +182,7 @@ def test_progress_without_a_terminal_is_printed_as_lines(capsys):
 def test_progress_on_a_terminal_is_a_bar_that_ends_with_a_newline(capsys):
     bar = ProgressBar()
     bar(4, 9, Report())  # a resumed run
-    time.sleep(0.2)  # tqdm draws ten times a second
+    time.sleep(0.2)  # tqdm draws ten times per second
     bar(5, 9, Report())
     bar.close()
     error = capsys.readouterr().err

@@ -143,7 +143,7 @@ def test_frames_beyond_the_poses_have_none(layout):
     path.write_text("\n".join(" ".join(map(str, np.eye(4).ravel())) for _ in range(2)))
     assert [frame.pose is None for frame in layout.open()] == [False, False, True, True, True]
     path.write_text("1 0 0")
-    with pytest.raises(DatasetError, match=f"{path.name}: must have 16 numbers a pose, got 3 numbers"):
+    with pytest.raises(DatasetError, match=f"{path.name}: must have 16 numbers per pose, got 3 numbers"):
         layout.open()
 
 
