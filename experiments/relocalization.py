@@ -68,7 +68,7 @@ def main() -> None:
 
 def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:
     """For each frame shown: whether it is a wall, distance (cm) and angle (degrees) to the true pose, and its fit."""
-    ground_truth, random = true_poses(dataset), np.random.default_rng(0)
+    ground_truth, random = gt_poses(dataset), np.random.default_rng(0)
     system = SlamSystem(config, dataset.camera, ground_truth[0])
     rows = len(dataset) // STEP
     for place in np.linspace(FIRST_PLACE * rows, rows - 1, PLACES).astype(int).tolist():

@@ -1,4 +1,4 @@
-"""Where a machine has the sequences of the suites, if not in the folders that the data sets use themselves."""
+"""Where a machine has the sequences of the suites, if not in the folders that the datasets use themselves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_folders(path: Path) -> Folders:
         path: the file.
 
     Returns:
-        Folder by suite and sequence, relative to the folder of all data sets, or absolute.
+        Folder by suite and sequence, relative to the folder of all datasets, or absolute.
 
     Raises:
         ConfigError: the file can't be read, or names a suite or sequence that doesn't exist or needs no data.

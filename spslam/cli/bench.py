@@ -16,8 +16,8 @@ from spslam.options import PRESETS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a data set's; --list names all")
-    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the data sets")
+    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a dataset's; --list names all")
+    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the datasets")
     parser.add_argument(
         "--folders",
         metavar="FILE",
@@ -86,7 +86,7 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     from spslam.run.device import resolve_device
 
     if args.data is not None and not args.data.is_dir():
-        raise UsageError(f"--data must be a folder that holds the data sets, got {args.data}")
+        raise UsageError(f"--data must be a folder that holds the datasets, got {args.data}")
     plan = make_plan(suite, args.data, resolve_device(args.device).type)
     if args.list:
         _print_plan(plan)

@@ -29,7 +29,7 @@ INTRINSICS_FILES = ("intrinsics.txt", "camera-intrinsics.txt", "intrinsics.json"
 FRAMES_PER_SECOND = 30.0
 # The median depth of an indoor recording; outside it the scale is wrong, not the room.
 PLAUSIBLE_MEDIAN_M = (0.1, 20.0)
-# Scales that sensors and data sets use; the one that makes a depth plausible is suggested.
+# Scales that sensors and datasets use; the one that makes a depth plausible is suggested.
 _COMMON_SCALES = (1.0, 1000.0, 5000.0, 6553.5, 10000.0)
 _FRAMES_TRIED_FOR_SCALE = 5
 

@@ -1,6 +1,6 @@
 """ScanNet (Dai et al. 2017): Structure Sensor on a tablet, poses by BundleFusion.
 
-A scan is read from `sceneNNNN_NN.sens` as it is distributed, or from what the data set's own exporter makes of it:
+A scan is read from `sceneNNNN_NN.sens` as it is distributed, or from what the dataset's own exporter makes of it:
 `color/N.jpg`, `depth/N.png` (16-bit millimeters), `pose/N.txt` (4x4 camera to world, OpenCV axes; infinite where
 unknown) and `intrinsic/intrinsic_depth.txt`. Color is larger than depth (1296x968 against 640x480). The authors
 registered the two to each other ("they can be resampled to the same resolution"), so color is brought to depth's size

@@ -3,7 +3,7 @@
 A scene folder holds `seq-01`, `seq-02`, ..., each with `frame-NNNNNN.color.png` (or jpg), `.depth.png`
 (16-bit millimeters; 0 and 65535 are invalid) and `.pose.txt` (4x4 camera to world, OpenCV axes). The poses are
 KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Color and depth were not
-registered to each other by the data set's authors; both are taken as one camera's, as everybody does.
+registered to each other by the dataset's authors; both are taken as one camera's, as everybody does.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from spslam.errors import DatasetError
 SPLITS = ("train", "test")
 INTRINSICS_FILE = "camera-intrinsics.txt"
 FRAMES_PER_SECOND = 30.0
-# "The default intrinsics for this sensor", as the data set's page gives them for 640x480.
+# "The default intrinsics for this sensor", as the dataset's page gives them for 640x480.
 _DEFAULT_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 _MOST_DIGITS = 9  # of a sequence's number
 _COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
@@ -30,7 +30,7 @@ _DEPTH_NAME = r"frame-(\d+)\.depth\.png"
 def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDataset:
     """Opens one sequence of a scene.
 
-    The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the data set's default
+    The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the dataset's default
     (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite pose, has no
     pose. A frame with an image missing or a malformed pose file is one that raises when it is read.
 

@@ -1,7 +1,7 @@
 """Unpacks untrusted archives: only files and folders, and only below the given folder.
 
 The size that an archive declares is compared with its own before anything is written: images hardly compress, so an
-archive with a hundred times its size in it is no data set.
+archive with a hundred times its size in it is no dataset.
 """
 
 from __future__ import annotations

@@ -25,10 +25,10 @@ MIN_AHEAD = 8
 
 
 class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
-    """Iterates over the frames of a data set in order; a frame that can't be read comes as its `DatasetError`.
+    """Iterates over the frames of a dataset in order; a frame that can't be read comes as its `DatasetError`.
 
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
-    another process do not compete with the frame loop for Python's GIL. A data set that can't be pickled is read by
+    another process do not compete with the frame loop for Python's GIL. A dataset that can't be pickled is read by
     threads of this process. At most `run.prefetch_ahead` frames exist at the same time. Nothing is read before the
     first frame is requested.
 

@@ -31,7 +31,7 @@ _EXIT_TIMEOUT_S = 5.0
 
 
 class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
-    """The frames of a data set from a position on, in order, prepared by another process.
+    """The frames of a dataset from a position on, in order, prepared by another process.
 
     Attributes:
         read_seconds: time spent on preparing the frames handed out, summed over the threads.
@@ -81,7 +81,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             uploader: copies the pixels to a device; None for the CPU.
 
         Returns:
-            None if the data set can't be pickled or the process can't be started.
+            None if the dataset can't be pickled or the process can't be started.
         """
         slots = max(ahead // 2, 1)
         blank = blank_pixels(dataset.camera, config)
@@ -103,7 +103,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         """Waits until the process can read.
 
         Returns:
-            False where the data set's class can't be imported by another process, which has then ended.
+            False where the dataset's class can't be imported by another process, which has then ended.
         """
         try:
             ready = self._connection.recv()

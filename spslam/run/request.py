@@ -12,9 +12,9 @@ class RunRequest:
 
     Attributes:
         config: all options; `config.dataset` says how to read the data.
-        data_dir: folder of the data set; None for the generated room.
+        data_dir: folder of the dataset; None for the generated room.
         output_dir: created if needed. It must be empty or, with `resume`, hold an interrupted run of the same request.
-        frames: which frames of the data set to process; None for all.
+        frames: which frames of the dataset to process; None for all.
         resume: continue from the checkpoint in `output_dir` if there is one.
         mesh: whether to extract the mesh.
     """

@@ -136,7 +136,7 @@ def test_repository_file_of_folders_is_valid():
 
 
 def test_suites_name_public_folders_only():
-    """A suite lists parent folders of the data set's own folder name; other names belong in a `--folders` file."""
+    """A suite lists parent folders of the dataset's own folder name; other names belong in a `--folders` file."""
     for name in suite_names():
         for sequence in load_suite(name).studies[0].sequences:
             assert len({folder.rpartition("/")[2] for folder in sequence.folders}) <= 1, sequence.name
