@@ -30,7 +30,7 @@ from experiments.fault_injection import (
     copy_of,
     cover_wall,
     expected_pose,
-    true_poses,
+    gt_poses,
 )
 from spslam.cli.arguments import parse_frames
 from spslam.config import Config, load_config

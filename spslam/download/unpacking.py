@@ -196,7 +196,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: _Budget) -> None:
                 raise ArchiveError(
                     f"{archive}: must contain only files and folders, but {brief(member.name)} is a link or device"
                 )
-            # Before the loop goes on and skips the content, which may have to be inflated for that.
+            # Before the loop continues and skips the content, which may have to be inflated for that.
             budget.spend(member.size)
             total += member.size
     require_space(folder, total, f"unpacking {archive.name}")

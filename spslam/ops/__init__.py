@@ -54,7 +54,6 @@ __all__ = [
     "RenderStep",
     "SceneGradients",
     "SceneView",
-    "Stream",
     "VoxelHash",
     "VoxelLimitError",
     "VolumeBuffers",

@@ -121,7 +121,7 @@ class Raising:
         (OSError(28, "No space left on device", "/x/log.jsonl"), 2, "spslam: /x/log.jsonl: No space left on device"),
         (RuntimeError("odd"), 1, "spslam: unexpected RuntimeError: odd; --debug shows where"),
         (KeyboardInterrupt(), 130, "spslam: interrupted"),
-        (KeyboardInterrupt("go on with x"), 130, "spslam: interrupted; go on with x"),
+        (KeyboardInterrupt("continue with x"), 130, "spslam: interrupted; continue with x"),
     ],
 )
 def test_every_error_is_one_line_with_an_exit_code(monkeypatch, capsys, error, code, line):
