@@ -15,7 +15,7 @@ _FRAMES = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
 
 
 def parse_frames(text: str) -> slice:
-    """``START:STOP[:STEP]`` as a slice; each of the first two may be left out, negative ones count from the end."""
+    """`START:STOP[:STEP]` as a slice; each of the first two may be left out, negative ones count from the end."""
     match = _FRAMES.fullmatch(text)
     try:
         start, stop, step = (int(part) if part else None for part in match.groups()) if match else (None, None, 0)
@@ -79,7 +79,7 @@ def add_run_folder(parser: argparse.ArgumentParser) -> None:
 
 
 def overrides(args: argparse.Namespace) -> list[str | tuple[str, Any]]:
-    """What the command line changes in the configuration; options of their own win over ``--set``."""
+    """What the command line changes in the configuration; options of their own win over `--set`."""
     changes: list[str | tuple[str, Any]] = list(getattr(args, "changes", []))
     for option in ("device", "seed"):
         if getattr(args, option, None) is not None:

@@ -1,4 +1,4 @@
-"""``spslam run``: SLAM over a sequence; writes trajectory, map, mesh, metrics and report."""
+"""`spslam run`: SLAM over a sequence; writes trajectory, map, mesh, metrics and report."""
 
 from __future__ import annotations
 
@@ -97,5 +97,5 @@ def _can_resume(output: Path) -> bool:
 
 
 def default_output(config: str) -> Path:
-    """``runs/<configuration>-<time>``."""
+    """`runs/<configuration>-<time>`."""
     return Path("runs") / f"{resolve_config_path(config).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
