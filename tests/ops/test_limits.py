@@ -194,7 +194,7 @@ def bad_layouts(layout):
 
 @pytest.mark.parametrize("name", ["query_color", "query_sdf", "render_step", "track_adam", "optimize_map_"])
 def test_planes_of_a_scene_stay_within_their_texels(name, device, generator):
-    """A file may say anything: see `spslam.scene.tensor_file`."""
+    """A file may say anything: see `spslam.tensor_file`."""
     call = arguments(name, generator, device)
     for layout in bad_layouts(call["scene"].plane_layout):
         with pytest.raises(ValueError, match=f"{name}: plane_layout must "):
