@@ -32,7 +32,7 @@ from experiments.fault_injection import (
     expected_pose,
     gt_poses,
 )
-from spslam.cli.arguments import parse_frames
+from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
@@ -134,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", default="demo", help="configuration file or name")
     parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--every", type=int, default=3, help="show every n-th of the frames that are not mapped")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")

@@ -40,7 +40,7 @@ def test_paper_preset_is_section_iv_a():
 
 
 @pytest.mark.parametrize(("name", "tracking", "mapping"), [("replica", 4, 20), ("tum", 6, 30), ("7scenes", 6, 20)])
-def test_paper_iterations_of_each_data_set(name, tracking, mapping):
+def test_paper_iterations_of_each_dataset(name, tracking, mapping):
     config = load_config(name, "paper")
     assert (config.tracking.iterations, config.mapping.iterations) == (tracking, mapping)
 

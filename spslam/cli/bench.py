@@ -9,10 +9,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from spslam.cli.arguments import add_quiet, at_least_one, parse_frames
+from spslam.cli.arguments import add_quiet, at_least_one
 from spslam.cli.parser import UsageError
 from spslam.errors import SpslamError
 from spslam.options import PRESETS
+from spslam.run.request import parse_frames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -134,7 +135,7 @@ def _exit_at_end_of_input() -> None:
 def _check_frames(text: str) -> None:
     try:
         parse_frames(text)
-    except argparse.ArgumentTypeError as error:
+    except ValueError as error:
         raise UsageError(f"--frames {error}") from None
 
 

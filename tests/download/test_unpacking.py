@@ -125,7 +125,7 @@ def refused(archive, message):
     assert "\n" not in str(error.value)
 
 
-def test_an_archive_of_zeros_is_no_data_set(tmp_path):
+def test_an_archive_of_zeros_is_no_dataset(tmp_path):
     """A thousand times its own size, beyond what small archives may hold anyway."""
     zeros = {"zeros.bin": bytes(150 << 20)}
     for name, pack in (("a.zip", zipped), ("a.tgz", tarred)):

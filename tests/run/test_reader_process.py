@@ -166,7 +166,7 @@ def test_no_standby_reader_where_the_run_uses_threads(options):
     assert not has_standby()
 
 
-def test_exception_in_a_data_set_keeps_its_traceback():
+def test_exception_in_a_dataset_keeps_its_traceback():
     with feed_of(Recorded(FRAMES, fail)) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
         next(feed)
 
