@@ -18,12 +18,12 @@ from spslam.run.request import parse_frames
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a dataset's; --list names all")
-    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the datasets")
+    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that contains the datasets")
     parser.add_argument(
         "--folders",
         metavar="FILE",
         type=Path,
-        help="YAML file of folders, SUITE: {SEQUENCE: FOLDER}, where the data has other names",
+        help="YAML file of folders, SUITE: {SEQUENCE: FOLDER}, if the folders have other names",
     )
     parser.add_argument("--output", metavar="DIR", type=Path, help="folder of results; runs/bench-SUITE if not given")
     parser.add_argument(
@@ -87,7 +87,7 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     from spslam.run.device import resolve_device
 
     if args.data is not None and not args.data.is_dir():
-        raise UsageError(f"--data must be a folder that holds the datasets, got {args.data}")
+        raise UsageError(f"--data must be a folder that contains the datasets, got {args.data}")
     plan = make_plan(suite, args.data, resolve_device(args.device).type)
     if args.list:
         _print_plan(plan)

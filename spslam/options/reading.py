@@ -28,7 +28,7 @@ class DatasetOptions(Section):
         needs=(need(is_("dataset.type", "7scenes")),),
     )
     depth_variant: Literal["filtered", "noisy", "exact"] | None = option(
-        "depth with filtered noise, with noise, or without; null is the first in the folder",
+        "depth images to read: noisy and filtered, noisy, or exact; null is the first of these in the folder",
         needs=(need(is_("dataset.type", "synthetic_rgbd")),),
     )
     depth_scale: float | None = option(
@@ -37,7 +37,9 @@ class DatasetOptions(Section):
         needs=(need(is_("dataset.type", "folder")),),
         gt=0,
     )
-    frames: int = option("length of the sequence; 300 go around the room once", "frames", needs=(_GENERATED,), ge=1)
+    frames: int = option(
+        "length of the sequence; 300 frames are one loop around the room", "frames", needs=(_GENERATED,), ge=1
+    )
     width: int = option("width of the images", "px", needs=(_GENERATED,), ge=16)
     height: int = option("height of the images", "px", needs=(_GENERATED,), ge=16)
     noise: float = option(

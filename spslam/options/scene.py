@@ -32,8 +32,8 @@ class SceneOptions(Section):
 class PriorOptions(Section):
     """The depth encoder and its fusion into the volume (section III.A)."""
 
-    enabled: bool = option("encode each mapped frame and fuse it; false starts new vertices from random embeddings")
-    fusion: bool = option("fuse into existing vertices by eq. (1); false only fills new ones", needs=(_PRIOR,))
+    enabled: bool = option("encode and fuse each mapped frame; false initializes new vertices with random embeddings")
+    fusion: bool = option("fuse into existing vertices by eq. (1); false only initializes new ones", needs=(_PRIOR,))
     weights: str | None = option(
         "file of encoder and decoder weights (safetensors); null is the shipped one for the neighborhood",
         needs=(need(_ENABLED, is_("prior.decoder", "pretrained")),),
@@ -48,7 +48,9 @@ class PriorOptions(Section):
     max_weight: float = option("upper limit of the fused weight W_g", needs=(_PRIOR,), gt=0)
     normal_step_px: int = option("step of the depth differences that surface normals are computed from", "px", ge=1)
     max_jump: float = option(
-        "a pixel gets no normal if the depth `normal_step_px` away differs by this fraction or more", gt=0
+        "relative depth difference to a pixel `normal_step_px` away from which on it is a depth discontinuity without "
+        "normal",
+        gt=0,
     )
 
 
