@@ -32,7 +32,7 @@ BACK_M, BACK_RAD = 0.01, np.radians(0.5)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config")
-    parser.add_argument("data", nargs="?")
+    parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--frames", type=int, default=200, help="frames of the run")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th frame")
     parser.add_argument("--every", type=int, default=10, help="try every n-th of them")

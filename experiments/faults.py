@@ -16,7 +16,7 @@ import torch
 
 from experiments import timing
 from experiments.fault_injection import FLAG_WITHIN, Outcome, plan, run_trials
-from spslam.cli.arguments import parse_frames
+from spslam.cli.arguments import frame_range
 from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.options import PRESETS
@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", default="demo", help="configuration file or name")
     parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--trials", type=int, default=10, help="of each fault")

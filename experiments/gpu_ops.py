@@ -26,7 +26,7 @@ TRACKING = ops.GaussNewtonOptions(
     kernel_end=0.02,
     damping=1e-4,
     seed=0,
-    stream=ops.Stream.TRACKING_PIXELS,
+    stream=ops.RandomStream.TRACKING_PIXELS,
     frame=0,
 )
 

@@ -30,9 +30,9 @@ from experiments.fault_injection import (
     copy_of,
     cover_wall,
     expected_pose,
-    true_poses,
+    gt_poses,
 )
-from spslam.cli.arguments import parse_frames
+from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
@@ -68,7 +68,7 @@ def main() -> None:
 
 def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:
     """For each frame shown: whether it is a wall, distance (cm) and angle (degrees) to the true pose, and its fit."""
-    ground_truth, random = true_poses(dataset), np.random.default_rng(0)
+    ground_truth, random = gt_poses(dataset), np.random.default_rng(0)
     system = SlamSystem(config, dataset.camera, ground_truth[0])
     rows = len(dataset) // STEP
     for place in np.linspace(FIRST_PLACE * rows, rows - 1, PLACES).astype(int).tolist():
@@ -134,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", default="demo", help="configuration file or name")
     parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--every", type=int, default=3, help="show every n-th of the frames that are not mapped")
     parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")

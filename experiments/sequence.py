@@ -20,11 +20,11 @@ from pathlib import Path
 import torch
 
 from experiments import timing
-from spslam.cli.arguments import parse_frames
 from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.reader_launch import launch_standby
+from spslam.run.request import parse_frames
 from spslam.run.sequence import RunRequest, run_sequence
 from spslam.run_folder import RunFolder
 

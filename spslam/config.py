@@ -148,7 +148,7 @@ def _read(path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold sections of options, got {shown(content)}")
+        raise ConfigError(f"{path}: must contain sections of options, got {shown(content)}")
     return content
 
 

@@ -222,7 +222,7 @@ def _pose_problems(found: Inspection, explanation: str | None) -> list[str]:
         return []
     problems = []
     if poses.count < found.frames:
-        problems.append(f"{found.frames - poses.count} of {found.frames} frames have no true pose")
+        problems.append(f"{found.frames - poses.count} of {found.frames} frames have no ground-truth pose")
     if poses.jumps:
         listed = ", ".join(map(str, poses.jumps[:5])) + (", ..." if len(poses.jumps) > 5 else "")
         problems.append(
@@ -231,10 +231,10 @@ def _pose_problems(found: Inspection, explanation: str | None) -> list[str]:
     if explanation is not None:
         problems.append(explanation)
     elif poses.agreement is None and poses.count > 1:
-        problems.append("no view overlaps with one a little later by the true poses: they look wrong")
+        problems.append("no view overlaps with one a little later by the ground-truth poses: they look wrong")
     elif poses.agreement is not None and poses.agreement.relative > _GOOD_AGREEMENT:
         problems.append(
-            f"depth and true poses disagree by {poses.agreement.median_cm:.1f} cm: poses or intrinsics are off"
+            f"depth and ground-truth poses disagree by {poses.agreement.median_cm:.1f} cm: poses or intrinsics are off"
         )
     return problems
 

@@ -137,8 +137,8 @@ def test_interruption_is_one_line_and_resumes_to_the_same_bytes(tmp_path):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error
-    assert error == f"spslam: interrupted; the same command with --output {tmp_path / 'cut'} --resume goes on\n"
-    assert_refused(spslam("run", "demo", *arguments, "--output", "cut", cwd=tmp_path), "go on with --resume")
+    assert error == f"spslam: interrupted; the same command with --output {tmp_path / 'cut'} --resume continues\n"
+    assert_refused(spslam("run", "demo", *arguments, "--output", "cut", cwd=tmp_path), "continue it with --resume")
     run(tmp_path, *arguments, "--output", "cut", "--resume")
     for name in ("trajectory.txt", "map.safetensors"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -182,7 +182,7 @@ def test_progress_without_a_terminal_is_printed_as_lines(capsys):
 def test_progress_on_a_terminal_is_a_bar_that_ends_with_a_newline(capsys):
     bar = ProgressBar()
     bar(4, 9, Report())  # a resumed run
-    time.sleep(0.2)  # tqdm draws ten times a second
+    time.sleep(0.2)  # tqdm draws ten times per second
     bar(5, 9, Report())
     bar.close()
     error = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The look through a data set: an analytic room whose data is then spoilt in the ways that happen."""
+"""The look through a dataset: an analytic room whose data is then corrupted in the ways that occur."""
 
 import tracemalloc
 
@@ -22,21 +22,21 @@ HALF_SIZE = np.array([3.0, 2.0, 2.5])
 
 
 class BoxRoom(RgbdDataset):
-    """A walk through an empty box, depth exact; attributes can be replaced to spoil it."""
+    """A walk through an empty box, depth exact; attributes can be replaced to corrupt it."""
 
     name = "box"
     camera = CAMERA
 
     def __init__(self, frames=40):
-        self.true_poses = np.stack([walk(i / frames) for i in range(frames)])
-        self.given_poses = self.true_poses.copy()
+        self.gt_poses = np.stack([walk(i / frames) for i in range(frames)])
+        self.given_poses = self.gt_poses.copy()
         self.times = np.arange(frames) / 30
         self.scale = 1.0
         self.holes = 0
         self.broken = ()
 
     def __len__(self):
-        return len(self.true_poses)
+        return len(self.gt_poses)
 
     def timestamps(self):
         return self.times
@@ -47,7 +47,7 @@ class BoxRoom(RgbdDataset):
     def read(self, index):
         if index in self.broken:
             raise DatasetError(f"frame {index} is broken")
-        depth = self.scale * cast(self.true_poses[index])
+        depth = self.scale * cast(self.gt_poses[index])
         depth[: self.holes] = 0
         color = np.zeros((*depth.shape, 3), np.uint8)
         return RgbdFrame(index, self.times[index], color, depth.astype(np.float32))
@@ -109,7 +109,7 @@ def test_sound_data_has_no_problem():
     assert 0 < found.depth.near_m < found.depth.median_m < found.depth.far_m < 8
 
 
-SPOILERS = {
+CORRUPTIONS = {
     "world-to-camera; camera": inverse,
     "OpenGL axes (y up": lambda poses: poses @ np.diag([1.0, -1, -1, 1]),
     "world-to-camera in OpenGL": lambda poses: inverse(poses @ np.diag([1.0, -1, -1, 1])),
@@ -117,10 +117,10 @@ SPOILERS = {
 }
 
 
-@pytest.mark.parametrize("words", SPOILERS)
+@pytest.mark.parametrize("words", CORRUPTIONS)
 def test_wrong_poses_are_explained(words):
     room = BoxRoom()
-    room.given_poses = SPOILERS[words](room.true_poses)
+    room.given_poses = CORRUPTIONS[words](room.gt_poses)
     assert any(words in problem for problem in inspect_dataset(room).problems)
 
 
@@ -148,7 +148,7 @@ def test_holes_and_missing_poses_and_broken_frames_are_reported():
     assert problems == [
         "unreadable: frame 3 is broken",
         "62% of the pixels have no depth",
-        "4 of 40 frames have no true pose",
+        "4 of 40 frames have no ground-truth pose",
     ]
 
 
@@ -189,7 +189,7 @@ def test_recordings_as_distributed_are_sound(name):
     assert found.poses.agreement.median_cm < 2
 
 
-class Spoilt(Subset):
+class Corrupted(Subset):
     """A recording whose poses or depth were converted wrongly."""
 
     def __init__(self, dataset, change_poses=None, scale=1.0):
@@ -205,16 +205,16 @@ class Spoilt(Subset):
         return frame
 
 
-@pytest.mark.parametrize("words", SPOILERS)
+@pytest.mark.parametrize("words", CORRUPTIONS)
 @pytest.mark.parametrize("name", ["7scenes-redkitchen", "synthetic-grey-white-room"])
 def test_wrong_poses_of_recordings_are_explained(name, words):
-    spoilt = Spoilt(RECORDINGS[name](shared_data(name)), SPOILERS[words])
-    assert any(words in problem for problem in inspect_dataset(spoilt, frames=3).problems)
+    corrupted = Corrupted(RECORDINGS[name](shared_data(name)), CORRUPTIONS[words])
+    assert any(words in problem for problem in inspect_dataset(corrupted, frames=3).problems)
 
 
 @pytest.mark.parametrize(("scale", "fix"), [(0.2, 5), (5, 0.2), (0.1526, 6.5535)])
 @pytest.mark.parametrize("name", ["7scenes-redkitchen", "synthetic-grey-white-room"])
 def test_wrong_depth_scale_of_recordings_is_named(name, scale, fix):
-    spoilt = Spoilt(RECORDINGS[name](shared_data(name)), scale=scale)
-    problems = inspect_dataset(spoilt, frames=3).problems
+    corrupted = Corrupted(RECORDINGS[name](shared_data(name)), scale=scale)
+    problems = inspect_dataset(corrupted, frames=3).problems
     assert any(f"depths {fix:g} times as large would fit" in problem for problem in problems)

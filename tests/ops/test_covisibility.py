@@ -32,7 +32,7 @@ def make_records(generator, count=2000):
 
 def drawn_points(records, pose, seed, frame):
     """World points float64 [N, 3] of the pixels that the op draws."""
-    draw = ops.sample_indices(seed, ops.Stream.COVISIBILITY, frame, 0, POINTS, len(records))
+    draw = ops.sample_indices(seed, ops.RandomStream.COVISIBILITY, frame, 0, POINTS, len(records))
     chosen = records[draw]
     u, v = (chosen[:, 0] & 0xFFFF).double(), (chosen[:, 0] >> 16).double()
     z = chosen[:, 1].contiguous().view(torch.float32).double()

@@ -58,7 +58,7 @@ FLOAT32_SUMS, TF32_SUMS = 1e-4, 5e-3  # of the largest
 @pytest.mark.parametrize("tf32", [False, True])
 @pytest.mark.parametrize("num_pixels", [50, 1024, 1100, 5000])
 def test_devices_agree(device, generator, tf32, num_pixels):
-    """Whole and part tiles, one a warp and several."""
+    """Whole and part tiles, one per warp and several."""
     scene = make_scene(generator, random_decoder=False, device=device)
     records, start = corner_pixels(POSE, generator), pose7(moved_pose(POSE, 0.01, 0.02))
     options = replace(OPTIONS, num_pixels=num_pixels)
