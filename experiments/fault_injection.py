@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError
 from spslam.geometry import inverse, rotation_angle
+from spslam.run.clock import RunClock
 from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapshot
 from spslam.slam.system import SlamSystem
 
@@ -248,7 +249,9 @@ def gt_poses(dataset: RgbdDataset) -> np.ndarray:
 
 def copy_of(system: SlamSystem, first_pose: np.ndarray, path: Path) -> SlamSystem:
     """A copy of the system, made through a checkpoint at `path`."""
-    write_snapshot(path, take_snapshot(system.state, system.config, {}, copy=False))
+    frames = len(system.state.frames)
+    source = {"data": {"frames": frames}, "next": frames, "clock": asdict(RunClock())}
+    write_snapshot(path, take_snapshot(system.state, system.config, source, copy=False))
     copy = SlamSystem(system.config, system.camera, first_pose, system.device)
     load_checkpoint(path, copy.state, copy.config)
     return copy

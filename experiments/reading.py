@@ -3,7 +3,6 @@
 python -m experiments.reading --config 7scenes --data path/to/redkitchen --frames 0:300 --workers 1 2 4 8 16
 """
 
-import argparse
 import os
 import statistics
 import time
@@ -13,6 +12,7 @@ import cv2
 import torch
 
 from experiments import timing
+from experiments.arguments import add_sequence, make_parser
 from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
@@ -23,9 +23,8 @@ from spslam.run.frame_feed import FrameFeed
 
 def main() -> None:
     """Parses the arguments and prints a row per number of threads."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
     parser.add_argument("--frames", default="0:300", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--device", default="cpu", help="cuda includes the upload")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])

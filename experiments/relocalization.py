@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from experiments.arguments import add_measurements, add_options, add_sequence, make_parser
 from experiments.basin import matrix
 from experiments.fault_injection import (
     STEP,
@@ -36,7 +37,6 @@ from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
-from spslam.options import PRESETS
 from spslam.slam.fit import Fit
 from spslam.slam.pixels import sample_frame
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
@@ -131,15 +131,12 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
     parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--every", type=int, default=3, help="show every n-th of the frames that are not mapped")
-    parser.add_argument("--preset", choices=PRESETS)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
-    parser.add_argument("--save", type=Path, help="file for the measurements")
-    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to evaluate together")
+    add_options(parser)
+    add_measurements(parser)
     return parser
 
 

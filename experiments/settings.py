@@ -25,6 +25,7 @@ from typing import Any
 
 import torch
 
+from experiments.arguments import make_parser
 from spslam import ops
 from spslam.benchmark.environment import describe_environment
 from spslam.config import Config, load_config
@@ -82,7 +83,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--sequence", action="append", default=[])
     parser.add_argument("--setting", action="append", default=[])
     parser.add_argument("--settings", action="append", default=[], type=Path, help="file with one setting per line")

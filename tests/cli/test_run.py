@@ -90,7 +90,7 @@ def test_eval_adds_metrics_of_the_mesh(finished, few_samples):
     assert "F1 at 5 cm" in result.stdout
     # Compared with itself, the mesh differs only by the alignment of estimated and ground-truth poses.
     assert json.loads((folder / "out" / "metrics.json").read_text())["f1_5cm"] > 99
-    assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such mesh file")
+    assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such file")
 
 
 def test_eval_adds_metrics_of_views_and_of_alignment_with_scale(finished):

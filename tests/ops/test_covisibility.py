@@ -5,6 +5,7 @@ import torch
 
 from spslam import ops
 from tests.ops.arguments import opcheck
+from tests.ops.threads import with_threads
 from tests.reference.covisibility import overlap, select
 
 INTRINSICS = ops.Intrinsics(140.0, 140.0, 79.5, 59.5)
@@ -136,14 +137,8 @@ def test_nothing_to_choose_from(device, generator):
 
 def test_same_rows_for_any_number_of_threads(generator):
     frames, records = make_frames(generator, 600), make_records(generator)
-    candidates, threads = torch.randperm(590, generator=generator), ops.get_num_threads()
-    rows = []
-    try:
-        for count in (1, 2, 3):
-            ops.set_num_threads(count)
-            rows.append(choose(frames, records, 599, candidates, "cpu").tolist())
-    finally:
-        ops.set_num_threads(threads)
+    candidates = torch.randperm(590, generator=generator)
+    rows = with_threads(lambda: choose(frames, records, 599, candidates, "cpu").tolist(), (1, 2, 3))
     assert rows[0] == rows[1] == rows[2]
 
 

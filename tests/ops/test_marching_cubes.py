@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from skimage import measure
 
 from spslam import ops
+from tests.ops.threads import assert_same_for_any_threads
 
 # A vertex is interpolated in float32 from values near 1, on edges of one sample step.
 POSITION_TOLERANCE = 1e-4
@@ -181,13 +182,7 @@ def test_far_and_negative_cells(device):
 
 def test_does_not_depend_on_threads():
     coords, values = _cells(_noise(41), 4)
-    threads = torch.ops.spslam.get_num_threads()
-    results = []
-    for count in (1, 4):
-        torch.ops.spslam.set_num_threads(count)
-        results.append(ops.marching_cubes(coords, values))
-    torch.ops.spslam.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    assert_same_for_any_threads(lambda: ops.marching_cubes(coords, values), (1, 4))
 
 
 def test_same_on_every_device(device):
