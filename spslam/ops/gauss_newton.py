@@ -160,7 +160,7 @@ def track_gauss_newton(
         >>> pose = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
         >>> options = GaussNewtonOptions(
         ...     num_pixels=4, iterations=2, truncation=0.08, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=0,
-        ...     stream=Stream.TRACKING_PIXELS, frame=0)
+        ...     stream=RandomStream.TRACKING_PIXELS, frame=0)
         >>> pixels, camera = torch.zeros(4, 3, dtype=torch.int32), Intrinsics(60.0, 60.0, 31.5, 23.5)
         >>> still, stats, hessian = track_gauss_newton(SceneView.empty(), pixels, pose, camera, options)
         >>> torch.equal(still, pose), stats[:, 1]  # nothing is mapped: no pixel takes part, the camera stays
