@@ -64,6 +64,10 @@ def spin(folder):
         pass
 
 
+def sleep(folder):
+    time.sleep(60)
+
+
 def leave_a_file(folder):
     (folder / "left").touch()
 
@@ -99,6 +103,7 @@ FAULTS = {
     read_null: "crash",
     leave_early: "crash",
     spin: "hang",
+    sleep: "hang",
     leave_a_file: "files",
     leave_a_file_outside: "files",
     leave_a_file_at_home: "files",
@@ -112,6 +117,7 @@ FAULTS = {
 def test_each_kind_of_failure_is_found_and_the_next_case_still_runs(monkeypatch, fault):
     if fault is spin:  # the others may be slow beside other work
         monkeypatch.setattr(worker, "MAX_SECONDS", 0.5)
+    monkeypatch.setattr(worker, "MAX_SLEEPING_SECONDS", 2.0)
     outcomes = list(run_cases(Planted(fault), range(7, 9)))
     assert [seed for seed, _ in outcomes] == [7, 8]
     assert [outcome.kind for _, outcome in outcomes] == [FAULTS[fault]] * 2

@@ -23,7 +23,7 @@ from tests.fuzz.cases import Outcome, limit_memory, run_case
 from tests.fuzz.formats import Format
 
 MAX_SECONDS = 10.0  # of processor time
-MAX_WAITING_SECONDS = 60.0  # without using the processor that long; another process may have it
+MAX_SLEEPING_SECONDS = 60.0  # waiting for something else than the processor, which another process may have
 CASES_PER_CHILD = 200
 _POLL_SECONDS = 0.25
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -105,11 +105,14 @@ def _send(pipe: int, outcome: Outcome | None) -> None:
 
 def _receive(pipe: FileIO, child: int) -> Outcome | None:
     """The next outcome; None where the child has no further one, a crash where it ended, a hang where it must be."""
-    began, used_before = time.monotonic(), _processor_seconds(child)
+    _, used_before = _state_and_seconds(child)
+    slept = 0.0
     while not select.select([pipe], [], [], _POLL_SECONDS)[0]:
-        used = _processor_seconds(child) - used_before
-        if used > MAX_SECONDS or time.monotonic() - began > MAX_WAITING_SECONDS + used:
-            return Outcome("hang", f"{used:.1f} s of processor time, {time.monotonic() - began:.1f} s in all", used)
+        state, used = _state_and_seconds(child)
+        used -= used_before
+        slept += _POLL_SECONDS if state != "R" else 0.0
+        if used > MAX_SECONDS or slept > MAX_SLEEPING_SECONDS:
+            return Outcome("hang", f"{used:.1f} s of processor time, {slept:.1f} s of sleep", used)
     try:
         (size,) = _SIZE.unpack(_exactly(pipe, _SIZE.size))
         return pickle.loads(_exactly(pipe, size))
@@ -127,12 +130,13 @@ def _exactly(pipe: FileIO, count: int) -> bytes:
     return content
 
 
-def _processor_seconds(process: int) -> float:
+def _state_and_seconds(process: int) -> tuple[str, float]:
+    """Whether a process runs or could ("R"), and the processor time that it has used."""
     try:
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / _TICKS
+        return "X", 0.0
+    return fields[0], (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def _epitaph(status: int) -> str:

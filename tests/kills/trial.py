@@ -25,7 +25,7 @@ from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, results, settings
 
 FRAMES = 8
-SETTINGS = ("run.checkpoint_every=2", "run.previews=1", "mapping.first_iterations=10", "mapping.every=2")
+SETTINGS = ("device=cpu", "run.checkpoint_every=2", "run.previews=1", "mapping.first_iterations=10", "mapping.every=2")
 MAX_KILLS = 3  # of one run
 GIVE_UP_S = 300.0
 
