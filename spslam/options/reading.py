@@ -16,7 +16,7 @@ _RENDERED = need(is_("dataset.type", "generated"), is_("dataset.type", "places")
 _READ_FROM_FILES = (need(is_not("dataset.type", "generated")), need(is_not("dataset.type", "places")))
 PlaceName = Literal["room", "apartment", "stairwell", "arcade", "desk", "hall"]
 MotionName = Literal["handheld", "walking", "fast_turns", "stop_and_go"]
-SensorName = Literal["exact", "structured_light"]
+SensorName = Literal["exact", "structured_light", "stereo", "time_of_flight", "phone_lidar"]
 
 
 class DatasetOptions(Section):

@@ -21,6 +21,7 @@ _GAP_M = 0.03
 _WAY_STEP_M = 0.1
 
 Part = tuple[Primitive, Finish]
+Point = Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ class Builder:
     def __init__(
         self,
         generator: np.random.Generator,
-        low: Sequence[float],
-        high: Sequence[float],
+        low: Point,
+        high: Point,
         shell_finishes: Sequence[Finish],
     ) -> None:
         self.generator = generator
@@ -76,7 +77,7 @@ class Builder:
         self.pace = pace
         self._way = self.route.at(np.arange(0, self.route.effort_m, _WAY_STEP_M))[0]
 
-    def box(self, low: Sequence[float], high: Sequence[float], finish: Finish) -> None:
+    def box(self, low: Point, high: Point, finish: Finish) -> None:
         """A box between two corners."""
         self.add(_box(low, high), finish)
 
@@ -127,7 +128,7 @@ class Builder:
             self.add(solid, finish)
         return True
 
-    def occupy(self, low: Sequence[float], high: Sequence[float]) -> None:
+    def occupy(self, low: Point, high: Point) -> None:
         """Keeps furniture out of a box, for example a wall or the swing of a door."""
         self._occupied.append((np.asarray(low, dtype=float), np.asarray(high, dtype=float)))
 
@@ -146,7 +147,7 @@ class Builder:
         middle[1 - axis], half[1 - axis] = center[0], size[0] / 2
         middle[2], half[2] = center[1], size[1] / 2
         poster = Finish(f"poster{int(self.generator.integers(POSTERS))}", tint(self.generator, 0.8), None)
-        solid = Box(tuple(middle), 0.0, tuple(2 * half))
+        solid = _box(middle - half, middle + half)
         behind = solid.corners()
         behind[:, axis] = at - sign * SINK_M
         if self._are_solid(behind) and not self._blocks_way([(solid, poster)]):
@@ -189,9 +190,15 @@ def tint(generator: np.random.Generator, low: float = 0.55, spread: float = 0.12
     return red, green, blue
 
 
-def _box(low: Sequence[float], high: Sequence[float]) -> Box:
-    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    return Box(tuple(float(c) for c in (low + high) / 2), 0.0, tuple(float(c) for c in high - low))
+def _box(low: Point, high: Point) -> Box:
+    center = (np.asarray(low, dtype=float) + np.asarray(high, dtype=float)) / 2
+    size = np.asarray(high, dtype=float) - np.asarray(low, dtype=float)
+    return Box(_triple(center), 0.0, _triple(size))
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 def _moved(solid: Primitive, x: float, y: float, bottom: float, yaw: float) -> Primitive:

@@ -158,5 +158,5 @@ def hang_pictures(
         axis, end = (int(n) for n in generator.integers(0, 2, 2))
         size = (float(generator.uniform(0.4, 1.1)), float(generator.uniform(0.4, 0.8)))
         span = low[1 - axis] + size[0] / 2 + 0.1, high[1 - axis] - size[0] / 2 - 0.1
-        along, height = float(generator.uniform(*sorted(span))), float(generator.uniform(1.4, 1.75))
+        along, height = float(generator.uniform(min(span), max(span))), float(generator.uniform(1.4, 1.75))
         plan.picture(axis, float(high[axis] if end else low[axis]), -1 if end else 1, (along, height), size)

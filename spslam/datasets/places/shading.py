@@ -62,13 +62,13 @@ class Shader:
         self._texels_per_m = SIZE_PX * np.abs(self._scale).max(axis=0)
         signs = np.repeat([[-1.0], [1.0]], len(parts), axis=1)
         signs[:, -1] *= -1
-        self._normals = np.zeros((3, len(parts), _FACES), dtype=np.float32)
+        normals = np.zeros((3, len(parts), _FACES), dtype=np.float32)
         c, s = self._turns
         for side in (0, 1):
-            self._normals[0, :, side], self._normals[1, :, side] = c * signs[side], s * signs[side]
-            self._normals[0, :, 2 + side], self._normals[1, :, 2 + side] = -s * signs[side], c * signs[side]
-            self._normals[2, :, 4 + side] = signs[side]
-        self._normals = self._normals.reshape(3, count)
+            normals[0, :, side], normals[1, :, side] = c * signs[side], s * signs[side]
+            normals[0, :, 2 + side], normals[1, :, 2 + side] = -s * signs[side], c * signs[side]
+            normals[2, :, 4 + side] = signs[side]
+        self._normals = normals.reshape(3, count)
         boxes = np.repeat(self._round == 0, _FACES)
         shade = np.where(boxes, _AMBIENT + _DIRECT * (_LIGHT @ self._normals), 1.0)
         self._color *= shade.astype(np.float32)[:, None]

@@ -125,7 +125,7 @@ def _planks(generator: Random) -> np.ndarray:
         image[band, joints % SIZE_PX] *= 0.35
         image[band.start : band.start + 2] *= 0.4
     stretched = np.roll(cv2.resize(grain[:, :64], (SIZE_PX, SIZE_PX)), int(generator.integers(SIZE_PX)), axis=0)
-    stretched += stretched[:, ::-1]
+    stretched = stretched + stretched[:, ::-1]
     image *= (1 + 0.06 * stretched + 0.03 * _noise(generator, 256))[..., None]
     return image * (1 - 0.6 * _spots(generator, 10, (2, 5)))[..., None]
 

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.datasets.places.sensors.phone_lidar import measure_phone_lidar
+from spslam.datasets.places.sensors.stereo import measure_stereo
 from spslam.datasets.places.sensors.structured_light import measure_structured_light
+from spslam.datasets.places.sensors.time_of_flight import measure_time_of_flight
 
 # Exact depth, color, camera, level and random numbers to measured depth.
 Measure = Callable[[np.ndarray, np.ndarray, Camera, float, np.random.Generator], np.ndarray]
@@ -61,4 +64,7 @@ def _measure_exact(
 SENSORS: dict[str, Sensor] = {
     "exact": Sensor(320, 240, 60.0, 30.0, 0.0, math.inf, _measure_exact),
     "structured_light": Sensor(320, 240, 60.0, 30.0, 0.35, 8.0, measure_structured_light),
+    "stereo": Sensor(424, 240, 87.0, 30.0, 0.2, 10.0, measure_stereo),
+    "time_of_flight": Sensor(320, 288, 75.0, 30.0, 0.5, 5.5, measure_time_of_flight),
+    "phone_lidar": Sensor(256, 192, 62.0, 60.0, 0.2, 5.0, measure_phone_lidar),
 }
