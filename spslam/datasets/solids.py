@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from spslam.datasets.primitives import Box, Primitive
 _HIDDEN_M = 1e-9
 
 
-class SolidScene:
+class SolidScene(ABC):
     """Free space is the inside of `shell` less all solids, which may overlap; world axes have z up.
 
     Args:
@@ -23,6 +24,10 @@ class SolidScene:
     def __init__(self, shell: Box, solids: Sequence[Primitive]) -> None:
         self._shell = shell
         self._solids = tuple(solids)
+
+    @abstractmethod
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """The surface as a mesh: vertices float64 [V,3] and faces int64 [F,3], which point into free space."""
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         """Distance [N] in meters of points [N,3] to the nearest surface.

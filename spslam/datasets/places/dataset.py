@@ -12,6 +12,7 @@ from spslam.datasets.places.color_image import ColorImage, ExposureMeter
 from spslam.datasets.places.motion import MOTIONS, Motion
 from spslam.datasets.places.registry import PLACES, make_place
 from spslam.datasets.places.sensors import SENSORS
+from spslam.datasets.solids import SolidScene
 from spslam.errors import DatasetError
 
 _SMALLEST_IMAGE = 16
@@ -119,6 +120,10 @@ class PlacesDataset(RgbdDataset):
     def poses(self) -> np.ndarray:
         """Poses at the times of depth images; with a rolling shutter, of their middle row."""
         return self.motion.poses(self.timestamps())
+
+    @property
+    def surface(self) -> SolidScene:
+        return self.place
 
     def read(self, index: int) -> RgbdFrame:
         time = index / self._rate_hz

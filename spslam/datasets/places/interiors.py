@@ -44,7 +44,7 @@ def apartment(generator: Random) -> Builder:
     """
     corridor, wall = float(generator.uniform(1.7, 2.1)), 0.12
     depths = generator.uniform(3.8, 4.6, 2)
-    north, south = generator.uniform(3.9, 4.9, 4), generator.uniform(4.6, 6.0, 3)
+    north, south = generator.uniform(4.2, 5.1, 4), generator.uniform(4.6, 6.0, 3)
     length = float(north.sum())
     south = south * length / south.sum()
     low, high = (0.0, -corridor / 2 - depths[1]), (length, corridor / 2 + depths[0])

@@ -29,14 +29,14 @@ _STYLES = {
     "handheld": _Style(0.55),
     "walking": _Style(1.15, shake=0.8, steps_hz=1.8),
     "fast_turns": _Style(0.45, shake=1.2, turns=True),
-    "stop_and_go": _Style(0.8, shake=0.5, stops=True),
+    "stop_and_go": _Style(0.5, shake=0.5, stops=True),
 }
 MOTIONS = tuple(_STYLES)
 # Drift of the speed, as a share of it.
 _SPEED_WAVE = 0.25
 _BOB_M, _SWAY_M, _STEP_PITCH, _STEP_ROLL, _STEP_YAW = 0.02, 0.018, 0.008, 0.012, 0.012
-# A fast turn: to a direction of up to `_TURN_REACH` beside the route's, at up to `_TURN_RATE` at its middle.
-_TURN_EVERY_S, _TURN_REACH, _TURN_RATES = 1.8, 1.15, (1.2, 2.7)
+# A fast turn: to a direction of up to `_TURN_REACH` beside the route's, at one of the rates (rad/s) at its middle.
+_TURN_EVERY_S, _TURN_REACH, _TURN_RATES = 1.8, 1.15, (1.3, 2.9)
 # Of a stop and the way to the next one.
 _CYCLE_S, _STANDING_S = 7.0, 2.0
 # Peak slope of the smooth step below.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import trimesh
 
@@ -34,7 +36,12 @@ class Place(SolidScene):
         corners = np.array([solid.corners() for solid in plan.solids])
         self._extents = corners.min(axis=1), corners.max(axis=1)
         self._caster = Caster(plan.shell, plan.solids)
-        self._shader = Shader(plan.shell, plan.solids, [*plan.finishes, plan.shell_finishes], seed, texture)
+        self._look = ([*plan.finishes, plan.shell_finishes], seed, texture)
+
+    @cached_property
+    def _shader(self) -> Shader:
+        """Made when colors are first asked for; textures take half a second."""
+        return Shader(self._shell, self._solids, *self._look)
 
     def render(self, camera: Camera, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Color uint8 [H, W, 3] and exact depth float32 [H, W], m.

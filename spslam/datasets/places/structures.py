@@ -88,7 +88,7 @@ def arcade(generator: Random) -> Builder:
     """A vaulted walk around a block, its columns and bays all alike; a round is some 70 m."""
     bay, aisle = float(generator.uniform(2.8, 3.2)), float(generator.uniform(1.5, 1.8))
     width, height = float(generator.uniform(5.6, 6.2)), float(generator.uniform(3.8, 4.6))
-    bays = int(generator.integers(5, 7)), int(generator.integers(3, 5))
+    bays = 6, int(generator.integers(3, 5))
     # The columns stand on the corners of a rectangle of whole bays.
     inner = np.array(bays) * bay
     edge = width - aisle

@@ -50,7 +50,7 @@ def measure_stereo(
     texture = texture_of(color, disparity_px_m / disparity)
     deviation = np.float32(level * SUBPIXEL * scale) * np.clip(_GOOD_TEXTURE / np.maximum(texture, 1e-3), 1, 3)
     noisy = disparity + deviation * smooth_noise(depth.shape, _WINDOW_SIGMA_PX * scale, generator)
-    lost = _unmatched(exact) | (texture < _NO_TEXTURE) | (noisy <= 0)
+    lost = (_unmatched(exact) & (disparity == exact)) | (texture < _NO_TEXTURE) | (noisy <= 0)
     lost |= generator.random(depth.shape, dtype=np.float32) < _RANDOM_LOSS * level
     return np.where(lost, np.float32(0), disparity_px_m / np.where(noisy <= 0, np.float32(1), noisy))
 
