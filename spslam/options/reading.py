@@ -46,7 +46,7 @@ class DatasetOptions(Section):
         gt=0,
     )
     frames: int = option(
-        "length of the sequence; beyond one round of a generated path the next begins",
+        "length of the sequence; beyond one round of the path (300 frames of `generated`) the next begins",
         "frames",
         needs=(_RENDERED,),
         ge=1,

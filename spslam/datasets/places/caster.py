@@ -44,12 +44,10 @@ class Rays:
             poses: [4, 4], or one for each row [H, 4, 4].
         """
         poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
-        rotations = poses[:, :3, :3].astype(np.float32)
-        camera_rays = camera.ray_directions()
-        if len(poses) == 1:
-            directions = np.tensordot(rotations[0], camera_rays, axes=(1, 2))
-        else:
-            directions = np.ascontiguousarray(np.moveaxis(camera_rays @ np.swapaxes(rotations, 1, 2), 2, 0))
+        across, down, forward = np.moveaxis(poses[:, :3, :3], (2, 1), (0, 1))[..., None]
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+        directions = (across * x).astype(np.float32) + (down * y + forward).astype(np.float32)
         directions[np.abs(directions) < _SMALLEST] = _SMALLEST
         return cls(poses[:, :3, 3].T[:, :, None], directions, poses)
 
@@ -110,7 +108,7 @@ class Caster:
         if isinstance(solid, Box) and solid.yaw == 0:
             hit, nearer = _box_entry(solid, origins, rays[1][(slice(None), *window)])
         else:
-            hit = solid.intersect(origins[:, 0, 0] if origins.shape[1] == 1 else origins, directions)
+            hit = solid.intersect(origins, directions)
             nearer = hit > 0
         nearer &= hit < depth[window]
         np.copyto(depth[window], hit, where=nearer)
