@@ -25,7 +25,7 @@ NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capab
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
-demo: dev ## track and map a generated room with known truth, into runs/demo
+demo: dev ## track and map a generated room with exact ground truth, into runs/demo
 	$(COMMAND) demo
 
 test: dev ## build, then run the tests on the CPU, without the slow sweeps
@@ -78,7 +78,7 @@ test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined
 	cd build/asan-site && LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops
 
-fuzz: dev ## read spoiled files of every format for MINUTES (60), in JOBS processes; see docs/reliability.md
+fuzz: dev ## read corrupted files of every format for MINUTES (60), in JOBS processes; see docs/reliability.md
 	$(PYTHON) -m tests.fuzz --minutes $(or $(MINUTES),60) --jobs $(JOBS)
 
 lint: $(ENVIRONMENT) ## style and types

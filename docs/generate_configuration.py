@@ -1,6 +1,6 @@
 """Writes docs/configuration.md from the options' own descriptions, the defaults and the presets.
 
-Run it from the repository after changing an option; a test says when it is due.
+Run it from the repository after changing an option; a test fails if the page is out of date.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ HEADER = """# Configuration
 
 A run's options are merged from four places, each overriding those before:
 
-1. `configs/defaults.yaml`, which holds a value for every option,
+1. `configs/defaults.yaml`, which has a value for every option,
 2. a preset, `--preset paper|balanced|fast`,
 3. the configuration file given to `spslam run`, by path or by the name of a shipped one ({names}),
 4. `--set section.key=value`, any number of times (and `--device`, `--seed`, `--data` for `device`, `seed` and
    `dataset.path`).
 
-A file may name its `preset`, and under `presets: {{paper: {{...}}}}` give options that apply with that preset alone;
-so `configs/replica.yaml` holds the paper's iterations for Replica without touching the other presets. Unknown options,
-wrong types and values out of range are errors before anything runs. So is an option from a file or `--set` that has no
-effect with the other options: "only with" below says what it needs. The resolved options of a run are in its
-`config.yaml`, marked with `resolved: true`, which can be given to `spslam run` again. Sections and equations in the
+A file may name its `preset`, and under `presets: {{paper: {{...}}}}` set options that apply with that preset only; for
+example, `configs/replica.yaml` sets the paper's iterations for Replica and does not change the other presets. Unknown
+options, wrong types and values out of range are errors before anything runs. So is an option from a file or `--set`
+that has no effect with the other options: "only with" below names the condition. The resolved options of a run are in
+its `config.yaml`, marked with `resolved: true`, which can be given to `spslam run` again. Sections and equations in the
 tables are those of the paper.
 
 From Python:
@@ -89,7 +89,7 @@ def _preset_table(defaults: dict[str, Any], presets: dict[str, dict[str, Any]]) 
         if len({str(value) for value in values}) > 1:
             rows.append(f"| `{key}` | " + " | ".join(_value(value) for value in values) + " |")
     text = (
-        "`paper` has the values of section IV.A of the paper; `balanced`, the default, is the most accurate at the "
+        "`paper` has the values of section IV.A of the paper; `balanced`, the default, is the most accurate one at the "
         "camera's frame rate; `fast` has the fewest iterations. They differ in:"
     )
     return f"## Presets\n\n{text}\n\n" + "\n".join(rows) + "\n"

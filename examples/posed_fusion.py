@@ -24,7 +24,7 @@ def surface_points(frame, camera, device):
     """World points and unit normals [N, 3] at random pixels of a frame."""
     depth = torch.from_numpy(frame.depth).to(device)
     measured = depth.flatten().nonzero()[:, 0]
-    key = 0, ops.Stream.ENCODER_POINTS, frame.index, 0
+    key = 0, ops.RandomStream.ENCODER_POINTS, frame.index, 0
     drawn = measured[ops.sample_indices(*key, POINTS, max(len(measured), 1), device)]
     u, v, z = drawn % camera.width, drawn // camera.width, depth.flatten()[drawn]
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy

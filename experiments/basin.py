@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from experiments.arguments import add_changes, make_parser
 from spslam import ops
 from spslam.benchmark.environment import describe_environment
 from spslam.config import load_config
@@ -30,15 +31,15 @@ BACK_M, BACK_RAD = 0.01, np.radians(0.5)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("config")
-    parser.add_argument("data", nargs="?")
+    parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--frames", type=int, default=200, help="frames of the run")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th frame")
     parser.add_argument("--every", type=int, default=10, help="try every n-th of them")
     parser.add_argument("--trials", type=int, default=10, help="starts of each offset at each frame")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change an option")
+    add_changes(parser)
     parser.add_argument("--json", type=Path, help="file to write the shares to")
     args = parser.parse_args()
     came_back = measure(args)

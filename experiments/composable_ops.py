@@ -39,7 +39,7 @@ def cases(generator: torch.Generator, device: torch.device) -> list[Case]:
     scene = room.make_scene(generator, device)
     rays = room.make_rays(generator, RAYS, room.FRAMES, device)
     seen = unpack_pixels(rays.pixels, rays.intrinsics, torch.float32)
-    key = (0, ops.Stream.MAPPING_RAYS, 0, 0)
+    key = (0, ops.RandomStream.MAPPING_RAYS, 0, 0)
 
     def sample(depth):
         return ops.sample_along_rays(depth, UNIFORM, SURFACE, 0.2, 1.02, room.TRUNCATION_M, *key)

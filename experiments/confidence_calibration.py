@@ -12,16 +12,15 @@ measurements.
 import argparse
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from experiments.arguments import add_measurements, add_options, add_sequence, make_parser
 from experiments.basin import matrix, moved
 from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.geometry import rotation_angle
-from spslam.options import PRESETS
 from spslam.slam.fit import Fit
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.poses import pose_tensor
@@ -150,14 +149,11 @@ def coefficients(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
     parser.add_argument("--step", type=int, default=1, help="use every n-th frame")
-    parser.add_argument("--preset", choices=PRESETS)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
-    parser.add_argument("--save", type=Path, help="file for the measurements")
-    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to evaluate together")
+    add_options(parser)
+    add_measurements(parser)
     return parser
 
 

@@ -1,14 +1,14 @@
 """Fault injection: frames of a covered, moved or interrupted camera, and what the system does with them.
 
 A trial is a run up to some frame, then a fault, then frames near a place that was mapped before. Every second frame of
-the data set is mapped, and the camera returns with frames in between, so that no frame is processed twice.
+the dataset is mapped, and the camera returns with frames in between, so that no frame is processed twice.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError
 from spslam.geometry import inverse, rotation_angle
+from spslam.run.clock import RunClock
 from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapshot
 from spslam.slam.system import SlamSystem
 
@@ -61,7 +62,7 @@ COVERS = (cover_near, cover_garbage, cover_wall)
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame of a trial: its index in the data set, and the change that the fault makes to it."""
+    """A frame of a trial: its index in the dataset, and the change that the fault makes to it."""
 
     index: int
     change: Change | None = None
@@ -154,10 +155,10 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
         The outcome of each trial, in the order of their places.
 
     Raises:
-        DatasetError: a frame before a fault is lost, so that there is nothing to compare with, or the data set has no
+        DatasetError: a frame before a fault is lost, so that there is nothing to compare with, or the dataset has no
             ground truth.
     """
-    ground_truth = true_poses(dataset)
+    ground_truth = gt_poses(dataset)
     system = SlamSystem(config, dataset.camera, ground_truth[0], device)
     with tempfile.TemporaryDirectory() as folder:
         for trial in sorted(trials, key=lambda trial: trial.place):
@@ -169,7 +170,7 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
 
 def try_fault(system: SlamSystem, dataset: RgbdDataset, trial: Trial) -> Outcome:
     """Runs one trial on a system that has mapped `trial.place` frames; the system is not usable afterwards."""
-    random, ground_truth = np.random.default_rng(trial.seed), true_poses(dataset)
+    random, ground_truth = np.random.default_rng(trial.seed), gt_poses(dataset)
     lost, wrong, added = [], [], 0
     for shown in trial.during:
         voxels = system.state.scene.volume.num_voxels
@@ -208,7 +209,7 @@ def _shown_frame(dataset: RgbdDataset, shown: Shown, random: np.random.Generator
 
 
 def _error(system: SlamSystem, ground_truth: np.ndarray, place: int, index: int) -> tuple[float, float]:
-    """Distance (cm) and angle (degrees) of the last pose from the expected pose of a data set's frame."""
+    """Distance (cm) and angle (degrees) of the last pose from the expected pose of a dataset's frame."""
     return apart(system.state.frames.matrices(-1)[0], expected_pose(system, ground_truth, place, index))
 
 
@@ -219,9 +220,9 @@ def expected_pose(system: SlamSystem, ground_truth: np.ndarray, place: int, inde
 
     Args:
         system: has mapped `place` frames.
-        ground_truth: float64 [F, 4, 4] of the data set.
+        ground_truth: float64 [F, 4, 4] of the dataset.
         place: number of mapped frames.
-        index: of the frame in the data set.
+        index: of the frame in the dataset.
 
     Returns:
         float64 [4, 4] T_world_camera.
@@ -238,7 +239,7 @@ def apart(pose: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     return 100 * float(np.linalg.norm(pose[:3, 3] - other[:3, 3])), float(np.degrees(angle))
 
 
-def true_poses(dataset: RgbdDataset) -> np.ndarray:
+def gt_poses(dataset: RgbdDataset) -> np.ndarray:
     """Ground-truth poses float64 [F, 4, 4]; raises DatasetError where there are none."""
     poses = dataset.poses()
     if poses is None:
@@ -248,7 +249,9 @@ def true_poses(dataset: RgbdDataset) -> np.ndarray:
 
 def copy_of(system: SlamSystem, first_pose: np.ndarray, path: Path) -> SlamSystem:
     """A copy of the system, made through a checkpoint at `path`."""
-    write_snapshot(path, take_snapshot(system.state, system.config, {}, copy=False))
+    frames = len(system.state.frames)
+    source = {"data": {"frames": frames}, "next": frames, "clock": asdict(RunClock())}
+    write_snapshot(path, take_snapshot(system.state, system.config, source, copy=False))
     copy = SlamSystem(system.config, system.camera, first_pose, system.device)
     load_checkpoint(path, copy.state, copy.config)
     return copy

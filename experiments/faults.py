@@ -15,11 +15,11 @@ from pathlib import Path
 import torch
 
 from experiments import timing
+from experiments.arguments import add_options, add_sequence, make_parser
 from experiments.fault_injection import FLAG_WITHIN, Outcome, plan, run_trials
-from spslam.cli.arguments import parse_frames
+from spslam.cli.arguments import frame_range
 from spslam.config import load_config
 from spslam.datasets import open_sequence
-from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 
 RECOVERED_SHARE = 0.9
@@ -45,15 +45,13 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
+    parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--preset", choices=PRESETS)
     parser.add_argument("--trials", type=int, default=10, help="of each fault")
     parser.add_argument("--seed", type=int, default=0, help="of the places to return to and of noise")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
+    add_options(parser)
     parser.add_argument("--verbose", action="store_true", help="print a line per trial")
     parser.add_argument("--json", type=Path, help="file to write the results to")
     return parser

@@ -6,7 +6,6 @@ The time of a call is measured by CUDA events and includes launches and the read
 measured by the profiler. Frames are encoded into a map that already has earlier frames, as in a run.
 """
 
-import argparse
 import statistics
 from collections.abc import Callable
 from functools import partial
@@ -16,6 +15,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from experiments import room, timing
+from experiments.arguments import make_parser
 from spslam import ops
 from spslam.meshing import extract_surface
 from spslam.prior import load_prior
@@ -136,7 +136,7 @@ def _cells(scene: ops.SceneView) -> torch.Tensor:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=50, help="calls of each")
     parser.add_argument("--json", type=Path, help="file to write the results to")
     args = parser.parse_args()

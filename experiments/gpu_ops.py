@@ -3,7 +3,6 @@
 python -m experiments.gpu_ops --json gpu_ops.json
 """
 
-import argparse
 import statistics
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +11,7 @@ from pathlib import Path
 import torch
 
 from experiments import room, timing
+from experiments.arguments import make_parser
 from spslam import ops
 from spslam.camera import Camera
 from spslam.slam.pixels import FramePixels, unpack_points
@@ -26,7 +26,7 @@ TRACKING = ops.GaussNewtonOptions(
     kernel_end=0.02,
     damping=1e-4,
     seed=0,
-    stream=ops.Stream.TRACKING_PIXELS,
+    stream=ops.RandomStream.TRACKING_PIXELS,
     frame=0,
 )
 
@@ -128,7 +128,7 @@ def selection_rows(rays: ops.RayBatch, rounds: int) -> list[dict[str, object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=100, help="replays of each")
     parser.add_argument("--json", type=Path, help="file to write the results to")
     args = parser.parse_args()

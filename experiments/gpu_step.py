@@ -148,7 +148,7 @@ def main() -> None:
                     }
                 )
     samples = OPTIONS.num_uniform + OPTIONS.num_surface
-    title = f"{len(scene.embeddings)} vertices, {len(scene.texels)} texels, {samples} samples a ray, all gradients"
+    title = f"{len(scene.embeddings)} vertices, {len(scene.texels)} texels, {samples} samples per ray, all gradients"
     timing.report(title, rows, device, args.json)
 
 

@@ -3,7 +3,6 @@
 python -m experiments.reading --config 7scenes --data path/to/redkitchen --frames 0:300 --workers 1 2 4 8 16
 """
 
-import argparse
 import os
 import statistics
 import time
@@ -13,6 +12,8 @@ import cv2
 import torch
 
 from experiments import timing
+from experiments.arguments import add_sequence, make_parser
+from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
@@ -22,10 +23,9 @@ from spslam.run.frame_feed import FrameFeed
 
 def main() -> None:
     """Parses the arguments and prints a row per number of threads."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", default="0:300", help="START:STOP")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
+    parser.add_argument("--frames", default="0:300", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--device", default="cpu", help="cuda includes the upload")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=3)
@@ -37,7 +37,7 @@ def main() -> None:
     rows = []
     for workers in args.workers:
         config = load_config(args.config, None, [f"run.prefetch_workers={workers}"])
-        dataset = open_sequence(config.dataset, args.data, slice(*map(int, args.frames.split(":"))))
+        dataset = open_sequence(config.dataset, args.data, args.frames)
         rounds = [read_all(dataset, config, device) for _ in range(args.rounds)]
         rows.append({"workers": workers, **{name: statistics.median(r[name] for r in rounds) for name in rounds[0]}})
     timing.report(f"{args.config}, {len(dataset)} frames, {os.cpu_count()} cores", rows, device, args.json)

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from experiments.arguments import add_measurements, add_options, add_sequence, make_parser
 from experiments.basin import matrix
 from experiments.fault_injection import (
     STEP,
@@ -30,13 +31,12 @@ from experiments.fault_injection import (
     copy_of,
     cover_wall,
     expected_pose,
-    true_poses,
+    gt_poses,
 )
-from spslam.cli.arguments import parse_frames
+from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
-from spslam.options import PRESETS
 from spslam.slam.fit import Fit
 from spslam.slam.pixels import sample_frame
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
@@ -68,7 +68,7 @@ def main() -> None:
 
 def measure(config: Config, dataset: RgbdDataset, every: int) -> Iterator[list[float]]:
     """For each frame shown: whether it is a wall, distance (cm) and angle (degrees) to the true pose, and its fit."""
-    ground_truth, random = true_poses(dataset), np.random.default_rng(0)
+    ground_truth, random = gt_poses(dataset), np.random.default_rng(0)
     system = SlamSystem(config, dataset.camera, ground_truth[0])
     rows = len(dataset) // STEP
     for place in np.linspace(FIRST_PLACE * rows, rows - 1, PLACES).astype(int).tolist():
@@ -131,15 +131,12 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
-    parser.add_argument("--frames", type=parse_frames, help="START:STOP[:STEP]")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
+    parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--every", type=int, default=3, help="show every n-th of the frames that are not mapped")
-    parser.add_argument("--preset", choices=PRESETS)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
-    parser.add_argument("--save", type=Path, help="file for the measurements")
-    parser.add_argument("--saved", type=Path, nargs="+", help="files of earlier calls to evaluate together")
+    add_options(parser)
+    add_measurements(parser)
     return parser
 
 

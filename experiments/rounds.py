@@ -14,12 +14,12 @@ import numpy as np
 import torch
 
 from experiments import timing
+from experiments.arguments import add_options, make_parser
 from spslam.config import load_config
 from spslam.datasets import open_sequence
 from spslam.datasets.generated import FRAMES_PER_ROUND
 from spslam.errors import DatasetError
 from spslam.evaluation.trajectory_metrics import absolute_errors, align
-from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.frame_feed import FrameFeed
 from spslam.slam.system import SlamSystem
@@ -77,12 +77,11 @@ def memory(system: SlamSystem) -> dict[str, float]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--noise", type=float, default=1.0, help="of the depth camera; 1 is a Kinect's")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--preset", choices=PRESETS)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
+    add_options(parser)
     parser.add_argument("--json", type=Path, help="file to write the results to")
     return parser
 

@@ -20,11 +20,12 @@ from pathlib import Path
 import torch
 
 from experiments import timing
-from spslam.cli.arguments import parse_frames
+from experiments.arguments import add_changes, add_sequence, make_parser
 from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
 from spslam.run.reader_launch import launch_standby
+from spslam.run.request import parse_frames
 from spslam.run.sequence import RunRequest, run_sequence
 from spslam.run_folder import RunFolder
 
@@ -66,14 +67,13 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", default="demo", help="configuration file or name")
-    parser.add_argument("--data", type=Path, help="the sequence's folder")
+    parser = make_parser(__doc__)
+    add_sequence(parser)
     parser.add_argument("--frames", help="START:STOP[:STEP]")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--preset", action="append", choices=PRESETS, help="all where none is given")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each preset")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further options")
+    add_changes(parser)
     parser.add_argument("--json", type=Path, help="file to write the results to")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     return parser

@@ -25,9 +25,10 @@ from typing import Any
 
 import torch
 
+from experiments.arguments import make_parser
 from spslam import ops
 from spslam.benchmark.environment import describe_environment
-from spslam.config import load_config
+from spslam.config import Config, load_config
 from spslam.datasets import open_dataset
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
@@ -59,6 +60,12 @@ class Job:
         """Identifies a row of results."""
         return self.setting, self.name, self.seed
 
+    def load_config(self, threads: int) -> Config:
+        """All options of the run; raises ConfigError."""
+        preset, *overrides = self.setting.split(",")
+        own = [f"seed={self.seed}", f"run.prefetch_workers={threads}", *self.overrides]
+        return load_config(self.config, preset, [*own, *overrides])
+
 
 def main() -> None:
     """Parses the arguments; runs the jobs in worker processes, or is such a worker."""
@@ -76,7 +83,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--sequence", action="append", default=[])
     parser.add_argument("--setting", action="append", default=[])
     parser.add_argument("--settings", action="append", default=[], type=Path, help="file with one setting per line")
@@ -175,9 +182,7 @@ def serve(device_name: str, threads: int) -> None:
 
 def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
     """Tracks and maps the sequence; returns ATE, RPE, lost and recovered frames, and frames/s."""
-    preset, *overrides = job.setting.split(",")
-    own = [f"seed={job.seed}", f"run.prefetch_workers={threads}", *job.overrides]
-    config = load_config(job.config, preset, [*own, *overrides])
+    config = job.load_config(threads)
     dataset = Subset(open_dataset(config.dataset, job.folder or None), job.start, job.stop, job.step)
     ground_truth = dataset.poses()
     warm_up(config, dataset.camera, device)

@@ -24,7 +24,7 @@ OPTIONS = ops.RenderOptions(
     weight_free_space=20.0,
     weight_sdf=1000.0,
     seed=0,
-    stream=ops.Stream.MAPPING_RAYS,
+    stream=ops.RandomStream.MAPPING_RAYS,
     frame=0,
     iteration=0,
 )
@@ -85,7 +85,7 @@ def main() -> None:
                     }
                 )
     samples = OPTIONS.num_uniform + OPTIONS.num_surface
-    title = f"{len(scene.embeddings)} vertices, {len(scene.texels)} texels, {samples} samples a ray"
+    title = f"{len(scene.embeddings)} vertices, {len(scene.texels)} texels, {samples} samples per ray"
     timing.report(title, rows, device, args.json)
 
 

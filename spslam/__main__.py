@@ -1,4 +1,4 @@
-"""``python -m spslam``: the ``spslam`` command."""
+"""`python -m spslam`: the `spslam` command."""
 
 import sys
 

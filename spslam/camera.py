@@ -34,7 +34,7 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if int(value) != value or value < 1:
+            if not 1 <= value < 2**31 or int(value) != value:
                 raise ValueError(f"Camera: {name} must be a positive whole number, got {value}")
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):

@@ -1,7 +1,7 @@
 """Reading a configuration: defaults, then a preset, then a configuration file, then overrides.
 
-A configuration file is YAML with the sections of :class:`spslam.options.Config`. It may name its ``preset``, and hold
-under ``presets: {NAME: ...}`` options that apply only with that preset.
+A configuration file is YAML with the sections of `spslam.options.Config`. It may name its `preset`, and hold
+under `presets: {NAME: ...}` options that apply only with that preset.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ def load_config(path: str | os.PathLike, preset: str | None = None, overrides: I
 
 
 def dump_config(config: Config, header: Mapping[str, Any] | None = None) -> str:
-    """The configuration as YAML that :func:`load_config` reads back to an equal one; ``header`` becomes comments."""
+    """The configuration as YAML that `load_config` reads back to an equal one; `header` becomes comments."""
     comments = "".join(f"# {key}: {value}\n" for key, value in (header or {}).items())
     values = {RESOLVED: True, **config.model_dump(mode="json")}
     return comments + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 
 def resolve_config_path(path: str | os.PathLike) -> Path:
-    """The file that a path or a shipped configuration's name stands for; ``configs/NAME.yaml`` is found anywhere."""
+    """The file that a path or a shipped configuration's name stands for; `configs/NAME.yaml` is found anywhere."""
     given = Path(path)
     if str(given) in config_names():  # though there may be a folder of that name, say the data's
         return _config_dir() / f"{given}.yaml"
@@ -91,7 +91,7 @@ def resolve_config_path(path: str | os.PathLike) -> Path:
 
 
 def read_shipped(name: str) -> dict[str, Any]:
-    """The content of a YAML file in the shipped ``configs`` folder, say ``models/pose_confidence.yaml``."""
+    """The content of a YAML file in the shipped `configs` folder, say `models/pose_confidence.yaml`."""
     return _read(_config_dir() / name)
 
 
@@ -109,7 +109,7 @@ def _config_dir() -> Path:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2's floating-point numbers (``1e-4``), no key twice, no aliases and no whole numbers of any length."""
+    """YAML 1.2's floating-point numbers (`1e-4`), no key twice, no aliases and no whole numbers of any length."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):  # ten levels of ten aliases each stand for 10^10 values
@@ -148,7 +148,7 @@ def _read(path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold sections of options, got {shown(content)}")
+        raise ConfigError(f"{path}: must contain sections of options, got {shown(content)}")
     return content
 
 
@@ -179,7 +179,7 @@ def _nest(key: str, value: Any) -> dict[str, Any]:
 
 
 def _merge(base: dict[str, Any], change: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """A copy of ``base`` in which ``change`` replaces values; sections are merged key by key."""
+    """A copy of `base` in which `change` replaces values; sections are merged key by key."""
     merged = copy.copy(base)
     for key, value in change.items():
         if isinstance(base.get(key), dict):
@@ -226,7 +226,7 @@ def _validate(values: dict[str, Any]) -> Config:
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """All options of nested sections as ``section.key``."""
+    """All options of nested sections as `section.key`."""
     for key, value in values.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{prefix}{key}.")

@@ -5,9 +5,21 @@ Each message is one line that names the file, the option or the argument at faul
 data, output folders, devices and weights.
 """
 
+_MAX_MESSAGE_CHARACTERS = 900
+
 
 class SpslamError(Exception):
-    """Base class of all errors that a user can fix."""
+    """Base class of all errors that a user can fix.
+
+    The message is one line, shortened in the middle where it is very long, whatever a file put into it.
+    """
+
+    def __str__(self) -> str:
+        text = " ".join(super().__str__().splitlines())
+        if len(text) <= _MAX_MESSAGE_CHARACTERS:
+            return text
+        kept = _MAX_MESSAGE_CHARACTERS // 2 - 3
+        return f"{text[:kept]} ... {text[-kept:]}"
 
 
 class ConfigError(SpslamError):

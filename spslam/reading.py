@@ -123,7 +123,7 @@ def parse_json(text: str, name: str, error: type[Exception]) -> dict[str, Any]:
     except ValueError as fault:
         raise error(f"{name}: isn't valid JSON: {brief(str(fault), 200)}") from None
     if not isinstance(content, dict):
-        raise error(f"{name}: must hold an object with named values, got {type(content).__name__}")
+        raise error(f"{name}: must contain an object with named values, got {type(content).__name__}")
     return content
 
 

@@ -41,6 +41,7 @@ def test_resized_keeps_the_field_of_view():
     [
         ((0, 48, 1, 1, 0, 0), "Camera: width must be a positive whole number, got 0"),
         ((64, 48.5, 1, 1, 0, 0), "Camera: height must be a positive whole number, got 48.5"),
+        ((float("inf"), 48, 1, 1, 0, 0), "Camera: width must be a positive whole number, got inf"),
         ((64, 48, 0, 1, 0, 0), "Camera: fx must be positive, got 0"),
         ((64, 48, 1, float("nan"), 0, 0), "Camera: fy must be finite, got nan"),
     ],

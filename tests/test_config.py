@@ -40,7 +40,7 @@ def test_paper_preset_is_section_iv_a():
 
 
 @pytest.mark.parametrize(("name", "tracking", "mapping"), [("replica", 4, 20), ("tum", 6, 30), ("7scenes", 6, 20)])
-def test_paper_iterations_of_each_data_set(name, tracking, mapping):
+def test_paper_iterations_of_each_dataset(name, tracking, mapping):
     config = load_config(name, "paper")
     assert (config.tracking.iterations, config.mapping.iterations) == (tracking, mapping)
 
@@ -144,7 +144,7 @@ def test_wrong_option_is_one_clear_line(override, message):
     ("text", "message"),
     [
         ("", "dataset.type must be set in the configuration file"),
-        ("- 3", "{path}: must hold sections of options, got [3]"),
+        ("- 3", "{path}: must contain sections of options, got [3]"),
         ("a: b: c", "{path}:1: must be YAML: mapping values are not allowed here"),
         ("seed: 1\nseed: 2", "{path}:2: must be YAML: seed is given twice"),
         ("{[1]: 2}", "{path}:1: must be YAML: found unhashable key"),

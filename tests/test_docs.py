@@ -1,5 +1,6 @@
 """The documentation agrees with the code."""
 
+import functools
 import importlib.util
 import re
 from pathlib import Path
@@ -14,6 +15,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 # Dated experiments are not updated, so the options and scripts that they name may be gone; everything else is current.
 RECORDS = [page for page in PAGES if page.parent.name == "experiments" and page.name != "index.md"]
 CURRENT = [page for page in PAGES if page not in RECORDS]
+NAMING = [ROOT / name for name in ("spslam", "tests", "docs", "experiments", "examples", "csrc", "bindings", "configs")]
 
 
 def page_id(page):
@@ -91,6 +93,34 @@ def test_scripts_and_files_named_exist(page):
         assert (ROOT / "experiments" / f"{name}.py").is_file(), name
     for path in re.findall(r"`([\w/]+/\w+\.(?:py|yaml|h|cuh|cpp|cu))`", text):
         assert (ROOT / path).is_file() or (ROOT / "spslam" / path).is_file(), path
+
+
+def exists(name):
+    """Whether a dotted name is a module, or something in one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        module = ".".join(parts[:count])
+        try:
+            found = importlib.util.find_spec(module) is not None
+        except ModuleNotFoundError:
+            continue
+        if found:
+            value = importlib.import_module(module)
+            return functools.reduce(lambda owner, part: getattr(owner, part, None), parts[count:], value) is not None
+    return False
+
+
+@pytest.mark.parametrize("folder", NAMING, ids=lambda folder: folder.name)
+def test_modules_named_in_backticks_exist(folder):
+    """Such as `spslam.run.sequence` or `spslam.meshing.load_mesh`, in pages, docstrings, comments and messages."""
+    files = [path for suffix in ("md", "py", "h", "cpp", "cu", "cuh", "yaml") for path in folder.rglob(f"*.{suffix}")]
+    named = {
+        (path, name)
+        for path in files
+        if path not in RECORDS
+        for name in re.findall(r"`(spslam(?:\.[A-Za-z_]\w*)+)", path.read_text(encoding="utf-8"))
+    }
+    assert not [f"{path.relative_to(ROOT)}: {name}" for path, name in sorted(named) if not exists(name)]
 
 
 @pytest.mark.parametrize("page", RECORDS, ids=page_id)

@@ -62,7 +62,7 @@ def test_a_line_without_end_is_refused(tmp_path):
         ("{", "isn't valid JSON: Expecting"),
         ("[" * 100_000, "isn't valid JSON: it is nested too deep"),
         ('{"a": ' + "9" * 5000 + "}", "isn't valid JSON: a whole number must have at most 20 digits, got 5000"),
-        ("[1]", "must hold an object with named values, got list"),
+        ("[1]", "must contain an object with named values, got list"),
     ],
 )
 def test_json_that_holds_no_object_is_refused(text, message):

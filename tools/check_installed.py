@@ -99,9 +99,14 @@ def check_examples() -> None:
 
 def check_demo(frames: int) -> None:
     """From images to a mesh and a report."""
-    print(spslam("demo", "--frames", str(frames), "--output", "out"))
+    from spslam.run_folder import RunFolder
+
+    folder = RunFolder(Path("out"))
+    print(spslam("demo", "--frames", str(frames), "--output", str(folder.path)))
     missing = [
-        name for name in ("trajectory.txt", "mesh.ply", "metrics.json", "report.html") if not Path("out", name).exists()
+        path
+        for path in (folder.trajectory, folder.map, folder.mesh, folder.metrics, folder.report)
+        if not path.exists()
     ]
     if missing:
         sys.exit(f"check: demo must leave {missing[0]}")

@@ -90,7 +90,7 @@ def check_wheel_file(tools: Environment, wheel: Path) -> None:
     if megabytes > MAX_WHEEL_MB:
         sys.exit(f"release: the wheel must be under {MAX_WHEEL_MB} MB, got {megabytes:.1f}")
     if strays := [name for name in names if name.endswith((".a", ".h", ".cpp", ".cu"))]:
-        sys.exit(f"release: the wheel must hold no development files, got {strays[0]}")
+        sys.exit(f"release: the wheel must contain no development files, got {strays[0]}")
     unpacked = WORK / "unpacked"
     shutil.rmtree(unpacked, ignore_errors=True)
     zipfile.ZipFile(wheel).extractall(unpacked)

@@ -20,19 +20,9 @@ Tensor predict_pose(Tensor before, Tensor last) {
 constexpr char kName[] = "track_gauss_newton";
 
 // Places in the op's lists of numbers; spslam/ops/gauss_newton.py fills them.
-enum class Scalar {
-  kFx,
-  kFy,
-  kCx,
-  kCy,
-  kTruncation,
-  kKernelStart,
-  kKernelEnd,
-  kScoreKernel,
-  kDamping,
-  kNoiseCrossoverDepth,
-  kCount
-};
+#define SPS_NAME_PLACE(type, name) name,
+enum class Scalar { kFx, kFy, kCx, kCy, SPS_GAUSS_NEWTON_SCALARS(SPS_NAME_PLACE) kCount };
+#undef SPS_NAME_PLACE
 enum class Integer { kNumPixels, kIterations, kSeed, kStream, kFrame, kTf32, kCount };
 enum class ReferenceScalar { kFx, kFy, kCx, kCy, kWeight, kKernel, kCount };
 enum class KeyframeScalar { kFx, kFy, kCx, kCy, kUnit, kKernelEnd, kCount };
@@ -98,13 +88,10 @@ GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<I
   options.intrinsics = load_intrinsics(scalars);
   options.num_pixels = integers[Integer::kNumPixels];
   options.iterations = integers[Integer::kIterations];
-  options.truncation = scalars.as<float>(Scalar::kTruncation);
-  options.kernel_start = scalars.as<float>(Scalar::kKernelStart);
-  options.kernel_end = scalars.as<float>(Scalar::kKernelEnd);
-  options.score_kernel = scalars.as<float>(Scalar::kScoreKernel);
-  options.damping = scalars[Scalar::kDamping];
+#define SPS_LOAD_FIELD(type, name) options.name = scalars.as<type>(Scalar::name);
+  SPS_GAUSS_NEWTON_SCALARS(SPS_LOAD_FIELD)
+#undef SPS_LOAD_FIELD
   options.key = load_key(integers, 0);
-  options.noise_crossover_depth = scalars.as<float>(Scalar::kNoiseCrossoverDepth);
   options.tf32 = integers.as<bool>(Integer::kTf32);
   check_count(kName, "num_pixels", options.num_pixels);
   check_count(kName, "iterations", options.iterations);

@@ -12,7 +12,7 @@ std::tuple<Tensor, Tensor, std::int64_t> marching_cubes(Tensor cell_coords, Tens
                 values.size(2) == values.size(3) && has_shape(cell_coords, {values.size(0), 3}),
             "marching_cubes: cell_coords and values must have shapes [M, 3] and [M, n + 1, n + 1, n + 1]");
   SPS_CHECK(values.size(1) >= 2 && values.size(1) <= kMaxSamples, "marching_cubes: values must have 2 to ", kMaxSamples,
-            " samples an axis, got ", values.size(1));
+            " samples per axis, got ", values.size(1));
   DeviceScope scope(values);
   cell_coords = contiguous(cell_coords);
   values = contiguous(values);

@@ -16,7 +16,7 @@ void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, 
   std::optional<Tensor> flat_stamps;
   if (stamps.has_value()) flat_stamps = contiguous(*stamps);
   const std::int64_t rows = stamps.has_value() ? stamps->numel() : 1;
-  SPS_CHECK(rows >= 1 && count % rows == 0, "sparse_adam_: stamps must have one entry a row of param");
+  SPS_CHECK(rows >= 1 && count % rows == 0, "sparse_adam_: stamps must have one entry per row of param");
   dispatch_floating("sparse_adam_", param, [&](auto zero) {
     using T = decltype(zero);
     sparse_adam(scope.context, AdamStep{lr, beta1, beta2, eps, step}, rows, count / rows,

@@ -11,7 +11,7 @@ namespace spslam {
 
 // What a draw is for. Two draws share no counter unless stream, frame, iteration and element all agree.
 // spslam/ops/ray_sampling.py repeats these numbers.
-enum class Stream : std::uint32_t {
+enum class RandomStream : std::uint32_t {
   kPixelDatabase = 0,
   kTrackingPixels = 1,
   kTrackingRays = 2,

@@ -149,7 +149,7 @@ class Chunk {
 // Gradients of samples before they are added to the tables: chunk c writes rows and runs from c * kChunkRays *
 // num_samples on.
 struct TableGradients {
-  std::int64_t capacity;  // rows a chunk may write
+  std::int64_t capacity;  // rows that a chunk may write
   std::int64_t rows;      // of all chunks
 
   std::int64_t* num_embedding_runs;  // [chunks]

@@ -7,7 +7,7 @@ namespace {
 
 constexpr int kWarps = 16;
 constexpr int kThreads = kWarps * kWarp;
-static_assert(kTrackingTerms <= kWarp, "one lane a term");
+static_assert(kTrackingTerms <= kWarp, "one lane per term");
 
 __global__ void __launch_bounds__(kThreads) icp_kernel(const float* points, std::int64_t num_points, SurfaceMaps target,
                                                        IcpOptions options, float* pose, float* stats, float* hessian) {

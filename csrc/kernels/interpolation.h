@@ -119,7 +119,7 @@ struct PlaneGradient {
   T u, v;
 };
 
-// d(sum_k weight[k] * values[k]) / d position in texel units, for one value a corner.
+// d(sum_k weight[k] * values[k]) / d position in texel units, for one value per corner.
 template <class T>
 SPS_INLINE PlaneGradient<T> plane_gradient(const PlaneCell<T>& cell, const T (&values)[4]) {
   return {cell.slope_u * lerp(values[1] - values[0], values[3] - values[2], cell.v),

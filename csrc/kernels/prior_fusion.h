@@ -113,8 +113,9 @@ SPS_INLINE void random_embedding(std::uint64_t seed, VoxelCoord coord, float sca
   constexpr std::uint64_t kSecondHalf = 0x9E3779B97F4A7C15ull;  // a second key: one counter gives four numbers
   constexpr float kTwoPi = 6.28318531f;
   for (int half = 0; half < 2; ++half) {
-    const PhiloxKey key{half == 0 ? seed : seed ^ kSecondHalf, static_cast<std::uint32_t>(Stream::kInitialization),
-                        static_cast<std::uint32_t>(coord.z), static_cast<std::uint32_t>(coord.y)};
+    const PhiloxKey key{half == 0 ? seed : seed ^ kSecondHalf,
+                        static_cast<std::uint32_t>(RandomStream::kInitialization), static_cast<std::uint32_t>(coord.z),
+                        static_cast<std::uint32_t>(coord.y)};
     const Philox4 bits = philox(key, static_cast<std::uint32_t>(coord.x));
     const std::uint32_t words[4] = {bits.x, bits.y, bits.z, bits.w};
     for (int pair = 0; pair < 2; ++pair) {

@@ -33,7 +33,7 @@ SPS_INLINE std::uint64_t voxel_axis_bits(std::int32_t c) {
   return static_cast<std::uint32_t>(c) - static_cast<std::uint32_t>(kVoxelCoordMin);
 }
 
-// 21 bits an axis, so that the order of keys is the lexicographic order of (x, y, z). Out of range: some key.
+// 21 bits per axis, so that the order of keys is the lexicographic order of (x, y, z). Out of range: some key.
 SPS_INLINE std::int64_t pack_voxel(VoxelCoord c) {
   return static_cast<std::int64_t>((voxel_axis_bits(c.x) << (2 * kVoxelCoordBits)) |
                                    (voxel_axis_bits(c.y) << kVoxelCoordBits) | voxel_axis_bits(c.z));

@@ -95,7 +95,7 @@ Vector3 DepthFrame::to_camera(const Vector3& point) const {
 std::vector<DepthFrame> load_frames(const std::string& folder) {
   const std::filesystem::path root(folder);
   const std::vector<float> camera = read_numbers(root / "intrinsics.txt"), poses = read_numbers(root / "poses.txt");
-  if (camera.size() != 4) throw std::runtime_error((root / "intrinsics.txt").string() + ": must hold fx fy cx cy");
+  if (camera.size() != 4) throw std::runtime_error((root / "intrinsics.txt").string() + ": must contain fx fy cx cy");
   std::vector<std::filesystem::path> paths;
   for (const auto& entry : std::filesystem::directory_iterator(root / "depth")) {
     if (entry.path().extension() == ".pgm") paths.push_back(entry.path());
@@ -103,7 +103,7 @@ std::vector<DepthFrame> load_frames(const std::string& folder) {
   std::sort(paths.begin(), paths.end());
   if (paths.empty()) throw std::runtime_error((root / "depth").string() + ": holds no .pgm image");
   if (poses.size() != 16 * paths.size()) {
-    throw std::runtime_error((root / "poses.txt").string() + ": must hold 16 numbers for each depth image");
+    throw std::runtime_error((root / "poses.txt").string() + ": must contain 16 numbers for each depth image");
   }
   std::vector<DepthFrame> frames;
   for (std::size_t i = 0; i < paths.size(); ++i) {

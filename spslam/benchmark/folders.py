@@ -1,4 +1,4 @@
-"""Where a machine has the sequences of the suites, if not in the folders that the data sets use themselves."""
+"""Where a machine has the sequences of the suites, if not in the folders that the datasets use themselves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_folders(path: Path) -> Folders:
         path: the file.
 
     Returns:
-        Folder by suite and sequence, relative to the folder of all data sets, or absolute.
+        Folder by suite and sequence, relative to the folder of all datasets, or absolute.
 
     Raises:
         ConfigError: the file can't be read, or names a suite or sequence that doesn't exist or needs no data.
@@ -35,7 +35,7 @@ def read_folders(path: Path) -> Folders:
         if suite not in suite_names():
             raise ConfigError(f"{path}: suite must be one of {', '.join(suite_names())}, got {suite}")
         if not isinstance(folders, dict):
-            raise ConfigError(f"{path}: {suite} must hold SEQUENCE: FOLDER, got {folders}")
+            raise ConfigError(f"{path}: {suite} must contain SEQUENCE: FOLDER, got {folders}")
         known = [sequence.name for sequence in load_suite(suite).studies[0].sequences if sequence.folders]
         for name, folder in folders.items():
             if name not in known:
@@ -54,7 +54,7 @@ def _read(path: Path) -> dict[Any, Any]:
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: must be YAML: {getattr(error, 'problem', None) or 'malformed'}") from error
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold SUITE: {{SEQUENCE: FOLDER}}, got {content}")
+        raise ConfigError(f"{path}: must contain SUITE: {{SEQUENCE: FOLDER}}, got {content}")
     return content
 
 

@@ -109,7 +109,7 @@ def make_plan(suite: Suite, data: Path | None, device: str) -> Plan:
 
     Args:
         suite: what to run.
-        data: folder that holds the data sets; None to run over generated data only.
+        data: folder that holds the datasets; None to run over generated data only.
         device: `cpu` or `cuda`.
 
     Raises:

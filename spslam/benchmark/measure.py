@@ -25,6 +25,7 @@ from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.run.device import resolve_device
+from spslam.run.request import parse_frames
 from spslam.run.sequence import RunRequest, run_sequence
 
 _READING_THREADS, _READ_AHEAD = 2, 8
@@ -57,14 +58,8 @@ def measure(job: Job, folder: Path, threads: int | None) -> dict[str, Any]:
     }
 
 
-def parse_slice(frames: str | None) -> slice | None:
-    """`START:STOP[:STEP]` as a slice; raises ValueError."""
-    if frames is None:
-        return None
-    parts = [int(part) if part else None for part in frames.split(":")]
-    if not 2 <= len(parts) <= 3:
-        raise ValueError(f"parse_slice: frames must be START:STOP[:STEP], got {frames}")
-    return slice(*parts)
+def _frames(job: Job) -> slice | None:
+    return None if job.frames is None else parse_frames(job.frames)
 
 
 def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
@@ -73,7 +68,7 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
     dataset = open_dataset(config.dataset, data)
     ground_truth = _true_surface(dataset, job.mesh)
     with_mesh = ground_truth is not None or job.thorough
-    figures = run_sequence(RunRequest(config, data, folder, parse_slice(job.frames), mesh=with_mesh))
+    figures = run_sequence(RunRequest(config, data, folder, _frames(job), mesh=with_mesh))
     if "peak_gpu_mb" in figures:
         figures["peak_gpu_gb"] = figures["peak_gpu_mb"] / 1024
     run = RunOutput.read(folder)
@@ -93,9 +88,7 @@ def _true_surface(dataset: RgbdDataset, mesh: str | None) -> Surface | None:
 
 
 def _measure_gicp(job: Job, threads: int) -> dict[str, Any]:
-    dataset = open_sequence(
-        job.load_config().dataset, None if job.data is None else Path(job.data), parse_slice(job.frames)
-    )
+    dataset = open_sequence(job.load_config().dataset, None if job.data is None else Path(job.data), _frames(job))
     ground_truth = dataset.poses()
     first_pose = ground_truth[0] if ground_truth is not None and bool(np.isfinite(ground_truth[0]).all()) else np.eye(4)
     odometry = GicpOdometry(dataset.camera, first_pose, threads=threads, **dict(job.method_options))

@@ -140,7 +140,7 @@ def _scale(low: float, high: float, start: float, stop: float, log: bool) -> Cal
 
 
 def _ticks(high: float) -> list[float]:
-    """About five round numbers from 0 to at least ``high``."""
+    """About five round numbers from 0 to at least `high`."""
     step = max(high, 1e-9) / 4
     magnitude = 10.0 ** math.floor(math.log10(step))
     step = magnitude * next(factor for factor in (1, 2, 2.5, 5, 10) if factor * magnitude >= step * 0.999)

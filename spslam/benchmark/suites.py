@@ -1,6 +1,6 @@
 """What is run: suites of sequences and variants, read from `data/suites/*.yaml`.
 
-Each study of a suite runs every variant over every sequence. The suite of a data set has one study, whose variants are
+Each study of a suite runs every variant over every sequence. The suite of a dataset has one study, whose variants are
 presets and the classical baseline; the ablation has one study per question.
 """
 

@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import Any
 
 from spslam.config import config_names
 from spslam.errors import OutputError
 from spslam.options import PRESETS
+from spslam.run.request import parse_frames
 
-_FRAMES = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
 
-
-def parse_frames(text: str) -> slice:
-    """``START:STOP[:STEP]`` as a slice; each of the first two may be left out, negative ones count from the end."""
-    match = _FRAMES.fullmatch(text)
+def frame_range(text: str) -> slice:
+    """`START:STOP[:STEP]` as a slice, see `parse_frames`."""
     try:
-        start, stop, step = (int(part) if part else None for part in match.groups()) if match else (None, None, 0)
-    except ValueError:  # a lone minus sign
-        step = 0
-    if step == 0:
-        raise argparse.ArgumentTypeError(f"must be START:STOP[:STEP] with STEP at least 1, got {text!r}")
-    if start is not None and stop is not None and (start < 0) == (stop < 0) and stop <= start:
-        raise argparse.ArgumentTypeError(f"must select at least one frame, got {text!r}")
-    return slice(start, stop, step)
+        return parse_frames(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def at_least_one(text: str) -> int:
@@ -79,7 +71,7 @@ def add_run_folder(parser: argparse.ArgumentParser) -> None:
 
 
 def overrides(args: argparse.Namespace) -> list[str | tuple[str, Any]]:
-    """What the command line changes in the configuration; options of their own win over ``--set``."""
+    """What the command line changes in the configuration; options of their own win over `--set`."""
     changes: list[str | tuple[str, Any]] = list(getattr(args, "changes", []))
     for option in ("device", "seed"):
         if getattr(args, option, None) is not None:

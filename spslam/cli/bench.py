@@ -9,20 +9,21 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from spslam.cli.arguments import add_quiet, at_least_one, parse_frames
+from spslam.cli.arguments import add_quiet, at_least_one
 from spslam.cli.parser import UsageError
 from spslam.errors import SpslamError
 from spslam.options import PRESETS
+from spslam.run.request import parse_frames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a data set's; --list names all")
-    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that holds the data sets")
+    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a dataset's; --list names all")
+    parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that contains the datasets")
     parser.add_argument(
         "--folders",
         metavar="FILE",
         type=Path,
-        help="YAML file of folders, SUITE: {SEQUENCE: FOLDER}, where the data has other names",
+        help="YAML file of folders, SUITE: {SEQUENCE: FOLDER}, if the folders have other names",
     )
     parser.add_argument("--output", metavar="DIR", type=Path, help="folder of results; runs/bench-SUITE if not given")
     parser.add_argument(
@@ -86,7 +87,7 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     from spslam.run.device import resolve_device
 
     if args.data is not None and not args.data.is_dir():
-        raise UsageError(f"--data must be a folder that holds the data sets, got {args.data}")
+        raise UsageError(f"--data must be a folder that contains the datasets, got {args.data}")
     plan = make_plan(suite, args.data, resolve_device(args.device).type)
     if args.list:
         _print_plan(plan)
@@ -134,7 +135,7 @@ def _exit_at_end_of_input() -> None:
 def _check_frames(text: str) -> None:
     try:
         parse_frames(text)
-    except argparse.ArgumentTypeError as error:
+    except ValueError as error:
         raise UsageError(f"--frames {error}") from None
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def command_name() -> str:
-    """``spslam`` where the shell would find this very one, else its path, or ``python -m spslam`` as it was called."""
+    """`spslam` where the shell would find this very one, else its path, or `python -m spslam` as it was called."""
     called = Path(sys.argv[0])
     return _for_shell(called) if called.name == "spslam" else f"{_for_shell(Path(sys.executable))} -m spslam"
 

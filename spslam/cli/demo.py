@@ -1,4 +1,4 @@
-"""``spslam demo``: the whole system on a generated room with known ground truth; nothing to download."""
+"""`spslam demo`: the whole system on a generated room with known ground truth; nothing to download."""
 
 from __future__ import annotations
 

@@ -61,8 +61,8 @@ def _test_kernel(device: Any) -> str:
     from spslam import ops
 
     try:
-        drawn = ops.philox_uniform(0, ops.Stream.EVALUATION, 0, 0, 1000, device=device)
-        expected = ops.philox_uniform(0, ops.Stream.EVALUATION, 0, 0, 1000, device="cpu")
+        drawn = ops.philox_uniform(0, ops.RandomStream.EVALUATION, 0, 0, 1000, device=device)
+        expected = ops.philox_uniform(0, ops.RandomStream.EVALUATION, 0, 0, 1000, device="cpu")
     except Exception as error:
         return f"fail: {' '.join(str(error).split())[:200]}"
     return "working" if drawn.cpu().equal(expected) else "fail: wrong result"

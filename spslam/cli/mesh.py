@@ -11,7 +11,12 @@ from spslam.run_folder import MESH_FORMATS, RunFolder
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_folder(parser)
-    parser.add_argument("--resolution", metavar="M", type=positive_meters, help="edge of a cell in meters")
+    parser.add_argument(
+        "--resolution",
+        metavar="M",
+        type=positive_meters,
+        help="edge length of a marching-cubes cell in meters; the run's mesh.resolution_m if not given",
+    )
     parser.add_argument("--format", choices=MESH_FORMATS, default="ply", help="file format, ply if not given")
 
 

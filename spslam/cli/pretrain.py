@@ -47,7 +47,7 @@ def execute(args: argparse.Namespace) -> None:
     try:
         provenance = pretrain(args.output, _settings(args), args.resume, progress=_make_progress(args.quiet))
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("the same command with --resume goes on") from None
+        raise KeyboardInterrupt("the same command with --resume continues") from None
     if args.plot:
         plot_training(files.log, files.plot)
     if not args.quiet:

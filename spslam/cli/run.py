@@ -1,4 +1,4 @@
-"""``spslam run``: SLAM over a sequence; writes trajectory, map, mesh, metrics and report."""
+"""`spslam run`: SLAM over a sequence; writes trajectory, map, mesh, metrics and report."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from spslam.cli.arguments import add_config, add_device, add_preset, add_quiet, overrides, parse_frames
+from spslam.cli.arguments import add_config, add_device, add_preset, add_quiet, frame_range, overrides
 from spslam.cli.parser import UsageError
 from spslam.cli.progress import make_progress, print_summary
 from spslam.config import Config, load_config, resolve_config_path
@@ -22,9 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_preset(parser)
     parser.add_argument("--output", metavar="DIR", type=Path, help="output folder; runs/CONFIG-TIME if not given")
     add_device(parser)
-    parser.add_argument("--frames", metavar="START:STOP[:STEP]", type=parse_frames, help="only these frames")
+    parser.add_argument("--frames", metavar="START:STOP[:STEP]", type=frame_range, help="only these frames")
     parser.add_argument("--seed", metavar="N", type=int, help="seed of all random draws")
-    parser.add_argument("--resume", action="store_true", help="go on with the interrupted run in --output")
+    parser.add_argument("--resume", action="store_true", help="continue the interrupted run in --output")
     parser.add_argument("--no-mesh", action="store_true", help="leave out the mesh")
     add_quiet(parser)
 
@@ -75,7 +75,7 @@ def run(request: RunRequest, quiet: bool, command: str = "the same command with"
     from spslam.run.sequence import run_sequence
 
     progress = make_progress(quiet)
-    resume = f"{command} --output {request.output_dir} --resume goes on"
+    resume = f"{command} --output {request.output_dir} --resume continues"
     try:
         return run_sequence(request, progress)
     except KeyboardInterrupt:
@@ -97,5 +97,5 @@ def _can_resume(output: Path) -> bool:
 
 
 def default_output(config: str) -> Path:
-    """``runs/<configuration>-<time>``."""
+    """`runs/<configuration>-<time>`."""
     return Path("runs") / f"{resolve_config_path(config).stem}-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -1,4 +1,4 @@
-"""RGB-D sequences: one loader a format, all giving the same frames."""
+"""RGB-D sequences: one loader per format, all giving the same frames."""
 
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.export import export_folder

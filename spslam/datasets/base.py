@@ -1,4 +1,4 @@
-"""What a dataset is: RGB-D frames by number, their times and, where known, their true poses."""
+"""What a dataset is: RGB-D frames by number, their times and, where known, their ground-truth poses."""
 
 from __future__ import annotations
 

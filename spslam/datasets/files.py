@@ -70,7 +70,7 @@ class FileDataset(RgbdDataset):
 
     Attributes:
         frames: the files in order of time.
-        true_poses: float64 [F, 4, 4], NaN where unknown, or None.
+        gt_poses: float64 [F, 4, 4], NaN where unknown, or None.
         units_per_meter: see `spslam.datasets.images.read_depth`.
         invalid_depth: see `spslam.datasets.images.read_depth`.
         undistortion: applied to each color image.
@@ -80,7 +80,7 @@ class FileDataset(RgbdDataset):
     name: str
     camera: Camera
     frames: Sequence[FramePaths]
-    true_poses: np.ndarray | None
+    gt_poses: np.ndarray | None
     units_per_meter: float | None
     invalid_depth: Sequence[int] = ()
     undistortion: Undistortion | None = None
@@ -89,8 +89,8 @@ class FileDataset(RgbdDataset):
     border_px: int = 0
 
     def __post_init__(self) -> None:
-        if self.true_poses is not None and not np.isfinite(self.true_poses).any():
-            self.true_poses = None
+        if self.gt_poses is not None and not np.isfinite(self.gt_poses).any():
+            self.gt_poses = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -99,7 +99,7 @@ class FileDataset(RgbdDataset):
         return np.array([frame.timestamp for frame in self.frames], dtype=np.float64)
 
     def poses(self) -> np.ndarray | None:
-        return None if self.true_poses is None else self.true_poses.copy()
+        return None if self.gt_poses is None else self.gt_poses.copy()
 
     def read(self, index: int) -> RgbdFrame:
         paths = self.frames[index]
@@ -118,9 +118,9 @@ class FileDataset(RgbdDataset):
         return f"{self.frames[index].depth} (color: {self.frames[index].color.name})"
 
     def _pose(self, index: int) -> np.ndarray | None:
-        if self.true_poses is None or not np.isfinite(self.true_poses[index]).all():
+        if self.gt_poses is None or not np.isfinite(self.gt_poses[index]).all():
             return None
-        return self.true_poses[index].copy()
+        return self.gt_poses[index].copy()
 
 
 def require_folder(path: Path) -> Path:

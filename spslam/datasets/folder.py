@@ -29,7 +29,7 @@ INTRINSICS_FILES = ("intrinsics.txt", "camera-intrinsics.txt", "intrinsics.json"
 FRAMES_PER_SECOND = 30.0
 # The median depth of an indoor recording; outside it the scale is wrong, not the room.
 PLAUSIBLE_MEDIAN_M = (0.1, 20.0)
-# Scales that sensors and data sets use; the one that makes a depth plausible is suggested.
+# Scales that sensors and datasets use; the one that makes a depth plausible is suggested.
 _COMMON_SCALES = (1.0, 1000.0, 5000.0, 6553.5, 10000.0)
 _FRAMES_TRIED_FOR_SCALE = 5
 
@@ -62,7 +62,7 @@ def _color_folder(folder: Path) -> Path:
     for name in COLOR_FOLDERS:
         if (folder / name).is_dir():
             return folder / name
-    raise DatasetError(f"{folder}: must hold a folder color (or rgb, or images) beside depth, got none")
+    raise DatasetError(f"{folder}: must contain a folder color (or rgb, or images) beside depth, got none")
 
 
 def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -70,7 +70,7 @@ def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
         path for path in require_folder(folder).iterdir() if path.suffix.lower() in suffixes and path.name[0] != "."
     ]
     if not paths:
-        raise DatasetError(f"{folder}: must hold images ({', '.join(suffixes)}), got none")
+        raise DatasetError(f"{folder}: must contain images ({', '.join(suffixes)}), got none")
     return sorted(paths, key=lambda path: _natural_order(path.name))
 
 
@@ -98,14 +98,14 @@ def _read_intrinsics(folder: Path, width: int, height: int) -> tuple[Camera, flo
             if path.suffix == ".json":
                 return _read_json_intrinsics(path, width, height)
             return read_intrinsics_matrix(path, width, height), None
-    raise DatasetError(f"{folder}: must hold the intrinsics in one of {', '.join(INTRINSICS_FILES)}, got none")
+    raise DatasetError(f"{folder}: must contain the intrinsics in one of {', '.join(INTRINSICS_FILES)}, got none")
 
 
 def _read_json_intrinsics(path: Path, width: int, height: int) -> tuple[Camera, float | None]:
     values = read_json(path)
     for name in ("fx", "fy", "cx", "cy"):
         if not _is_number(values.get(name)):
-            raise DatasetError(f"{path}: must hold numbers fx, fy, cx, cy, got {name}: {brief(values.get(name))}")
+            raise DatasetError(f"{path}: must contain numbers fx, fy, cx, cy, got {name}: {brief(values.get(name))}")
     for name, actual in (("width", width), ("height", height)):
         if name in values and values[name] != actual:
             raise DatasetError(f"{path}: {name} must be the images' {actual}, got {brief(values[name])}")

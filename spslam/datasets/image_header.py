@@ -8,10 +8,11 @@ from collections.abc import Iterator
 
 _PNG, _JPEG = b"\x89PNG", b"\xff\xd8\xff"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
-_PNG_HEAD = struct.Struct(">8sI4sII")
+_PNG_HEAD, _PNG_CHUNK = struct.Struct(">8sI4sII"), struct.Struct(">I4s")
+# Chunks of a PNG, at 8 KB each those of 80 MB, and segments of a JPEG.
+_MAX_SEGMENTS = 10_000
 # Markers of a JPEG that have a segment behind them; of them, those that begin a frame and tell its size, or a scan.
 _MARKER = re.compile(rb"\xff[\x02-\xcf\xda-\xfe]")
-_MAX_SEGMENTS = 10_000
 _FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _BASELINE_MARKERS, _SCAN_MARKER = {0xC0, 0xC1}, 0xDA
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 256, 257, 322, 323
@@ -57,7 +58,24 @@ def _png_size(content: bytes) -> tuple[int, int]:
     _, _, name, width, height = _PNG_HEAD.unpack_from(content)
     if name != b"IHDR":
         raise ValueError("damaged header")
+    if not _has_whole_chunks(content):
+        raise ValueError("damaged chunks")
     return width, height
+
+
+def _has_whole_chunks(content: bytes) -> bool:
+    """Whether all chunks of a PNG up to its last lie in the file: OpenCV allocates their lengths before it reads."""
+    place = 8
+    for _ in range(_MAX_SEGMENTS):
+        if place + _PNG_CHUNK.size > len(content):
+            return False
+        length, name = _PNG_CHUNK.unpack_from(content, place)
+        place += _PNG_CHUNK.size + length + 4  # and a checksum
+        if place > len(content):
+            return False
+        if name == b"IEND":
+            return True
+    return False
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:

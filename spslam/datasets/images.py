@@ -19,8 +19,8 @@ from spslam.datasets.image_header import image_size, is_truncated
 from spslam.errors import DatasetError, brief
 from spslam.reading import read_bytes
 
-# Of an image whose size isn't known beforehand; about 33 million pixels. Pixel records have 16 bits for a coordinate.
-MAX_PIXELS, MAX_SIDE_PX = 1 << 25, 1 << 15
+# Of an image whose size isn't known beforehand; about 17 million pixels. Pixel records have 16 bits for a coordinate.
+MAX_PIXELS, MAX_SIDE_PX = 1 << 24, 1 << 15
 # Of an image's file.
 MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 _DEPTH_TYPES = (np.uint16, np.float32, np.float64)
@@ -185,7 +185,7 @@ def _check_size(actual: Size, expected: Size | None, name: str) -> None:
 
 
 def _text(size: Size) -> str:
-    return f"{size[0]}x{size[1]}"
+    return brief(f"{size[0]}x{size[1]}")
 
 
 def _load_array(path: Path, size: Size | None) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Inspection of a data set before a run: sizes, depth, missing depth, poses, and what looks wrong."""
+"""Inspection of a dataset before a run: sizes, depth, missing depth, poses, and what looks wrong."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,8 @@ _MANY_HOLES = 0.5
 _JUMP_M = 0.3
 _JUMP_DEG = 20.0
 _GOOD_AGREEMENT = 0.02
+# Of a larger depth image only every n-th row and column is kept, so that many of them fit into memory.
+_MAX_PIXELS_KEPT = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Inspection:
     """What was found.
 
     Attributes:
-        name: of the data set.
+        name: of the dataset.
         frames: how many it has.
         camera: of all frames.
         frames_read: how many were inspected.
@@ -99,7 +102,8 @@ class Inspection:
 def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> Inspection:
     """Reads some frames, spread evenly, and all poses and times.
 
-    A frame that can't be read is reported, not raised. Deterministic.
+    A frame that can't be read is reported, not raised. Deterministic. Of images of more than half a million pixels
+    every n-th row and column is looked at.
 
     Args:
         dataset: what to inspect.
@@ -127,10 +131,30 @@ def _read_depths(dataset: RgbdDataset, indices: np.ndarray) -> tuple[list[np.nda
     depths, unreadable = [], []
     for index in indices:
         try:
-            depths.append(dataset[int(index)].depth)
+            depths.append(_thinned(dataset[int(index)].depth))
         except DatasetError as error:
             unreadable.append(str(error))
     return depths, unreadable
+
+
+def _thinning(height: int, width: int) -> int:
+    """Every how many rows and columns are kept."""
+    return math.ceil(math.sqrt(height * width / _MAX_PIXELS_KEPT))
+
+
+def _thinned(depth: np.ndarray) -> np.ndarray:
+    """The rows and columns that are kept; a copy where that is not all, so that the whole image can go."""
+    step = _thinning(*depth.shape)
+    return depth if step == 1 else depth[::step, ::step].copy()
+
+
+def _thinned_camera(camera: Camera) -> Camera:
+    """The camera of thinned images: pixel (i, j) is pixel (n i, n j) of the whole one."""
+    step = _thinning(camera.height, camera.width)
+    if step == 1:
+        return camera
+    width, height = -(-camera.width // step), -(-camera.height // step)
+    return Camera(width, height, camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step)
 
 
 def _frames_per_second(timestamps: np.ndarray) -> float:
@@ -158,18 +182,19 @@ def _inspect_poses(dataset: RgbdDataset, pairs: int) -> tuple[PoseStatistics | N
     steps_deg = np.degrees(rotation_angle(motion[:, :3, :3]))
     jumps = both[(steps_cm > 100 * _JUMP_M) | (steps_deg > _JUMP_DEG)]
     views = _read_pairs(dataset, choose_pairs(poses, pairs))
-    agreement = measure_agreement(dataset.camera, views, poses)
+    camera = _thinned_camera(dataset.camera)
+    agreement = measure_agreement(camera, views, poses)
     statistics = PoseStatistics(
         int(known.sum()), *_median_and_max(steps_cm), *_median_and_max(steps_deg), jumps.tolist(), agreement
     )
-    return statistics, explain_disagreement(dataset.camera, views, poses, agreement) if views else None
+    return statistics, explain_disagreement(camera, views, poses, agreement) if views else None
 
 
 def _read_pairs(dataset: RgbdDataset, pairs: list[tuple[int, int]]) -> list[DepthPair]:
     views = []
     for a, b in pairs:
         try:
-            views.append(DepthPair(a, b, dataset[a].depth, dataset[b].depth))
+            views.append(DepthPair(a, b, _thinned(dataset[a].depth), _thinned(dataset[b].depth)))
         except DatasetError:
             continue
     return views
@@ -197,7 +222,7 @@ def _pose_problems(found: Inspection, explanation: str | None) -> list[str]:
         return []
     problems = []
     if poses.count < found.frames:
-        problems.append(f"{found.frames - poses.count} of {found.frames} frames have no true pose")
+        problems.append(f"{found.frames - poses.count} of {found.frames} frames have no ground-truth pose")
     if poses.jumps:
         listed = ", ".join(map(str, poses.jumps[:5])) + (", ..." if len(poses.jumps) > 5 else "")
         problems.append(
@@ -206,10 +231,10 @@ def _pose_problems(found: Inspection, explanation: str | None) -> list[str]:
     if explanation is not None:
         problems.append(explanation)
     elif poses.agreement is None and poses.count > 1:
-        problems.append("no view overlaps with one a little later by the true poses: they look wrong")
+        problems.append("no view overlaps with one a little later by the ground-truth poses: they look wrong")
     elif poses.agreement is not None and poses.agreement.relative > _GOOD_AGREEMENT:
         problems.append(
-            f"depth and true poses disagree by {poses.agreement.median_cm:.1f} cm: poses or intrinsics are off"
+            f"depth and ground-truth poses disagree by {poses.agreement.median_cm:.1f} cm: poses or intrinsics are off"
         )
     return problems
 

@@ -75,7 +75,7 @@ def sequence_options(options: DatasetOptions) -> list[DatasetOptions]:
     """One section of options for each sequence of the data, where `options` leaves open which one is meant.
 
     Args:
-        options: of a data set.
+        options: of a dataset.
 
     Returns:
         For a 7-Scenes scene of several sequences one section for each; for `sequence: train` or `test` one for each in

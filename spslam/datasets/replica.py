@@ -1,6 +1,6 @@
 """Replica as rendered for iMAP and NICE-SLAM.
 
-`results/frameNNNNNN.jpg` and `results/depthNNNNNN.png` (16-bit), `traj.txt` with 16 numbers a line (4x4 camera
+`results/frameNNNNNN.jpg` and `results/depthNNNNNN.png` (16-bit), `traj.txt` with 16 numbers per line (4x4 camera
 to world, OpenCV axes) and `cam_params.json` beside the scene or in its parent folder: `{"camera": {"w", "h", "fx",
 "fy", "cx", "cy", "scale"}}`, `scale` being the depth value of one meter.
 """
@@ -34,7 +34,7 @@ def open_replica(folder: Path) -> FileDataset:
     colors = find_numbered(results, r"frame(\d+)\.(?:jpg|jpeg|png)")
     depths = find_numbered(results, r"depth(\d+)\.png")
     if not colors:
-        raise DatasetError(f"{folder}: must hold results/frame000000.jpg and so on, got none")
+        raise DatasetError(f"{folder}: must contain results/frame000000.jpg and so on, got none")
     camera, units_per_meter = _read_camera(_find_camera_file(folder), *first_size(colors.values()))
     frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "traj.txt")
     return FileDataset(f"replica/{folder.name}", camera, frames, poses, units_per_meter)
@@ -51,7 +51,7 @@ def _read_camera(path: Path, width: int, height: int) -> tuple[Camera, float]:
     values = read_json(path).get("camera")
     names = ("w", "h", "fx", "fy", "cx", "cy", "scale")
     if not isinstance(values, dict) or not all(isinstance(values.get(name), (int, float)) for name in names):
-        raise DatasetError(f"{path}: must hold numbers camera.{{{', '.join(names)}}}, got {brief(values)}")
+        raise DatasetError(f"{path}: must contain numbers camera.{{{', '.join(names)}}}, got {brief(values)}")
     if (values["w"], values["h"]) != (width, height):
         raise DatasetError(
             f"{path}: must give the images' size {width}x{height}, got {brief(values['w'])}x{brief(values['h'])}"

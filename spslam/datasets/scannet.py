@@ -1,6 +1,6 @@
 """ScanNet (Dai et al. 2017): Structure Sensor on a tablet, poses by BundleFusion.
 
-A scan is read from `sceneNNNN_NN.sens` as it is distributed, or from what the data set's own exporter makes of it:
+A scan is read from `sceneNNNN_NN.sens` as it is distributed, or from what the dataset's own exporter makes of it:
 `color/N.jpg`, `depth/N.png` (16-bit millimeters), `pose/N.txt` (4x4 camera to world, OpenCV axes; infinite where
 unknown) and `intrinsic/intrinsic_depth.txt`. Color is larger than depth (1296x968 against 640x480). The authors
 registered the two to each other ("they can be resampled to the same resolution"), so color is brought to depth's size
@@ -46,7 +46,7 @@ def open_scannet(path: Path) -> RgbdDataset:
     files = sorted(path.glob("*.sens"))
     if len(files) != 1:
         raise DatasetError(
-            f"{path}: must hold one .sens file, or the folders color and depth exported from one, "
+            f"{path}: must contain one .sens file, or the folders color and depth exported from one, "
             f"got {', '.join(file.name for file in files) or 'neither'}"
         )
     return SensDataset(SensFile(files[0]))
@@ -69,7 +69,7 @@ class SensDataset(RgbdDataset):
     def __init__(self, file: SensFile) -> None:
         header, index = file.header, file.index
         if not len(index):
-            raise DatasetError(f"{file.path}: must hold a whole frame, got none of {header.frames}")
+            raise DatasetError(f"{file.path}: must contain a whole frame, got none of {header.frames}")
         self.name = f"scannet/{file.path.stem}"
         self.camera = _sens_camera(file)
         self._file = file
@@ -140,7 +140,7 @@ def _open_exported(folder: Path, name: str) -> FileDataset:
     colors, depths = find_numbered(folder / "color", _COLOR_NAME), find_numbered(folder / "depth", _DEPTH_NAME)
     if not colors or not depths:
         empty = folder / ("depth" if colors else "color")
-        raise DatasetError(f"{empty}: must hold a ScanNet scan's images (0.jpg, 0.png, ...), got none")
+        raise DatasetError(f"{empty}: must contain a ScanNet scan's images (0.jpg, 0.png, ...), got none")
     size = first_size(depths.values(), lambda path: read_depth(path, 1000.0))
     camera = _find_camera(folder, size, list(colors.values()))
     paired = pair_numbered(colors, depths, FRAMES_PER_SECOND)
@@ -155,4 +155,4 @@ def _find_camera(folder: Path, size: tuple[int, int], colors: list[Path]) -> Cam
     for parent in (folder / "intrinsic", folder):
         if (parent / _INTRINSICS[1]).is_file():
             return read_intrinsics_matrix(parent / _INTRINSICS[1], *first_size(colors)).resized(*size)
-    raise DatasetError(f"{folder / 'intrinsic' / _INTRINSICS[0]}: no such file; it must hold depth's intrinsics")
+    raise DatasetError(f"{folder / 'intrinsic' / _INTRINSICS[0]}: no such file; it must contain depth's intrinsics")

@@ -192,7 +192,7 @@ def _read_header(file: BinaryIO, path: Path) -> SensHeader:
         raise DatasetError(f"{path}: the file is truncated in its head") from None
     if color_compression not in (_RAW, _PNG, _JPEG) or depth_compression not in (_RAW, _ZLIB):
         raise DatasetError(
-            f"{path}: must hold color as raw, PNG or JPEG (0, 1, 2) and depth as raw or zlib (0, 1), "
+            f"{path}: must contain color as raw, PNG or JPEG (0, 1, 2) and depth as raw or zlib (0, 1), "
             f"got {color_compression} and {depth_compression}"
         )
     sizes = (color_width, color_height), (depth_width, depth_height)

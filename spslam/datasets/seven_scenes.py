@@ -3,7 +3,7 @@
 A scene folder holds `seq-01`, `seq-02`, ..., each with `frame-NNNNNN.color.png` (or jpg), `.depth.png`
 (16-bit millimeters; 0 and 65535 are invalid) and `.pose.txt` (4x4 camera to world, OpenCV axes). The poses are
 KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Color and depth were not
-registered to each other by the data set's authors; both are taken as one camera's, as everybody does.
+registered to each other by the dataset's authors; both are taken as one camera's, as everybody does.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from spslam.errors import DatasetError
 SPLITS = ("train", "test")
 INTRINSICS_FILE = "camera-intrinsics.txt"
 FRAMES_PER_SECOND = 30.0
-# "The default intrinsics for this sensor", as the data set's page gives them for 640x480.
+# "The default intrinsics for this sensor", as the dataset's page gives them for 640x480.
 _DEFAULT_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 _MOST_DIGITS = 9  # of a sequence's number
 _COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
@@ -30,7 +30,7 @@ _DEPTH_NAME = r"frame-(\d+)\.depth\.png"
 def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDataset:
     """Opens one sequence of a scene.
 
-    The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the data set's default
+    The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the dataset's default
     (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite pose, has no
     pose. A frame with an image missing or a malformed pose file is one that raises when it is read.
 
@@ -47,7 +47,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
     depths = find_numbered(sequence_folder, _DEPTH_NAME)
     if not colors and not depths:
         raise DatasetError(
-            f"{sequence_folder}: must hold 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
+            f"{sequence_folder}: must contain 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
             + _hint(sequence_folder)
         )
     camera = _find_camera(sequence_folder, list(colors.values()))
@@ -87,7 +87,7 @@ def _choose_sequence(folder: Path, sequence: str | int | None) -> Path:
     names = list_sequences(folder)
     if not names:
         if sequence is not None and folder.name != _sequence_name(sequence):
-            raise DatasetError(f"{folder}: must hold {_sequence_name(sequence)}, got no seq-XX folder")
+            raise DatasetError(f"{folder}: must contain {_sequence_name(sequence)}, got no seq-XX folder")
         return folder
     if sequence is None:
         return folder / names[0]

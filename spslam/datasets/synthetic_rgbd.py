@@ -38,7 +38,7 @@ def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileD
     colors = find_numbered(require_folder(folder) / "images", r"img(\d+)\.(?:png|jpg|jpeg)")
     depths = find_numbered(_depth_folder(folder, depth_variant), r"depth(\d+)\.png")
     if not colors:
-        raise DatasetError(f"{folder}: must hold images/img0.png (or jpg) and so on, got none")
+        raise DatasetError(f"{folder}: must contain images/img0.png (or jpg) and so on, got none")
     camera = _read_camera(folder / "focal.txt", *first_size(colors.values()))
     frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "poses.txt")
     if poses is not None:
@@ -51,7 +51,7 @@ def _depth_folder(folder: Path, variant: str | None) -> Path:
     if variant is not None and variant not in DEPTH_FOLDERS:
         raise DatasetError(f"depth_variant must be one of {', '.join(DEPTH_FOLDERS)}, got {variant}")
     if not present:
-        raise DatasetError(f"{folder}: must hold a folder depth_filtered or depth, got neither")
+        raise DatasetError(f"{folder}: must contain a folder depth_filtered or depth, got neither")
     if variant is not None and variant not in present:
         raise DatasetError(
             f"{folder / DEPTH_FOLDERS[variant]}: no such folder; "
@@ -63,7 +63,7 @@ def _depth_folder(folder: Path, variant: str | None) -> Path:
 def _read_camera(path: Path, width: int, height: int) -> Camera:
     numbers = read_numbers(path)
     if numbers.size != 1:
-        raise DatasetError(f"{path}: must hold one number, the focal length in pixels, got {numbers.size}")
+        raise DatasetError(f"{path}: must contain one number, the focal length in pixels, got {numbers.size}")
     focal = numbers[0]
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return camera_from_matrix(matrix, width, height, str(path))

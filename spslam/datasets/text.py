@@ -35,7 +35,7 @@ def read_numbers(path: Path) -> np.ndarray:
         try:
             numbers.extend(map(float, line.replace(",", " ").split()))
         except ValueError as error:
-            raise DatasetError(f"{path}: must hold numbers only: {brief(str(error))}") from None
+            raise DatasetError(f"{path}: must contain numbers only: {brief(str(error))}") from None
     return np.array(numbers, dtype=np.float64)
 
 
@@ -82,7 +82,7 @@ def read_pose_table(path: Path) -> tuple[np.ndarray, dict[int, str]]:
     """
     numbers = read_numbers(path)
     if numbers.size % 16:
-        raise DatasetError(f"{path}: must have 16 numbers a pose, got {numbers.size} numbers")
+        raise DatasetError(f"{path}: must have 16 numbers per pose, got {numbers.size} numbers")
     poses, is_motion = checked_poses(numbers.reshape(-1, 4, 4))
     rows = numbers.reshape(-1, 16)
     faults = {int(i): motion_fault(f"{path}, pose {i}", rows[i]) for i in np.flatnonzero(~is_motion)}

@@ -6,7 +6,7 @@
 Color and depth are taken at different moments, so each color image is paired with the depth image nearest in time,
 and the ground truth is interpolated at the color image's time. freiburg1's and freiburg2's color images are distorted,
 freiburg3's are not; the intrinsics are those the authors calibrated for each. Color is undistorted; depth is left as
-it is, because it comes from another lens: carried from view to view with the true poses, the depth images of
+it is, because it comes from another lens: carried from view to view with the ground-truth poses, the depth images of
 freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15 frames) than undistorted with the color
 camera's coefficients (3.0, 5.3, 5.3 cm).
 """
@@ -97,7 +97,7 @@ def open_tum(folder: Path) -> FileDataset:
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> np.ndarray:
     """Pairs the nearest times of two lists; each time is in one pair at most.
 
-    The closest pairs are taken first, as by the data set's `associate.py`.
+    The closest pairs are taken first, as by the dataset's `associate.py`.
 
     Args:
         times_a: [A], ascending.
@@ -183,10 +183,10 @@ def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tu
         numbers = read_numbers(path)
         if not 4 <= numbers.size <= 9:
             raise DatasetError(
-                f"{path}: must hold fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
+                f"{path}: must contain fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
             )
         if not np.isfinite(numbers).all():
-            raise DatasetError(f"{path}: must hold finite numbers, got {numbers.tolist()}")
+            raise DatasetError(f"{path}: must contain finite numbers, got {numbers.tolist()}")
         fx, fy, cx, cy = numbers[:4]
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         return camera_from_matrix(matrix, width, height, str(path)), tuple(

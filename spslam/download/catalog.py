@@ -70,7 +70,7 @@ class Source:
     folder: str
 
     def run_command(self, spslam: str, data: Path) -> str:
-        """The command line that runs on a sequence of it; ``spslam`` is how the command is called."""
+        """The command line that runs on a sequence of it; `spslam` is how the command is called."""
         return f"{spslam} run {self.config} --data {shlex.quote(str(data / self.folder))}"
 
 

@@ -1,7 +1,7 @@
 """Unpacks untrusted archives: only files and folders, and only below the given folder.
 
 The size that an archive declares is compared with its own before anything is written: images hardly compress, so an
-archive with a hundred times its size in it is no data set.
+archive with a hundred times its size in it is no dataset.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class _Budget:
         self._bytes -= count
         self._members -= 1
         if self._bytes < 0 or self._members < 0 or count < 0:
-            raise ArchiveError(f"{self._archive}: must hold what an archive of its size can hold, got more")
+            raise ArchiveError(f"{self._archive}: must contain what an archive of its size can hold, got more")
 
 
 class _ShortReads(io.RawIOBase):
@@ -115,7 +115,7 @@ class _ShortReads(io.RawIOBase):
             raise _RefusedError(f"a header must have at most {self._most} bytes, got {size}")
         content = self._file.read(size)
         if self._headers and size > _TAR_BLOCK_BYTES and _LONG_NUMBER.search(content):
-            raise _RefusedError("a header must not hold numbers of over 20 digits")
+            raise _RefusedError("a header must not contain numbers of over 20 digits")
         return content
 
     def seek(self, place: int, whence: int = os.SEEK_SET) -> int:
@@ -135,7 +135,7 @@ class _WholeMember(tarfile.TarInfo):
     """A member of a tar file that isn't sparse: the maps of sparse ones can be of any length."""
 
     def _proc_sparse(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
-        raise _RefusedError("must hold whole files, but has sparse ones")
+        raise _RefusedError("must contain whole files, but has sparse ones")
 
     _proc_gnusparse_10 = _proc_sparse
 
@@ -196,7 +196,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: _Budget) -> None:
                 raise ArchiveError(
                     f"{archive}: must contain only files and folders, but {brief(member.name)} is a link or device"
                 )
-            # Before the loop goes on and skips the content, which may have to be inflated for that.
+            # Before the loop continues and skips the content, which may have to be inflated for that.
             budget.spend(member.size)
             total += member.size
     require_space(folder, total, f"unpacking {archive.name}")

@@ -155,7 +155,7 @@ def _read_camera(path: Path) -> Camera | None:
         check_image_size((camera.width, camera.height), str(path))
         return camera
     except (TypeError, ValueError, DatasetError) as error:
-        raise OutputError(f"{path}: must hold a camera: {error}") from error
+        raise OutputError(f"{path}: must contain a camera: {error}") from error
 
 
 def _read_ground_truth(path: Path, timestamps: np.ndarray) -> np.ndarray | None:

@@ -15,7 +15,7 @@ from spslam.ops.optimizer import normal_equations, solve_normal_equations, spars
 from spslam.ops.pixel_sampling import PixelSampling, sample_frame_pixels, unproject_pixels
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_points, fuse_prior_, random_embeddings
 from spslam.ops.projective_icp import projective_icp
-from spslam.ops.ray_sampling import Stream, philox_uniform, sample_along_rays, sample_indices
+from spslam.ops.ray_sampling import RandomStream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
@@ -47,13 +47,13 @@ __all__ = [
     "LaunchGraph",
     "MapMoments",
     "PixelSampling",
+    "RandomStream",
     "RayBatch",
     "ReferenceImage",
     "RenderOptions",
     "RenderStep",
     "SceneGradients",
     "SceneView",
-    "Stream",
     "VoxelHash",
     "VoxelLimitError",
     "VolumeBuffers",

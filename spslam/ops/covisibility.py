@@ -9,7 +9,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
-from spslam.ops.ray_sampling import Stream
+from spslam.ops.ray_sampling import RandomStream
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
@@ -82,7 +82,7 @@ def select_covisible_frames(
         num_covisible: most frames taken for being co-visible.
         count: how many frames to take; all candidates where there are fewer.
         threshold: share of the points.
-        seed, frame: keys of the draw, with `Stream.COVISIBILITY`.
+        seed, frame: keys of the draw, with `RandomStream.COVISIBILITY`.
 
     Returns:
         int64 [min(count, M)] rows in ascending order; the same on every device. Candidates that are no rows, or come
@@ -114,7 +114,7 @@ def select_covisible_frames(
     check(0 <= threshold <= 1, name, "threshold", "be in [0, 1]", threshold)
     # The enum Integer in csrc/bindings/covisibility.cpp.
     counts = [num_points, num_covisible, count]
-    integers = [current, thumbnail_step, *counts, seed, int(Stream.COVISIBILITY), frame]
+    integers = [current, thumbnail_step, *counts, seed, int(RandomStream.COVISIBILITY), frame]
     return torch.ops.spslam.select_covisible_frames(
         records, poses, depth_thumbnails, candidates, list(intrinsics), threshold, integers
     )

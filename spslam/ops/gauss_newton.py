@@ -17,7 +17,9 @@ A reference image adds the photometric residual of direct methods (Kerl et al. 2
 an earlier frame at the projection of x, less the pixel's own, times a weight in meters.
 """
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -53,7 +55,12 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     return torch.ops.spslam.predict_pose(before, last)
 
 
-@dataclass(frozen=True)
+def _scalar(default: Any = dataclasses.MISSING, **bound: float) -> Any:
+    """A field that goes to the op among its scalars; `above` or `at_least` is what it is checked against."""
+    return dataclasses.field(default=default, metadata=bound)
+
+
+@dataclass(frozen=True, kw_only=True)
 class GaussNewtonOptions:
     """How `track_gauss_newton` draws pixels, weighs residuals and steps.
 
@@ -75,45 +82,37 @@ class GaussNewtonOptions:
 
     num_pixels: int
     iterations: int
-    truncation: float
-    kernel_start: float
-    kernel_end: float
-    damping: float
+    truncation: float = _scalar(above=0)
+    kernel_start: float = _scalar(above=0)
+    kernel_end: float = _scalar(above=0)
+    damping: float = _scalar(at_least=0)
     seed: int
     stream: int
     frame: int
-    score_kernel: float | None = None
-    noise_crossover_depth: float = 0.0
+    score_kernel: float | None = _scalar(None, above=0)
+    noise_crossover_depth: float = _scalar(0.0, at_least=0)
     tf32: bool = True
 
     def check(self, function: str) -> None:
         """Raises ValueError, naming `function`, where a number is out of range."""
         check_count(function, "num_pixels", self.num_pixels)
         check_count(function, "iterations", self.iterations)
-        check(self.truncation > 0, function, "truncation", "be positive", self.truncation)
-        check(self.kernel_start > 0, function, "kernel_start", "be positive", self.kernel_start)
-        check(self.kernel_end > 0, function, "kernel_end", "be positive", self.kernel_end)
-        check(self.damping >= 0, function, "damping", "be at least 0", self.damping)
-        score = self.score_kernel
-        check(score is None or score > 0, function, "score_kernel", "be positive", score)
-        crossover = self.noise_crossover_depth
-        check(crossover >= 0, function, "noise_crossover_depth", "be at least 0", crossover)
+        for name, bounds in _SCALARS.items():
+            value = getattr(self, name)
+            if value is not None and "above" in bounds:
+                check(value > bounds["above"], function, name, "be positive", value)
+            elif value is not None:
+                check(value >= bounds["at_least"], function, name, f"be at least {bounds['at_least']}", value)
 
     def arguments(self, intrinsics: Intrinsics) -> tuple[list[float], list[int]]:
         """The schema's scalars and integers: the enums Scalar and Integer in csrc/bindings/gauss_newton.cpp."""
-        scalars = [
-            *intrinsics,
-            self.truncation,
-            self.kernel_start,
-            self.kernel_end,
-            self.score_kernel or 0.0,
-            self.damping,
-            self.noise_crossover_depth,
-        ]
+        scalars = [*intrinsics, *(getattr(self, name) or 0.0 for name in _SCALARS)]
         integers = [self.num_pixels, self.iterations, self.seed, int(self.stream), self.frame, int(self.tf32)]
         return scalars, integers
 
 
+# Names and bounds, in the order of SPS_GAUSS_NEWTON_SCALARS in csrc/include/spslam/gauss_newton.h.
+_SCALARS = {field.name: field.metadata for field in dataclasses.fields(GaussNewtonOptions) if field.metadata}
 _ITERATIONS = 1  # among the integers
 
 
@@ -161,7 +160,7 @@ def track_gauss_newton(
         >>> pose = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
         >>> options = GaussNewtonOptions(
         ...     num_pixels=4, iterations=2, truncation=0.08, kernel_start=0.08, kernel_end=0.02, damping=1e-4, seed=0,
-        ...     stream=Stream.TRACKING_PIXELS, frame=0)
+        ...     stream=RandomStream.TRACKING_PIXELS, frame=0)
         >>> pixels, camera = torch.zeros(4, 3, dtype=torch.int32), Intrinsics(60.0, 60.0, 31.5, 23.5)
         >>> still, stats, hessian = track_gauss_newton(SceneView.empty(), pixels, pose, camera, options)
         >>> torch.equal(still, pose), stats[:, 1]  # nothing is mapped: no pixel takes part, the camera stays

@@ -101,7 +101,7 @@ class VoxelHash:
             voxel_coords: int32 [N, 3] in [-2^20, 2^20 - 1], repetitions allowed; N = 0 changes nothing.
 
         Returns:
-            voxel_ids int32 [N]. New ids go on from `len(self)` in the order of (x, y, z): the same on every device.
+            voxel_ids int32 [N]. New ids start at `len(self)`, in the order of (x, y, z): the same on every device.
 
         Raises:
             ValueError, TypeError: another shape, dtype or device.

@@ -38,8 +38,8 @@ def marching_cubes(
 
     Raises:
         TypeError: a tensor of another dtype.
-        ValueError: shapes or devices that do not fit, less than 2 or more than 1025 samples an axis, coordinates out of
-            range or repeated.
+        ValueError: shapes or devices that do not fit, less than 2 or more than 1025 samples per axis, coordinates out
+            of range or repeated.
 
     Example:
         >>> axis = torch.linspace(-1, 1, 9)
@@ -53,8 +53,8 @@ def marching_cubes(
     check_tensor(name, "values", values, ("M", "n + 1", "n + 1", "n + 1"), torch.float32)
     cells, side = values.shape[:2]
     check_tensor(name, "values", values, (cells, side, side, side), torch.float32)
-    check(side >= 2, name, "values", "have at least 2 samples an axis", side)
-    check(side <= _MAX_SAMPLES, name, "values", f"have at most {_MAX_SAMPLES} samples an axis", side)
+    check(side >= 2, name, "values", "have at least 2 samples per axis", side)
+    check(side <= _MAX_SAMPLES, name, "values", f"have at most {_MAX_SAMPLES} samples per axis", side)
     check_tensor(name, "cell_coords", cell_coords, (cells, 3), torch.int32, like=values)
     with torch.no_grad():
         vertices, faces, faults = torch.ops.spslam.marching_cubes(cell_coords, values, level)

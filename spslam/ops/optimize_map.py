@@ -8,7 +8,7 @@ from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
-from spslam.ops.ray_sampling import Stream
+from spslam.ops.ray_sampling import RandomStream
 from spslam.ops.render_step import RenderOptions
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
@@ -137,7 +137,7 @@ def optimize_map_(
     fixed_frame: int,
     first_step: int,
     first_stamp: int,
-    pixel_stream: int = Stream.MAPPING_PIXELS,
+    pixel_stream: int = RandomStream.MAPPING_PIXELS,
     graph: LaunchGraph | None = None,
 ) -> torch.Tensor:
     """Optimizes scene and poses over chosen frames, in place; all iterations in one call.

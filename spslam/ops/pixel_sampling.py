@@ -98,7 +98,11 @@ def sample_frame_pixels(
     height, width = depth.shape
     check(depth.device.type == "cpu", name, "depth", "be on cpu", depth.device)
     check(
-        max(height, width) <= _MAX_SIDE and height * width < 2**31, name, "depth", "fit 16 bits a side", (height, width)
+        max(height, width) <= _MAX_SIDE and height * width < 2**31,
+        name,
+        "depth",
+        "fit 16 bits per side",
+        (height, width),
     )
     check_tensor(name, "color", color, [height, width, 3], torch.uint8, like=depth)
     check(fx > 0, name, "fx", "be positive", fx)

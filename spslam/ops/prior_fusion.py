@@ -27,21 +27,22 @@ def depth_normals(
 ) -> torch.Tensor:
     """Surface normals at pixels of a depth image.
 
-    A normal is the cross product of central differences, over `step_px`, of back-projected depth. The depth at each of
-    the five pixels is smoothed before by a 5x5 bilateral filter: a Gaussian of 2 px in the image, a biweight of 6 cm in
-    depth.
+    The cross product of the central differences of the unprojected points `step_px` to the left and right, and above
+    and below. The depth of these four pixels and of the center is smoothed before by a 5x5 bilateral filter: a Gaussian
+    with a standard deviation of 2 px in the image, a biweight of 6 cm in depth.
 
     Args:
         depth: float32 [H, W], meters; values that are 0, negative or not finite are invalid.
         pixels: int32 [N, 2], (u, v): column, row.
-        fx, fy, cx, cy: pinhole camera, px.
-        step_px: distance of the differences, 1 to 65535.
-        max_jump: a neighbor whose depth differs by this share of the pixel's, or more, is another surface.
+        fx, fy, cx, cy: pinhole intrinsics, px.
+        step_px: distance of the neighbors from the pixel, 1 to 65535.
+        max_jump: relative difference between a neighbor's depth and the pixel's from which on there is a depth
+            discontinuity between them.
 
     Returns:
-        float32 [N, 3] in camera axes, unit, facing the camera (n . p < 0). 0 where undefined: invalid depth at one of
-        the five pixels, a depth discontinuity, or a pixel outside the image or nearer than `step_px` to its border. The
-        same in every run. N = 0 gives an empty tensor.
+        float32 [N, 3] unit normals in camera axes, facing the camera (n . p < 0). 0 where undefined: invalid depth at
+        one of the five pixels, a depth discontinuity, or a pixel outside the image or nearer than `step_px` to its
+        border. Deterministic. N = 0 gives an empty tensor.
 
     Raises:
         ValueError: wrong shapes or devices, `fx`, `fy` or `max_jump` not positive, `step_px` out of range.

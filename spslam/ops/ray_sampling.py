@@ -13,7 +13,7 @@ _MAX_SAMPLES = 2**20
 _COUNTER_RANGE = 2**32
 
 
-class Stream(IntEnum):
+class RandomStream(IntEnum):
     """Purpose of random numbers; different streams are independent. Duplicated in csrc/core/philox.h."""
 
     PIXEL_DATABASE = 0
@@ -36,7 +36,7 @@ def philox_uniform(
 
     Args:
         seed: 64-bit seed.
-        stream: purpose of the numbers, see `Stream`.
+        stream: purpose of the numbers, see `RandomStream`.
         frame: frame index, 0 to 2^32 - 1.
         iteration: iteration index, 0 to 2^32 - 1.
         count: number of elements, N.
@@ -78,7 +78,7 @@ def sample_indices(
         ValueError: `count` negative, or `upper` outside [1, 2^32].
 
     Example:
-        >>> drawn = sample_indices(0, Stream.EVALUATION, 0, 0, count=1000, upper=6)
+        >>> drawn = sample_indices(0, RandomStream.EVALUATION, 0, 0, count=1000, upper=6)
         >>> drawn.min(), drawn.max()
         (tensor(0), tensor(5))
     """
@@ -127,7 +127,7 @@ def sample_along_rays(
         ValueError: a shape does not fit, a number is out of range, or R * S exceeds 2^32.
 
     Example:
-        >>> sample_along_rays(torch.tensor([2.0]), 2, 1, 0.0, 1.0, 0.1, 0, Stream.TRACKING_RAYS, 0, 0).shape
+        >>> sample_along_rays(torch.tensor([2.0]), 2, 1, 0.0, 1.0, 0.1, 0, RandomStream.TRACKING_RAYS, 0, 0).shape
         torch.Size([1, 3])
     """
     name = "sample_along_rays"

@@ -6,7 +6,7 @@ from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
-from spslam.ops.ray_sampling import Stream
+from spslam.ops.ray_sampling import RandomStream
 from spslam.ops.render_step import RenderOptions
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
@@ -23,7 +23,7 @@ def track_adam(
     iterations: int,
     rotation_rate: float,
     translation_rate: float,
-    pixel_stream: int = Stream.TRACKING_PIXELS,
+    pixel_stream: int = RandomStream.TRACKING_PIXELS,
     graph: LaunchGraph | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Tracks one frame against a frozen scene; all iterations in one call.

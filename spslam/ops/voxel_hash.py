@@ -1,7 +1,7 @@
 """The voxel hash: which voxel vertices exist, their ids, and the eight corners of the cell around a point.
 
 A table is two tensors of `capacity` slots, a power of two, at most half of them used: `hash_keys` (packed coordinates,
--1 is empty) and `hash_values` (ids). Coordinates are packed with 21 bits an axis; ids count up from 0 without gaps.
+-1 is empty) and `hash_values` (ids). Coordinates are packed with 21 bits per axis; ids count up from 0 without gaps.
 """
 
 import torch
@@ -229,7 +229,7 @@ def voxel_hash_lookup(
     points: torch.Tensor,
     voxel_size: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The cell around each point; one probe a point.
+    """The cell around each point; one probe per point.
 
     Args:
         hash_keys, hash_values: the table.

@@ -44,8 +44,8 @@ class Config(Section):
         "`cpu`, `cuda`, `cuda:N`, or `auto`: the GPU if there is one", pattern=r"^(auto|cpu|cuda(:\d+)?)$"
     )
     precision: Literal["tf32", "fp32"] = option(
-        "how networks multiply on CUDA while tracking, encoding and mapping: `tf32` lets tensor cores do it; the CPU "
-        "always computes in `fp32`"
+        "precision of the networks' matrix products on CUDA in tracking, encoding and mapping: `tf32` uses tensor "
+        "cores; the CPU always computes in `fp32`"
     )
     dataset: DatasetOptions
     scene: SceneOptions

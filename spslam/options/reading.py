@@ -36,7 +36,7 @@ class DatasetOptions(Section):
         needs=(need(is_("dataset.type", "7scenes")),),
     )
     depth_variant: Literal["filtered", "noisy", "exact"] | None = option(
-        "depth with filtered noise, with noise, or without; null is the first in the folder",
+        "depth images to read: noisy and filtered, noisy, or exact; null is the first of these in the folder",
         needs=(need(is_("dataset.type", "synthetic_rgbd")),),
     )
     depth_scale: float | None = option(
@@ -46,7 +46,7 @@ class DatasetOptions(Section):
         gt=0,
     )
     frames: int = option(
-        "length of the sequence; beyond one round of the path (300 frames of `generated`) the next begins",
+        "length of the sequence; the path is a loop (300 frames for `generated`), which is repeated as needed",
         "frames",
         needs=(_RENDERED,),
         ge=1,
@@ -101,8 +101,8 @@ class RunOptions(Section):
         "threads that read and decode images; null chooses by the number of cores and the device", "threads", ge=1
     )
     reader: Literal["auto", "process", "threads"] = option(
-        "where these threads run: in a separate `process`, or as `threads` of the run; `auto` is `process` for a GPU "
-        "when the command line starts the run"
+        "where these threads run: in a separate `process`, or as `threads` of the run's own; `auto` is `process` for a "
+        "GPU if the command line starts the run and the process can read the dataset"
     )
     prefetch_ahead: int | None = option(
         "maximum number of frames read ahead; null is two per thread, at least 8", "frames", ge=1

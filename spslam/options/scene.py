@@ -19,7 +19,7 @@ class SceneOptions(Section):
     plane_cell_m: float = option("edge length of a tri-plane cell", "m", gt=0, le=4)
     position_scale: float = option("scale of the position that the geometry decoder takes as input", "1/m", gt=0)
     first_pose: Literal["dataset", "identity"] = option(
-        "pose of the first frame: the data set's ground truth if there is one, or the identity"
+        "pose of the first frame: the dataset's ground truth if there is one, or the identity"
     )
     max_voxels: int = option("maximum number of voxel vertices in the volume", "vertices", ge=1000)
     max_texels: int = option("maximum number of texels in the tri-planes", "texels", ge=1000)
@@ -32,8 +32,8 @@ class SceneOptions(Section):
 class PriorOptions(Section):
     """The depth encoder and its fusion into the volume (section III.A)."""
 
-    enabled: bool = option("encode each mapped frame and fuse it; false starts new vertices from random embeddings")
-    fusion: bool = option("fuse into existing vertices by eq. (1); false only fills new ones", needs=(_PRIOR,))
+    enabled: bool = option("encode and fuse each mapped frame; false initializes new vertices with random embeddings")
+    fusion: bool = option("fuse into existing vertices by eq. (1); false only initializes new ones", needs=(_PRIOR,))
     weights: str | None = option(
         "file of encoder and decoder weights (safetensors); null is the shipped one for the neighborhood",
         needs=(need(_ENABLED, is_("prior.decoder", "pretrained")),),
@@ -48,7 +48,9 @@ class PriorOptions(Section):
     max_weight: float = option("upper limit of the fused weight W_g", needs=(_PRIOR,), gt=0)
     normal_step_px: int = option("step of the depth differences that surface normals are computed from", "px", ge=1)
     max_jump: float = option(
-        "a pixel gets no normal if the depth `normal_step_px` away differs by this fraction or more", gt=0
+        "relative depth difference to a pixel `normal_step_px` away from which on it is a depth discontinuity without "
+        "normal",
+        gt=0,
     )
 
 

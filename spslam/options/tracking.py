@@ -46,8 +46,8 @@ class TrackingOptions(Section):
         ge=0,
     )
     color_weight_m: float = option(
-        "Gauss-Newton: weight of brightness residuals to the last mapped frame: the distance that a difference from "
-        "black to white counts as; 0 does not compare brightness",
+        "Gauss-Newton: weight of brightness residuals against the last mapped frame: the distance that is equivalent "
+        "to a difference from black to white; 0 disables them",
         "m",
         ge=0,
     )
@@ -66,7 +66,8 @@ class TrackingOptions(Section):
         gt=0,
     )
     recovery: bool = option(
-        "start again from projective ICP when a frame fits the map badly; with `adam` only when tracking failed"
+        "repeat tracking from poses found by projective ICP if a frame fits the map badly; with `adam` only if "
+        "tracking failed"
     )
     recovery_min_robust_weight: float = option(
         "recover and verify when the mean robust weight of the pixels is below this", ge=0, le=1
@@ -82,7 +83,7 @@ class TrackingOptions(Section):
         le=1,
     )
     relocalization_candidates: int = option(
-        "number of stored frames, the most similar ones, that a lost frame is aligned with; 0 does not relocalize",
+        "number of stored frames, the most similar ones, that a lost frame is aligned with; 0 disables relocalization",
         "frames",
         ge=0,
     )

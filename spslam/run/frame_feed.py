@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 
 import torch
@@ -13,7 +13,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.prefetch import Prefetcher, prefetch
 from spslam.errors import DatasetError
 from spslam.run.reader_launch import has_standby
-from spslam.run.reader_process import ReaderProcess
+from spslam.run.reader_process import ReaderProcess, ReaderUnavailableError
 from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 from spslam.slam.upload import Uploader
@@ -25,18 +25,22 @@ MIN_AHEAD = 8
 
 
 class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
-    """Iterates over the frames of a data set in order; a frame that can't be read comes as its `DatasetError`.
+    """Iterates over the frames of a dataset in order; a frame that can't be read comes as its `DatasetError`.
 
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
-    another process do not compete with the frame loop for Python's GIL. A data set that can't be pickled is read by
-    threads of this process. At most `run.prefetch_ahead` frames exist at the same time. Nothing is read before the
-    first frame is requested.
+    another process do not compete with the frame loop for Python's GIL. If `run.reader` is `auto`, a dataset that no
+    other process can read is read by threads of this one; if it is `process`, that is an error. At most
+    `run.prefetch_ahead` frames exist at the same time. Nothing is read before the first frame is requested.
 
     Args:
         dataset: the frames.
         config: how they are read and sampled.
         device: receives the pixels.
         start: position of the first frame.
+
+    Raises:
+        ReaderUnavailableError: `run.reader` is `process`, and no other process can read the dataset: it can't be
+            pickled, its class can't be imported there (raised by `prepare`), or no process can be started.
     """
 
     def __init__(self, dataset: RgbdDataset, config: Config, device: torch.device, start: int = 0):
@@ -46,20 +50,21 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         ahead = max(2 * workers, MIN_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
         uploader = Uploader(device) if device.type == "cuda" else None
         self._threads = prefetch(FramePreparation(dataset, config, start, uploader), workers, ahead)
-        self._process = (
-            ReaderProcess.start(dataset, config, start, workers, ahead, uploader)
-            if run.reader == "process" or (run.reader == "auto" and device.type == "cuda" and has_standby())
-            else None
-        )
+        self._may_fall_back = run.reader == "auto"
+        self._process: ReaderProcess | None = None
+        if uses_process(run.reader, device):
+            with self._fallback():
+                self._process = ReaderProcess.start(dataset, config, start, workers, ahead, uploader)
         self._reader: Prefetcher[PreparedFrame] | ReaderProcess | None = None
 
     def prepare(self) -> Iterator[PreparedFrame | DatasetError]:
         """Waits until frames can be requested; reads none. Returns the iterator over the frames."""
         if self._reader is None:
-            if self._process is not None and self._process.is_ready():
-                self._reader = self._process
-            else:
-                self._reader = self._threads
+            self._reader = self._threads
+            if self._process is not None:
+                with self._fallback():
+                    self._process.wait_until_ready()
+                    self._reader = self._process
         return self._reader
 
     @property
@@ -75,12 +80,27 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
             item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
         return item
 
+    @contextmanager
+    def _fallback(self) -> Iterator[None]:
+        """Where the process was not asked for, its absence is no error: the threads read instead."""
+        try:
+            yield
+        except ReaderUnavailableError:
+            if not self._may_fall_back:
+                self._threads.close()
+                raise
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._threads.close()
         if self._process is not None:
             self._process.close()
+
+
+def uses_process(reader: str, device: torch.device) -> bool:
+    """Whether a separate process reads, by the value of `run.reader`: `auto` takes a standby reader for a GPU."""
+    return reader == "process" or (reader == "auto" and device.type == "cuda" and has_standby())
 
 
 def automatic_workers(device: torch.device) -> int:

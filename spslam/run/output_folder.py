@@ -106,7 +106,9 @@ class OutputFolder(RunFolder):
         if self.metrics.exists():
             raise OutputError(f"{self.path}: holds a finished run; use another --output")
         if self.checkpoint.exists():
-            raise OutputError(f"{self.path}: holds an interrupted run; go on with --resume, or use another --output")
+            raise OutputError(
+                f"{self.path}: contains an interrupted run; continue it with --resume, or use another --output"
+            )
         if self.config.exists() and not resume:
             raise OutputError(
                 f"{self.path}: holds a run that ended before its first checkpoint; "
@@ -140,7 +142,7 @@ class OutputFolder(RunFolder):
 
         Args:
             frames: number of frames processed before the checkpoint.
-            position: in the data set, of the first frame after the checkpoint.
+            position: in the dataset, of the first frame after the checkpoint.
         """
         atomic_write(self.log, "".join(_complete_lines(self.log)[:frames]))
         if self.skipped.exists():
@@ -179,7 +181,7 @@ class OutputFolder(RunFolder):
 
         Args:
             dataset: of the run.
-            indices: index in the data set of each row of the trajectory.
+            indices: index in the dataset of each row of the trajectory.
             ground_truth: float64 [len(dataset), 4, 4], NaN where unknown; None if there is none.
             count: number of frames, spread evenly over the run.
         """

@@ -19,7 +19,7 @@ import torch
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
-from spslam.errors import DatasetError, SpslamError
+from spslam.errors import DatasetError, SpslamError, brief
 from spslam.run.reader_launch import launch, take_standby
 from spslam.run.reader_service import DISCONNECTED, Message, Work, mapped
 from spslam.slam.pixels import FramePixels, blank_pixels
@@ -30,8 +30,12 @@ _WORD_BYTES = 4
 _EXIT_TIMEOUT_S = 5.0
 
 
+class ReaderUnavailableError(SpslamError):
+    """No separate process can read the dataset."""
+
+
 class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
-    """The frames of a data set from a position on, in order, prepared by another process.
+    """The frames of a dataset from a position on, in order, prepared by another process.
 
     Attributes:
         read_seconds: time spent on preparing the frames handed out, summed over the threads.
@@ -44,6 +48,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         memory: torch.Tensor,
         blank: FramePixels,
         uploader: Uploader | None,
+        kind: type[RgbdDataset],
     ):
         """Use `start`.
 
@@ -53,10 +58,11 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             memory: int32 [slots, words], shared memory.
             blank: pixels of a frame without content, for the shapes.
             uploader: copies the pixels to a device; if None, they are copied out of the slot on the host.
+            kind: the dataset's class, for messages.
         """
         self.read_seconds = 0.0
         self._process, self._connection = process, connection
-        self._memory, self._blank, self._uploader = memory, blank, uploader
+        self._memory, self._blank, self._uploader, self._kind = memory, blank, uploader, kind
         self._in_use: deque[tuple[int, Upload]] = deque()
         self._has_started = self._is_locked = False
 
@@ -69,7 +75,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         workers: int,
         ahead: int,
         uploader: Uploader | None,
-    ) -> "ReaderProcess | None":
+    ) -> "ReaderProcess":
         """Starts the process, or takes the standby reader. It reads nothing before the first frame is requested.
 
         Args:
@@ -80,8 +86,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             ahead: maximum number of frames that exist at the same time.
             uploader: copies the pixels to a device; None for the CPU.
 
-        Returns:
-            None if the data set can't be pickled or the process can't be started.
+        Raises:
+            ReaderUnavailableError: the dataset can't be pickled, or the process can't be started.
         """
         slots = max(ahead // 2, 1)
         blank = blank_pixels(dataset.camera, config)
@@ -89,21 +95,24 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         work = Work(dataset, config, start, workers, max(ahead - slots, 1), slots, words)
         try:
             content = pickle.dumps(work)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise _unavailable(f"{dataset.name} can't be pickled ({brief(str(error))})") from error
+        try:
             reader = take_standby() or launch()
-        except (pickle.PicklingError, AttributeError, TypeError, OSError):
-            return None
+        except (OSError, AttributeError, TypeError) as error:
+            raise _unavailable(f"the process can't be started ({brief(str(error))})") from error
         os.ftruncate(reader.shared, max(slots * words * _WORD_BYTES, 1))
         memory = mapped(reader.shared, slots, words)
         os.close(reader.shared)
         with contextlib.suppress(*DISCONNECTED):
             reader.connection.send_bytes(content)
-        return cls(reader.process, reader.connection, memory, blank, uploader)
+        return cls(reader.process, reader.connection, memory, blank, uploader, type(dataset))
 
-    def is_ready(self) -> bool:
+    def wait_until_ready(self) -> None:
         """Waits until the process can read.
 
-        Returns:
-            False where the data set's class can't be imported by another process, which has then ended.
+        Raises:
+            ReaderUnavailableError: the dataset's class can't be imported by the process, which has then ended.
         """
         try:
             ready = self._connection.recv()
@@ -111,9 +120,10 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             ready = False
         if not ready:
             self.close()
-        elif self._uploader is not None:
+            name = f"{self._kind.__module__}.{self._kind.__qualname__}"
+            raise _unavailable(f"{name} can't be imported by another process")
+        if self._uploader is not None:
             self._is_locked = self._uploader.lock_pages(self._memory)
-        return ready
 
     def __next__(self) -> PreparedFrame | DatasetError:
         try:
@@ -178,6 +188,12 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
                 upload.end.wait()
             self._in_use.popleft()
             self._connection.send(slot)
+
+
+def _unavailable(reason: str) -> ReaderUnavailableError:
+    return ReaderUnavailableError(
+        f"run.reader=process can't be used: {reason}; run.reader=threads uses no separate process"
+    )
 
 
 def _describe_exit(code: int | None) -> str:

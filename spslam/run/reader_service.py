@@ -50,7 +50,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Message:
-    """From the process: a frame, a frame that can't be read, a failure, or the end of the data set (all defaults).
+    """From the process: a frame, a frame that can't be read, a failure, or the end of the dataset (all defaults).
 
     Attributes:
         read_ms: time that a reading thread spent on the frame.
@@ -99,7 +99,7 @@ def serve(socket: int, shared: int) -> None:
     with contextlib.suppress(*DISCONNECTED), Connection(socket) as connection:
         try:
             work: Work = pickle.loads(connection.recv_bytes())
-        except (AttributeError, ImportError):  # the data set's class can't be imported here
+        except (AttributeError, ImportError):  # the dataset's class can't be imported here
             connection.send(False)
             return
         connection.send(True)

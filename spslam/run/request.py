@@ -1,9 +1,12 @@
 """The input of a run."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from spslam.config import Config
+
+_FRAMES = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
 
 
 @dataclass(frozen=True)
@@ -12,9 +15,10 @@ class RunRequest:
 
     Attributes:
         config: all options; `config.dataset` says how to read the data.
-        data_dir: folder of the data set; None for the generated room.
-        output_dir: created if needed. It must be empty or, with `resume`, hold an interrupted run of the same request.
-        frames: which frames of the data set to process; None for all.
+        data_dir: folder of the dataset; None for the generated room.
+        output_dir: created if needed. It must be empty or, with `resume`, contain an interrupted run of the same
+            request.
+        frames: which frames of the dataset to process; None for all.
         resume: continue from the checkpoint in `output_dir` if there is one.
         mesh: whether to extract the mesh.
     """
@@ -25,3 +29,24 @@ class RunRequest:
     frames: slice | None = None
     resume: bool = False
     mesh: bool = True
+
+
+def parse_frames(text: str) -> slice:
+    """Reads which frames to process.
+
+    Args:
+        text: `START:STOP[:STEP]`; each of the first two may be left out, negative ones count from the end.
+
+    Raises:
+        ValueError: anything else, or no frame selected whatever the length of the sequence.
+    """
+    match = _FRAMES.fullmatch(text)
+    try:
+        start, stop, step = (int(part) if part else None for part in match.groups()) if match else (None, None, 0)
+    except ValueError:  # a lone minus sign
+        step = 0
+    if step == 0:
+        raise ValueError(f"must be START:STOP[:STEP] with STEP at least 1, got {text!r}")
+    if start is not None and stop is not None and (start < 0) == (stop < 0) and stop <= start:
+        raise ValueError(f"must select at least one frame, got {text!r}")
+    return slice(start, stop, step)

@@ -1,4 +1,4 @@
-"""SLAM over a sequence: from a data set to an output folder."""
+"""SLAM over a sequence: from a dataset to an output folder."""
 
 import contextlib
 import time

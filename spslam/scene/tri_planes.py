@@ -173,7 +173,7 @@ class TriPlanes:
         """Texels [_BLOCK, _BLOCK, 32] of the block with these world coordinates."""
         count = _BLOCK * _BLOCK * 2 * FEATURES
         frame, iteration = block_u & 0xFFFFFFFF, _FIRST_KEY + 4 * block_v + plane
-        stream = ops.Stream.INITIALIZATION
+        stream = ops.RandomStream.INITIALIZATION
         uniform = ops.philox_uniform(self.seed, stream, frame, iteration, count, self.texels.device)
         first, second = uniform.view(_BLOCK, _BLOCK, 2, FEATURES).unbind(2)
         # Box-Muller transform; 1 - u lies in (0, 1].

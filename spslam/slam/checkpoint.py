@@ -21,7 +21,7 @@ from spslam.tensor_schema import CHECKPOINT
 
 FORMAT = "spslam-checkpoint-2"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
-# Iterations are numbered by int32; this many leave room to go on.
+# Iterations are numbered by int32; this many leave room to continue.
 _MOST_ITERATIONS = 2**30
 
 
@@ -31,7 +31,7 @@ def fingerprint(config: Config) -> str:
     for section in ("device", "preset", "run", "mesh"):
         content.pop(section)
     content["dataset"].pop("path")
-    # A run that met a limit goes on when the limit is raised.
+    # A run that reached a limit can continue when the limit is raised.
     for limit in ("max_voxels", "max_texels"):
         content["scene"].pop(limit)
     content["pose_confidence"] = read_shipped(MODEL_FILE)["constants"]
@@ -61,7 +61,7 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
     Args:
         state: after a whole frame.
         config: of the run.
-        source: JSON object that names the data and where to go on, returned by `load_checkpoint`.
+        source: JSON object that names the data and where to continue, returned by `load_checkpoint`.
         copy: whether the snapshot must outlast further frames; else it shares the state's memory.
     """
     tensors = {
@@ -161,11 +161,11 @@ def _sizes(state: SlamState) -> dict[str, int]:
 
 
 def _checked_source(header: dict[str, Any], frames: int) -> dict[str, Any]:
-    """What names the data and where to go on; raises ValueError."""
+    """What names the data and where to continue; raises ValueError."""
     source = header.get("source")
     clock = source.get("clock") if isinstance(source, dict) else None
     if not isinstance(source, dict) or not isinstance(clock, dict) or not isinstance(source.get("data"), dict):
-        raise ValueError("source must hold data, next and clock")
+        raise ValueError("source must contain data, next and clock")
     position = whole_number(source, "next", low=frames)
     whole_number(source["data"], "frames", low=position)
     whole_number(clock, "frames")

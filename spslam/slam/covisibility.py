@@ -39,7 +39,7 @@ def select_frames(
     if len(usable_ids) <= mapping.frames:
         return usable_ids.to(device, non_blocking=True)
     recent, older = usable_ids[-mapping.recent :], usable_ids[: -mapping.recent]
-    order = ops.philox_uniform(config.seed, ops.Stream.FRAME_SELECTION, newest, 0, newest + 1)
+    order = ops.philox_uniform(config.seed, ops.RandomStream.FRAME_SELECTION, newest, 0, newest + 1)
     shuffled = older[order[older].argsort(stable=True)]
     current = int(usable_ids[-1])
     chosen = ops.select_covisible_frames(

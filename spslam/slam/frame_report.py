@@ -19,7 +19,7 @@ class FrameReport:
 
     Attributes:
         frame: number of the frame in the run, from 0.
-        index: its index in the data set.
+        index: its index in the dataset.
         timestamp: s.
         lost: whether its pose is not to be trusted.
         valid_depth_share: share of pixels with usable depth.

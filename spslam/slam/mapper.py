@@ -69,7 +69,7 @@ class Mapper:
             state.frames.poses,
             frames,
             self.intrinsics,
-            render_options(config, ops.Stream.MAPPING_RAYS, newest),
+            render_options(config, ops.RandomStream.MAPPING_RAYS, newest),
             self._moments(state),
             num_pixels=config.mapping.pixels,
             iterations=iterations,

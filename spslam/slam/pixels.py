@@ -94,7 +94,7 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixel
         camera.cy,
         sampling,
         config.seed,
-        ops.Stream.PIXEL_DATABASE,
+        ops.RandomStream.PIXEL_DATABASE,
         frame.index,
     )
     size = frame.depth.shape

@@ -15,7 +15,7 @@ class PreparedFrame:
     """A sampled frame; its images are freed.
 
     Attributes:
-        index: of the frame in the data set; keys its draws.
+        index: of the frame in the dataset; keys its draws.
         timestamp: s.
         pixels: on the CPU, or on their way to the device.
         decode_ms: reading, decoding and sampling, on the thread that did it.
@@ -32,7 +32,7 @@ class PreparedFrame:
 
 
 class FramePreparation:
-    """The frames of a data set from a position on, each read, decoded, sampled and, with an uploader, sent off."""
+    """The frames of a dataset from a position on, each read, decoded, sampled and, with an uploader, sent off."""
 
     def __init__(self, dataset: RgbdDataset, config: Config, start: int = 0, uploader: Uploader | None = None):
         self._dataset, self._config, self._start, self._uploader = dataset, config, start, uploader

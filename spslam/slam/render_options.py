@@ -4,7 +4,7 @@ from spslam import ops
 from spslam.config import Config
 
 
-def render_options(config: Config, stream: ops.Stream, frame: int) -> ops.RenderOptions:
+def render_options(config: Config, stream: ops.RandomStream, frame: int) -> ops.RenderOptions:
     """Sampling, losses and random stream (Philox) of a call's first render step, from the configuration."""
     return ops.RenderOptions(
         num_uniform=config.sampling.uniform,

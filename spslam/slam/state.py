@@ -57,7 +57,7 @@ class FrameTable:
 
     @property
     def indices(self) -> torch.Tensor:
-        """int64 [F] index in the data set."""
+        """int64 [F] index in the dataset."""
         return self._columns["indices"][: self._count]
 
     @property

@@ -122,7 +122,7 @@ def test_the_command_prints_tables_and_writes_them(tmp_path):
     [
         ((), "SUITE must be one of 7scenes, ablation, quick"),
         (("replika",), "suite must be one of"),
-        (("quick", "--data", "nowhere"), "--data must be a folder that holds the data sets, got nowhere"),
+        (("quick", "--data", "nowhere"), "--data must be a folder that contains the datasets, got nowhere"),
         (("quick", "--frames", "9"), "--frames must be START:STOP"),
         (("quick", "--sequences", "x"), "sequence must be one of room"),
         (("quick", "--folders", "x.yaml"), "--folders needs --data"),

@@ -114,9 +114,9 @@ def test_folders_from_a_file(tmp_path):
     [
         (None, "can't be read: No such file"),
         ("a: [", "must be YAML"),
-        ("- quick", "must hold SUITE: {SEQUENCE: FOLDER}, got"),
+        ("- quick", "must contain SUITE: {SEQUENCE: FOLDER}, got"),
         ("quik: {kitchen: x}", "suite must be one of .*quick.*, got quik"),
-        ("quick: kitchen", "quick must hold SEQUENCE: FOLDER, got kitchen"),
+        ("quick: kitchen", "quick must contain SEQUENCE: FOLDER, got kitchen"),
         ("quick: {kitschen: x}", "a sequence of quick must be one of kitchen, .*, got kitschen"),
         ("quick: {room: x}", "a sequence of quick must be one of kitchen, .*, got room"),
         ("quick: {kitchen: 3}", "the folder of quick, kitchen must be text, got 3"),
@@ -136,7 +136,7 @@ def test_repository_file_of_folders_is_valid():
 
 
 def test_suites_name_public_folders_only():
-    """A suite lists parent folders of the data set's own folder name; other names belong in a `--folders` file."""
+    """A suite lists parent folders of the dataset's own folder name; other names belong in a `--folders` file."""
     for name in suite_names():
         for sequence in load_suite(name).studies[0].sequences:
             assert len({folder.rpartition("/")[2] for folder in sequence.folders}) <= 1, sequence.name

@@ -61,7 +61,7 @@ DAMAGES = {
     "no such folder": shutil.rmtree,
     "must be a folder": replace_by_file,
     "7-Scenes frames": replace_by_other_layout,
-    "must hold 7-Scenes frames": remove_frames,
+    "must contain 7-Scenes frames": remove_frames,
     "color.png": break_images,
     "depth.png": break_depths,
     "depth.png: must be as large as the sequence's first image, 32x24, got 10x10": shrink_depths,

@@ -32,4 +32,4 @@ def test_wrong_options_give_a_one_line_error(tmp_path):
 def test_a_damaged_checkpoint_gives_a_one_line_error(tmp_path):
     (tmp_path / "prior.checkpoint.safetensors").write_bytes(b"damaged")
     result = spslam("pretrain", "--resume", cwd=tmp_path)
-    assert_refused(result, "prior.checkpoint.safetensors: not a checkpoint of spslam pretrain")
+    assert_refused(result, "prior.checkpoint.safetensors: not a readable checkpoint of spslam pretrain")

@@ -92,7 +92,7 @@ def test_eval_adds_metrics_of_the_mesh(finished, few_samples):
     assert json.loads((folder / "out" / "metrics.json").read_text())["f1_5cm"] > 99
     exact = spslam("eval", "out", "--gt-mesh", "generated", cwd=folder)
     assert "accuracy" in exact.stdout
-    assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such mesh file")
+    assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such file")
 
 
 def test_eval_adds_metrics_of_views_and_of_alignment_with_scale(finished):
@@ -139,8 +139,8 @@ def test_interruption_is_one_line_and_resumes_to_the_same_bytes(tmp_path):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error
-    assert error == f"spslam: interrupted; the same command with --output {tmp_path / 'cut'} --resume goes on\n"
-    assert_refused(spslam("run", "demo", *arguments, "--output", "cut", cwd=tmp_path), "go on with --resume")
+    assert error == f"spslam: interrupted; the same command with --output {tmp_path / 'cut'} --resume continues\n"
+    assert_refused(spslam("run", "demo", *arguments, "--output", "cut", cwd=tmp_path), "continue it with --resume")
     run(tmp_path, *arguments, "--output", "cut", "--resume")
     for name in ("trajectory.txt", "map.safetensors"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -184,7 +184,7 @@ def test_progress_without_a_terminal_is_printed_as_lines(capsys):
 def test_progress_on_a_terminal_is_a_bar_that_ends_with_a_newline(capsys):
     bar = ProgressBar()
     bar(4, 9, Report())  # a resumed run
-    time.sleep(0.2)  # tqdm draws ten times a second
+    time.sleep(0.2)  # tqdm draws ten times per second
     bar(5, 9, Report())
     bar.close()
     error = capsys.readouterr().err

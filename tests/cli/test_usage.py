@@ -9,7 +9,7 @@ import pytest
 
 import spslam as package
 from spslam.cli import main as main_module
-from spslam.cli.arguments import parse_frames
+from spslam.cli.arguments import frame_range
 from spslam.cli.command_name import command_name
 from spslam.cli.doctor import cuda_archs
 from spslam.cli.main import COMMANDS, main
@@ -92,13 +92,13 @@ def test_a_wrong_command_line_is_a_one_line_error(tmp_path, arguments, message):
     ],
 )
 def test_frames_are_parsed(text, expected):
-    assert parse_frames(text) == expected
+    assert frame_range(text) == expected
 
 
 @pytest.mark.parametrize("text", ["", "5", "a:b", "5:5", "9:5", "-5:-9", "0:9:0", "0:9:-1", "1:2:3:4", "-:3", "1.5:3"])
 def test_wrong_frames_are_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match="got '"):
-        parse_frames(text)
+        frame_range(text)
 
 
 class Raising:
@@ -121,7 +121,7 @@ class Raising:
         (OSError(28, "No space left on device", "/x/log.jsonl"), 2, "spslam: /x/log.jsonl: No space left on device"),
         (RuntimeError("odd"), 1, "spslam: unexpected RuntimeError: odd; --debug shows where"),
         (KeyboardInterrupt(), 130, "spslam: interrupted"),
-        (KeyboardInterrupt("go on with x"), 130, "spslam: interrupted; go on with x"),
+        (KeyboardInterrupt("continue with x"), 130, "spslam: interrupted; continue with x"),
     ],
 )
 def test_every_error_is_one_line_with_an_exit_code(monkeypatch, capsys, error, code, line):

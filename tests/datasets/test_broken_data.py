@@ -80,7 +80,7 @@ def check_one_broken_frame(dataset, *words):
 
 @pytest.mark.parametrize("image", ["color", "depth"])
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("corrupt", "words"),
     [
         (truncate, "truncated"),
         (lambda path: path.write_bytes(b""), "the file is empty"),
@@ -88,9 +88,9 @@ def check_one_broken_frame(dataset, *words):
     ],
     ids=["truncated", "zero bytes", "no image"],
 )
-def test_a_broken_image(layout, image, spoil, words):
+def test_a_broken_image(layout, image, corrupt, words):
     path = getattr(layout, image)
-    spoil(path)
+    corrupt(path)
     check_one_broken_frame(layout.open(), path.name, words)
 
 
@@ -105,7 +105,7 @@ def test_a_missing_image(layout, image):
         check_one_broken_frame(layout.open(), other.name, f"the {image} image of this frame is missing")
 
 
-def spoil_pose(layout, text):
+def corrupt_pose(layout, text):
     """Writes ``text``, 16 words, in place of the pose of the frame to break; False where poses are in another form."""
     if layout.kind in ("7scenes", "scannet"):
         name = f"seq-01/frame-{BROKEN:06d}.pose.txt" if layout.kind == "7scenes" else f"pose/{BROKEN}.txt"
@@ -122,7 +122,7 @@ def spoil_pose(layout, text):
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
 def test_a_pose_that_is_not_finite_is_an_unknown_one(layout, value):
-    if not spoil_pose(layout, " ".join([value] * 16)):
+    if not corrupt_pose(layout, " ".join([value] * 16)):
         path = layout.folder / "groundtruth.txt"
         path.write_text(path.read_text() + f"1000.0 {' '.join([value] * 7)}\n")
         assert all(frame.pose is not None for frame in layout.open())
@@ -131,7 +131,7 @@ def test_a_pose_that_is_not_finite_is_an_unknown_one(layout, value):
 
 
 def test_a_pose_that_is_no_motion(layout):
-    if not spoil_pose(layout, " ".join(map(str, range(16)))):
+    if not corrupt_pose(layout, " ".join(map(str, range(16)))):
         return
     check_one_broken_frame(layout.open(), "must be a rotation and a translation")
 
@@ -143,7 +143,7 @@ def test_frames_beyond_the_poses_have_none(layout):
     path.write_text("\n".join(" ".join(map(str, np.eye(4).ravel())) for _ in range(2)))
     assert [frame.pose is None for frame in layout.open()] == [False, False, True, True, True]
     path.write_text("1 0 0")
-    with pytest.raises(DatasetError, match=f"{path.name}: must have 16 numbers a pose, got 3 numbers"):
+    with pytest.raises(DatasetError, match=f"{path.name}: must have 16 numbers per pose, got 3 numbers"):
         layout.open()
 
 
@@ -151,12 +151,12 @@ MISSING_INTRINSICS = {
     "replica": ("cam_params.json", "cam_params.json: no such file"),
     "synthetic_rgbd": ("focal.txt", "focal.txt: no such file"),
     "scannet": ("intrinsic/intrinsic_*.txt", "intrinsic_depth.txt: no such file"),
-    "folder": ("intrinsics.txt", "must hold the intrinsics in one of intrinsics.txt"),
+    "folder": ("intrinsics.txt", "must contain the intrinsics in one of intrinsics.txt"),
 }
 
 
 def test_missing_intrinsics(layout):
-    if layout.kind not in MISSING_INTRINSICS:  # the data sets' own defaults hold
+    if layout.kind not in MISSING_INTRINSICS:  # the datasets' own defaults hold
         assert layout.open().camera.width > 0
         return
     pattern, message = MISSING_INTRINSICS[layout.kind]

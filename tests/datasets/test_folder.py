@@ -77,15 +77,15 @@ def test_intrinsics_files(tmp_path):
         (folder / name).write_text(text)
         assert open_folder(folder).camera == CAMERA
         (folder / name).unlink()
-    with pytest.raises(DatasetError, match="must hold the intrinsics in one of intrinsics.txt"):
+    with pytest.raises(DatasetError, match="must contain the intrinsics in one of intrinsics.txt"):
         open_folder(folder)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fx": "wide"}, "must hold numbers fx, fy, cx, cy, got fx: wide"),
-        ({"fx": True}, "must hold numbers fx, fy, cx, cy, got fx: True"),
+        ({"fx": "wide"}, "must contain numbers fx, fy, cx, cy, got fx: wide"),
+        ({"fx": True}, "must contain numbers fx, fy, cx, cy, got fx: True"),
         ({"width": 640}, "width must be the images' 32, got 640"),
         ({"depth_scale": -1}, "depth_scale must be a number from 0.001 to 1e.09, got -1"),
         ({"fy": -5}, "Camera: fy must be positive, got -5"),
@@ -151,10 +151,10 @@ def test_poses_are_read_if_there(tmp_path):
 
 
 def test_wrong_layouts(tmp_path):
-    with pytest.raises(DatasetError, match="must hold a folder color"):
+    with pytest.raises(DatasetError, match="must contain a folder color"):
         open_folder(tmp_path)
     (tmp_path / "color").mkdir()
-    with pytest.raises(DatasetError, match=r"color: must hold images \(.png, .jpg, .jpeg\), got none"):
+    with pytest.raises(DatasetError, match=r"color: must contain images \(.png, .jpg, .jpeg\), got none"):
         open_folder(tmp_path)
     cv2.imwrite(str(tmp_path / "color" / "0.png"), np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(DatasetError, match="depth: no such folder"):

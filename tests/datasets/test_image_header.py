@@ -16,7 +16,7 @@ def encoded(suffix, image, *flags):
 
 
 GRAY16, COLOR = np.arange(24 * 37, dtype=np.uint16).reshape(24, 37), np.zeros((24, 37, 3), np.uint8)
-JPEG = encoded(".jpg", COLOR)
+PNG, JPEG = encoded(".png", COLOR), encoded(".jpg", COLOR)
 
 
 def tiff(order, is_big, tags):
@@ -58,6 +58,8 @@ def test_a_tile_may_be_larger_than_the_image():
         (encoded(".bmp", COLOR), "neither PNG, JPEG nor TIFF"),
         (encoded(".png", COLOR)[:20], "damaged header"),
         (encoded(".png", COLOR).replace(b"IHDR", b"IDAT"), "damaged header"),
+        (PNG[:33] + struct.pack(">I", 2**30) + PNG[37:], "damaged chunks"),
+        (PNG[:-12] + PNG[:8] + PNG[-12:], "damaged chunks"),
         (JPEG[:100], "damaged header"),
         (b"\xff\xd8\xff" + b"\0\xff" * 10**6, "damaged header"),
         (tiff("<", False, {256: 37}), "damaged header"),
@@ -68,6 +70,10 @@ def test_a_tile_may_be_larger_than_the_image():
 def test_damaged_headers(content, message):
     with pytest.raises(ValueError, match=message):
         image_size(content)
+
+
+def test_a_png_may_have_padding_behind_its_end():
+    assert image_size(PNG + bytes(500)) == (37, 24)
 
 
 def test_a_jpeg_of_many_scans_is_refused():

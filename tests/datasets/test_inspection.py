@@ -1,9 +1,12 @@
-"""The look through a data set: an analytic room whose data is then spoilt in the ways that happen."""
+"""The look through a dataset: an analytic room whose data is then corrupted in the ways that occur."""
+
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from spslam.camera import Camera
+from spslam.datasets import inspection
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.inspection import inspect_dataset
 from spslam.datasets.replica import open_replica
@@ -19,21 +22,21 @@ HALF_SIZE = np.array([3.0, 2.0, 2.5])
 
 
 class BoxRoom(RgbdDataset):
-    """A walk through an empty box, depth exact; attributes can be replaced to spoil it."""
+    """A walk through an empty box, depth exact; attributes can be replaced to corrupt it."""
 
     name = "box"
     camera = CAMERA
 
     def __init__(self, frames=40):
-        self.true_poses = np.stack([walk(i / frames) for i in range(frames)])
-        self.given_poses = self.true_poses.copy()
+        self.gt_poses = np.stack([walk(i / frames) for i in range(frames)])
+        self.given_poses = self.gt_poses.copy()
         self.times = np.arange(frames) / 30
         self.scale = 1.0
         self.holes = 0
         self.broken = ()
 
     def __len__(self):
-        return len(self.true_poses)
+        return len(self.gt_poses)
 
     def timestamps(self):
         return self.times
@@ -44,7 +47,7 @@ class BoxRoom(RgbdDataset):
     def read(self, index):
         if index in self.broken:
             raise DatasetError(f"frame {index} is broken")
-        depth = self.scale * cast(self.true_poses[index])
+        depth = self.scale * cast(self.gt_poses[index])
         depth[: self.holes] = 0
         color = np.zeros((*depth.shape, 3), np.uint8)
         return RgbdFrame(index, self.times[index], color, depth.astype(np.float32))
@@ -66,6 +69,35 @@ def cast(pose):
     return np.min(np.where(directions != 0, walls, np.inf), axis=-1)
 
 
+def test_large_images_are_thinned_without_another_finding(monkeypatch):
+    whole = inspect_dataset(BoxRoom())
+    monkeypatch.setattr(inspection, "_MAX_PIXELS_KEPT", CAMERA.width * CAMERA.height // 4)
+    thinned = inspect_dataset(BoxRoom())
+    assert thinned.problems == whole.problems == []
+    assert thinned.depth.median_m == pytest.approx(whole.depth.median_m, rel=0.05)
+    assert thinned.poses.agreement.relative < 0.02
+
+
+def test_images_of_17_million_pixels_are_inspected_in_bounded_memory():
+    """40 of them whole would be 2.7 GB."""
+
+    class Large(BoxRoom):
+        camera = Camera(4096, 4096, 4000.0, 4000.0, 2047.5, 2047.5)
+
+        def read(self, index):
+            color = np.broadcast_to(np.uint8(0), (4096, 4096, 3))
+            return RgbdFrame(index, self.times[index], color, np.full((4096, 4096), 2.0, np.float32))
+
+    tracemalloc.start()
+    try:
+        found = inspect_dataset(Large())
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found.frames_read == 40
+    assert most < 500e6
+
+
 def test_sound_data_has_no_problem():
     found = inspect_dataset(BoxRoom())
     assert found.problems == []
@@ -77,7 +109,7 @@ def test_sound_data_has_no_problem():
     assert 0 < found.depth.near_m < found.depth.median_m < found.depth.far_m < 8
 
 
-SPOILERS = {
+CORRUPTIONS = {
     "world-to-camera; camera": inverse,
     "OpenGL axes (y up": lambda poses: poses @ np.diag([1.0, -1, -1, 1]),
     "world-to-camera in OpenGL": lambda poses: inverse(poses @ np.diag([1.0, -1, -1, 1])),
@@ -85,10 +117,10 @@ SPOILERS = {
 }
 
 
-@pytest.mark.parametrize("words", SPOILERS)
+@pytest.mark.parametrize("words", CORRUPTIONS)
 def test_wrong_poses_are_explained(words):
     room = BoxRoom()
-    room.given_poses = SPOILERS[words](room.true_poses)
+    room.given_poses = CORRUPTIONS[words](room.gt_poses)
     assert any(words in problem for problem in inspect_dataset(room).problems)
 
 
@@ -116,7 +148,7 @@ def test_holes_and_missing_poses_and_broken_frames_are_reported():
     assert problems == [
         "unreadable: frame 3 is broken",
         "62% of the pixels have no depth",
-        "4 of 40 frames have no true pose",
+        "4 of 40 frames have no ground-truth pose",
     ]
 
 
@@ -157,7 +189,7 @@ def test_recordings_as_distributed_are_sound(name):
     assert found.poses.agreement.median_cm < 2
 
 
-class Spoilt(Subset):
+class Corrupted(Subset):
     """A recording whose poses or depth were converted wrongly."""
 
     def __init__(self, dataset, change_poses=None, scale=1.0):
@@ -173,16 +205,16 @@ class Spoilt(Subset):
         return frame
 
 
-@pytest.mark.parametrize("words", SPOILERS)
+@pytest.mark.parametrize("words", CORRUPTIONS)
 @pytest.mark.parametrize("name", ["7scenes-redkitchen", "synthetic-grey-white-room"])
 def test_wrong_poses_of_recordings_are_explained(name, words):
-    spoilt = Spoilt(RECORDINGS[name](shared_data(name)), SPOILERS[words])
-    assert any(words in problem for problem in inspect_dataset(spoilt, frames=3).problems)
+    corrupted = Corrupted(RECORDINGS[name](shared_data(name)), CORRUPTIONS[words])
+    assert any(words in problem for problem in inspect_dataset(corrupted, frames=3).problems)
 
 
 @pytest.mark.parametrize(("scale", "fix"), [(0.2, 5), (5, 0.2), (0.1526, 6.5535)])
 @pytest.mark.parametrize("name", ["7scenes-redkitchen", "synthetic-grey-white-room"])
 def test_wrong_depth_scale_of_recordings_is_named(name, scale, fix):
-    spoilt = Spoilt(RECORDINGS[name](shared_data(name)), scale=scale)
-    problems = inspect_dataset(spoilt, frames=3).problems
+    corrupted = Corrupted(RECORDINGS[name](shared_data(name)), scale=scale)
+    problems = inspect_dataset(corrupted, frames=3).problems
     assert any(f"depths {fix:g} times as large would fit" in problem for problem in problems)

@@ -41,7 +41,7 @@ def test_trajectories_may_be_short_or_absent(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fx": None}, r"must hold numbers camera.\{w, h, fx, fy, cx, cy, scale\}"),
+        ({"fx": None}, r"must contain numbers camera.\{w, h, fx, fy, cx, cy, scale\}"),
         ({"w": 64}, "must give the images' size 32x24, got 64x24"),
         ({"scale": 0}, "camera.scale must be a number from 0.001 to 1e.09, got 0"),
         ({"cx": 900}, "principal point must lie in the image"),
@@ -57,7 +57,7 @@ def test_wrong_camera_files(tmp_path, change, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("{", "isn't valid JSON"), ("[1]", "must hold an object"), ("{}", "got None")]
+    ("text", "message"), [("{", "isn't valid JSON"), ("[1]", "must contain an object"), ("{}", "got None")]
 )
 def test_malformed_json(tmp_path, text, message):
     scene = write_replica(tmp_path, count=1)
@@ -67,7 +67,7 @@ def test_malformed_json(tmp_path, text, message):
 
 
 def test_wrong_layout(tmp_path):
-    with pytest.raises(DatasetError, match="must hold results/frame000000.jpg and so on, got none"):
+    with pytest.raises(DatasetError, match="must contain results/frame000000.jpg and so on, got none"):
         open_replica(tmp_path)
 
 

@@ -46,9 +46,9 @@ def test_where_a_scan_may_be(tmp_path):
     shutil.rmtree(scan / "color")
     assert isinstance(open_scannet(scan), SensDataset)
     write_sens(scan / "second.sens")
-    with pytest.raises(DatasetError, match="must hold one .sens file, .* got scene.sens, second.sens"):
+    with pytest.raises(DatasetError, match="must contain one .sens file, .* got scene.sens, second.sens"):
         open_scannet(scan)
-    with pytest.raises(DatasetError, match="must hold one .sens file, .* got neither"):
+    with pytest.raises(DatasetError, match="must contain one .sens file, .* got neither"):
         open_scannet(tmp_path)
     with pytest.raises(DatasetError, match="nowhere: no such folder"):
         open_scannet(tmp_path / "nowhere")
@@ -61,7 +61,7 @@ def test_intrinsics(tmp_path):
     expected = Camera(2 * WIDTH, 2 * HEIGHT, 60, 62, 31, 23).resized(WIDTH, HEIGHT)
     assert open_scannet(scan).camera == expected
     shutil.rmtree(scan / "intrinsic")
-    with pytest.raises(DatasetError, match="intrinsic_depth.txt: no such file; it must hold depth's intrinsics"):
+    with pytest.raises(DatasetError, match="intrinsic_depth.txt: no such file; it must contain depth's intrinsics"):
         open_scannet(scan)
     (scan / "intrinsic_depth.txt").write_text("30 31 15 11")
     assert open_scannet(scan).camera == Camera(WIDTH, HEIGHT, 30, 31, 15, 11)
@@ -93,7 +93,7 @@ def test_broken_frames_name_their_file_and_leave_the_others(tmp_path):
 def test_a_scan_without_images(tmp_path):
     scan = write_scannet(tmp_path, count=1)
     (scan / "depth" / "0.png").unlink()
-    with pytest.raises(DatasetError, match="depth: must hold a ScanNet scan's images .* got none"):
+    with pytest.raises(DatasetError, match="depth: must contain a ScanNet scan's images .* got none"):
         open_scannet(scan)
 
 

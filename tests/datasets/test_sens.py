@@ -171,7 +171,7 @@ MATRICES, COMPRESSIONS = 12 + 15, 12 + 15 + 256
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("corrupt", "message"),
     [
         (lambda content: b"", "the file is empty"),
         (lambda content: content[:100], "the file is truncated in its head"),
@@ -190,12 +190,12 @@ MATRICES, COMPRESSIONS = 12 + 15, 12 + 15 + 256
             lambda content: changed(content, MATRICES + 128, bytes(64)),
             "intrinsics of depth: .*matrix must have the form",
         ),
-        (lambda content: content[:350], "must hold a whole frame, got none of 2"),
+        (lambda content: content[:350], "must contain a whole frame, got none of 2"),
     ],
 )
-def test_a_broken_file(tmp_path, spoil, message):
+def test_a_broken_file(tmp_path, corrupt, message):
     path = write(tmp_path / "a.sens", [frame(0), frame(1)])
-    path.write_bytes(spoil(path.read_bytes()))
+    path.write_bytes(corrupt(path.read_bytes()))
     with pytest.raises(DatasetError, match=rf"a.sens.*{message}") as error:
         open_scannet(path)
     assert "\n" not in str(error.value)

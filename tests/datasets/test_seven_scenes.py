@@ -128,7 +128,7 @@ def test_broken_frames_name_their_file_and_leave_the_others(tmp_path):
             "frame-000002.depth.png: the color image of this frame is missing",
             "frame-000003.depth.png: the file is empty",
             "frame-000004.pose.txt: a pose must have 16 numbers, got 3",
-            "frame-000005.pose.txt: must hold numbers only",
+            "frame-000005.pose.txt: must contain numbers only",
             "frame-000006.depth.png: must be as large as the sequence's first image, 32x24, got 16x12",
         ]
     ):
@@ -153,7 +153,7 @@ def test_frames_of_another_size_than_the_first(tmp_path):
     ("text", "message"),
     [
         ("1 2 3", "intrinsics must be a 3x3 or 4x4 matrix or fx fy cx cy, got 3 numbers"),
-        ("1 0 x 0 1 2 0 0 1", "must hold numbers only"),
+        ("1 0 x 0 1 2 0 0 1", "must contain numbers only"),
         ("0 0 5 0 9 5 0 0 1", "Camera: fx must be positive, got 0"),
         ("585 0 320 0 585 240 0 0 1", r"principal point must lie in the image of 32x24, got \(320, 240\)"),
         ("1 2 3 4 5 6 7 8 9", "matrix must have the form"),
@@ -172,9 +172,9 @@ def test_wrong_folders(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DatasetError, match="file: must be a folder, got a file"):
         open_seven_scenes(tmp_path / "file")
-    with pytest.raises(DatasetError, match="must hold 7-Scenes frames .* got none"):
+    with pytest.raises(DatasetError, match="must contain 7-Scenes frames .* got none"):
         open_seven_scenes(tmp_path)
-    with pytest.raises(DatasetError, match="must hold seq-02, got no seq-XX folder"):
+    with pytest.raises(DatasetError, match="must contain seq-02, got no seq-XX folder"):
         open_seven_scenes(tmp_path, 2)
 
 

@@ -46,10 +46,10 @@ def test_poses_with_nan_missing_and_absent(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("focal.txt", "", "focal.txt: must hold one number, the focal length in pixels, got 0"),
+        ("focal.txt", "", "focal.txt: must contain one number, the focal length in pixels, got 0"),
         ("focal.txt", "-3", "focal.txt: Camera: fx must be positive, got -3"),
-        ("poses.txt", "1 0 0 0\n", "poses.txt: must have 16 numbers a pose, got 4 numbers"),
-        ("poses.txt", "oops", "poses.txt: must hold numbers only"),
+        ("poses.txt", "1 0 0 0\n", "poses.txt: must have 16 numbers per pose, got 4 numbers"),
+        ("poses.txt", "oops", "poses.txt: must contain numbers only"),
     ],
 )
 def test_broken_text_files(tmp_path, name, text, message):
@@ -82,9 +82,9 @@ def test_wrong_layouts(tmp_path):
     with pytest.raises(DatasetError, match="focal.txt: no such file"):
         open_synthetic_rgbd(scene)
     shutil.rmtree(scene / "images")
-    with pytest.raises(DatasetError, match="must hold images/img0.png"):
+    with pytest.raises(DatasetError, match="must contain images/img0.png"):
         open_synthetic_rgbd(scene)
-    with pytest.raises(DatasetError, match="must hold a folder depth_filtered or depth, got neither"):
+    with pytest.raises(DatasetError, match="must contain a folder depth_filtered or depth, got neither"):
         open_synthetic_rgbd(tmp_path.parent)
 
 

@@ -71,7 +71,7 @@ def test_a_calibration_file_comes_first(tmp_path):
     (folder / "calibration.txt").write_text("30 31 15 11 0.1 0.01\n")
     assert open_tum(folder).undistortion is not None
     (folder / "calibration.txt").write_text("30 31 15\n")
-    with pytest.raises(DatasetError, match="calibration.txt: must hold fx fy cx cy"):
+    with pytest.raises(DatasetError, match="calibration.txt: must contain fx fy cx cy"):
         open_tum(folder)
 
 

@@ -125,11 +125,11 @@ def refused(archive, message):
     assert "\n" not in str(error.value)
 
 
-def test_an_archive_of_zeros_is_no_data_set(tmp_path):
+def test_an_archive_of_zeros_is_no_dataset(tmp_path):
     """A thousand times its own size, beyond what small archives may hold anyway."""
     zeros = {"zeros.bin": bytes(150 << 20)}
     for name, pack in (("a.zip", zipped), ("a.tgz", tarred)):
-        refused(write(tmp_path, name, pack(zeros)), "must hold what an archive of its size can hold, got more")
+        refused(write(tmp_path, name, pack(zeros)), "must contain what an archive of its size can hold, got more")
     assert tree(tmp_path / "out") == {}
 
 
@@ -142,23 +142,25 @@ def test_archives_that_are_nested_deep(tmp_path):
 
 def test_what_nested_archives_hold_counts_for_the_outer_one(tmp_path):
     inner = zipped({f"{i}.bin": bytes(20 << 20) for i in range(3)})
-    refused(write(tmp_path, "a.zip", zipped({f"{i}.zip": inner for i in range(3)})), "must hold what an archive of its")
+    refused(
+        write(tmp_path, "a.zip", zipped({f"{i}.zip": inner for i in range(3)})), "must contain what an archive of its"
+    )
 
 
 @pytest.mark.parametrize("count", [11_000])
 def test_archives_of_many_members(tmp_path, count):
     archive = write(tmp_path, "a.tgz", tarred({f"{i}": b"" for i in range(count)}))
-    refused(archive, "must hold what an archive of its size can hold, got more")
+    refused(archive, "must contain what an archive of its size can hold, got more")
     assert not list((tmp_path / "out").iterdir())
 
 
 def test_sparse_files_and_long_headers_are_refused(tmp_path):
     sparse = tarfile.TarInfo("a.bin")
     sparse.type = tarfile.GNUTYPE_SPARSE
-    refused(write(tmp_path, "sparse.tgz", tarred(FILES, sparse)), "must hold whole files, but has sparse ones")
+    refused(write(tmp_path, "sparse.tgz", tarred(FILES, sparse)), "must contain whole files, but has sparse ones")
     for name, content, message in (
         ("long.tgz", b"3 a=" + bytes(1 << 20), "a header must have at most 16384 bytes"),
-        ("digits.tgz", b"1" * 8000, "a header must not hold numbers of over 20 digits"),
+        ("digits.tgz", b"1" * 8000, "a header must not contain numbers of over 20 digits"),
     ):
         buffer = io.BytesIO()
         with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
@@ -190,11 +192,14 @@ def test_an_archive_does_not_replace_itself_or_its_notes(tmp_path):
     for name in (".downloads/a.zip", ".downloads/other.zip.json"):
         archive = write(notes, "a.zip", zipped({name: b"mine"}))
         before = archive.read_bytes()
-        with pytest.raises(DatasetError, match="must leave the folder that it lies in alone, but holds .downloads/"):
+        with pytest.raises(DatasetError, match="must not contain paths in the folder that it lies in, got .downloads/"):
             unpack(archive, tmp_path / "out")
         assert tree(notes) == {"a.zip": before}
     inner = zipped({"seq.zip": b"me"})
-    refused(write(tmp_path, "b.zip", zipped({"seq.zip": inner})), "must leave the folder that it lies in alone")
+    refused(
+        write(tmp_path, "b.zip", zipped({"seq.zip": inner})),
+        "must not contain paths in the folder that it lies in, got seq.zip",
+    )
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")

@@ -59,7 +59,7 @@ def perfect(tmp_path_factory, room):
 
 @pytest.fixture
 def output(tmp_path, perfect):
-    """A copy of the perfect run that a test may spoil."""
+    """A copy of the perfect run that a test may corrupt."""
     return shutil.copytree(perfect, tmp_path / "out")
 
 

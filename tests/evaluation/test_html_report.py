@@ -146,7 +146,7 @@ def test_writing_again_gives_the_same_bytes(tmp_path):
     ("name", "content", "message"),
     [
         ("metrics.json", "{", "metrics.json: isn't valid JSON"),
-        ("metrics.json", "[1]", "metrics.json: must hold an object with named values, got list"),
+        ("metrics.json", "[1]", "metrics.json: must contain an object with named values, got list"),
         ("log.jsonl", "{}\nx\n", "log.jsonl: isn't valid JSON"),
         ("trajectory.txt", "1 2 3\n", "trajectory.txt, line 1: must be"),
         ("mesh.ply", "nonsense", "mesh.ply: can't be read as a mesh"),

@@ -1,9 +1,12 @@
 """The plan of trials: no frame is processed twice, and the camera returns to places that were mapped."""
 
 import pytest
+import torch
 
-from experiments.fault_injection import BACK_FRAMES, STEP, plan
+from experiments.fault_injection import BACK_FRAMES, STEP, copy_of, plan
 from spslam.datasets.generated import GeneratedDataset
+from spslam.slam.system import SlamSystem
+from tests.system.sequences import Recorded, settings
 
 
 @pytest.mark.parametrize("frames", [150, 400])
@@ -20,3 +23,14 @@ def test_plan(frames):
         assert all(STEP * trial.place <= shown.index < frames for shown in trial.during)
     assert len({trial.back[0].index for trial in trials}) > 5
     assert plan(GeneratedDataset(frames, 16, 16), 10, seed=3) == trials
+
+
+def test_a_copy_tracks_as_the_system_does(tmp_path):
+    dataset = Recorded(3)
+    system = SlamSystem(settings("device=cpu", preset="fast"), dataset.camera, dataset.poses()[0])
+    for index in range(2):
+        system.process(dataset[index])
+    copy = copy_of(system, dataset.poses()[0], tmp_path / "state")
+    for each in (system, copy):
+        each.process(dataset[2])
+    assert torch.equal(copy.state.frames.poses, system.state.frames.poses)

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+from tests.fuzz import worker
 from tests.fuzz.cases import write_case
 from tests.fuzz.formats import all_formats
 from tests.fuzz.harness import prepare, print_failure, run_for, run_some
@@ -25,7 +26,9 @@ def main() -> int:
     parser.add_argument("--minutes", metavar="M", type=float, default=60, help="run for M minutes, 60 if not given")
     parser.add_argument("--jobs", metavar="J", type=int, default=os.cpu_count() or 1, help="processes at a time")
     parser.add_argument("--start", metavar="SEED", type=int, help="first seed; the time of day if not given")
+    parser.add_argument("--seconds", metavar="S", type=float, help="of processor time for a case, 10 if not given")
     args = parser.parse_args()
+    worker.MAX_SECONDS = args.seconds or worker.MAX_SECONDS
     if args.seed is not None and len(args.format or ()) != 1:
         parser.error("--seed needs one --format")
     forms = {name: form for name, form in all_formats().items() if not args.format or name in args.format}

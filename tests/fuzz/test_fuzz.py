@@ -110,7 +110,8 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: getattr(fault, "__name__", "none"))
 def test_each_kind_of_failure_is_found_and_the_next_case_still_runs(monkeypatch, fault):
-    monkeypatch.setattr(worker, "MAX_SECONDS", 0.5)
+    if fault is spin:  # the others may be slow beside other work
+        monkeypatch.setattr(worker, "MAX_SECONDS", 0.5)
     outcomes = list(run_cases(Planted(fault), range(7, 9)))
     assert [seed for seed, _ in outcomes] == [7, 8]
     assert [outcome.kind for _, outcome in outcomes] == [FAULTS[fault]] * 2

@@ -6,6 +6,7 @@ known, and another child goes on with the next.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import pickle
 import select
@@ -83,6 +84,7 @@ def _serve(form: Format, seeds: range, root: Path, write_end: int, until: float 
         for descriptor in (0, 1, 2):
             os.dup2(silence, descriptor)
         limit_memory()
+        faulthandler.disable()  # pytest's would print the stack of each crash that is looked for
         for seed in seeds:
             if until is not None and time.monotonic() > until:
                 break

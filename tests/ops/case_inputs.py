@@ -6,7 +6,7 @@ from spslam import ops
 
 VOXEL = 0.04
 LAYOUT = [0, -3, 2, 7, 5, 35, -3, -1, 7, 4, 63, 2, -1, 5, 4]
-KEY = dict(seed=7, stream=ops.Stream.MAPPING_RAYS, frame=3, iteration=1)
+KEY = dict(seed=7, stream=ops.RandomStream.MAPPING_RAYS, frame=3, iteration=1)
 CAMERA = dict(fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 SAMPLES = 21
 

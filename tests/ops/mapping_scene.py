@@ -76,7 +76,7 @@ class Map:
     def _iterate(self, options, step):
         frames, device = self.frames.to(self.device), self.device
         slot = torch.arange(NUM_PIXELS) * len(frames) // NUM_PIXELS
-        pixel_stream = ops.Stream.MAPPING_PIXELS
+        pixel_stream = ops.RandomStream.MAPPING_PIXELS
         per_frame = self.records.shape[1]
         draw = ops.sample_indices(
             options.seed, pixel_stream, options.frame, options.iteration, NUM_PIXELS, per_frame, device

@@ -26,7 +26,7 @@ OPTIONS = ops.RenderOptions(
     weight_free_space=20.0,
     weight_sdf=1000.0,
     seed=2**33 + 5,
-    stream=ops.Stream.MAPPING_RAYS,
+    stream=ops.RandomStream.MAPPING_RAYS,
     frame=3,
     iteration=7,
 )

@@ -80,7 +80,7 @@ def same(got, want):
     return all(torch.equal(g.nan_to_num(), w.nan_to_num()) for g, w in zip(got, want, strict=True))
 
 
-def spoilt(call, path, value, row=0):
+def corrupted(call, path, value, row=0):
     """The call with a value all over one row of an argument."""
     tensor = get(call, path).clone()
     tensor[row] = value
@@ -109,7 +109,7 @@ def test_a_bad_row_gives_what_is_documented(name, argument, values, expected, de
     call = arguments(name, generator, device)
     good, _ = run(name, call)
     for value in values:
-        got, _ = run(name, spoilt(call, (argument,), value, row=1))
+        got, _ = run(name, corrupted(call, (argument,), value, row=1))
         assert same([g[2:] for g in got], [g[2:] for g in good])
         assert same([g[:1] for g in got], [g[:1] for g in good])
         for part, want in zip(got, expected, strict=True):
@@ -124,8 +124,8 @@ def test_infinity_is_the_border(name, argument, device, generator):
     call = arguments(name, generator, device)
     for value in (math.inf, -math.inf):
         assert same(
-            run(name, spoilt(call, (argument,), value))[0],
-            run(name, spoilt(call, (argument,), math.copysign(1e6, value)))[0],
+            run(name, corrupted(call, (argument,), value))[0],
+            run(name, corrupted(call, (argument,), math.copysign(1e6, value)))[0],
         )
 
 
@@ -155,7 +155,7 @@ def test_a_bad_row_reaches_its_own_row_of_a_table(name, argument, values, tables
         row, target = 0, int(call["voxel_ids"][0])
     _, good = run(name, call)
     for value in values:
-        _, own = run(name, spoilt(call, (argument,), value, row))
+        _, own = run(name, corrupted(call, (argument,), value, row))
         for table in tables:
             others = torch.arange(len(own[table]), device=device) != target
             assert torch.equal(own[table][others], good[table][others])
@@ -166,7 +166,7 @@ def test_a_bad_row_reaches_its_own_row_of_a_table(name, argument, values, tables
 @pytest.mark.parametrize("value", OUT_OF_RANGE)
 def test_a_vertex_out_of_range_has_no_cell(value, device, generator):
     call = arguments("voxel_hash_update_corner_ids", generator, device)
-    _, own = run("voxel_hash_update_corner_ids", spoilt(call, ("voxel_coords",), value))
+    _, own = run("voxel_hash_update_corner_ids", corrupted(call, ("voxel_coords",), value))
     assert (own["corner_ids"][0] == -1).all()
 
 
@@ -175,7 +175,7 @@ def test_random_embeddings_take_any_integer(value, device, generator):
     call = arguments("random_embeddings", generator, device)
     (good,), (got,) = (
         run("random_embeddings", call)[0],
-        run("random_embeddings", spoilt(call, ("voxel_coords",), value))[0],
+        run("random_embeddings", corrupted(call, ("voxel_coords",), value))[0],
     )
     assert got.isfinite().all()
     assert torch.equal(got[1:], good[1:])
@@ -186,7 +186,7 @@ def test_losses_leave_out_what_has_no_place(device, generator):
     call = arguments("rendering_losses", generator, device)
 
     def losses(argument, value):
-        return run("rendering_losses", spoilt(call, (argument,), value))[0][0]
+        return run("rendering_losses", corrupted(call, (argument,), value))[0][0]
 
     for value in NO_DEPTH:
         assert torch.equal(losses("target_depth", value), losses("target_depth", 0.0))
@@ -203,7 +203,7 @@ def test_losses_show_what_is_no_number(argument, terms, device, generator):
     call["rendered"][0] = call["valid"][0] = True
     call["target_depth"][0] = call["t"][0].median()  # samples before the surface and near it
     value = False if argument == "valid" else math.nan
-    losses = run("rendering_losses", spoilt(call, (argument,), value))[0][0]
+    losses = run("rendering_losses", corrupted(call, (argument,), value))[0][0]
     assert losses.isnan().nonzero().flatten().tolist() == terms
 
 
@@ -226,7 +226,7 @@ def test_tracking_from_no_pose_finds_none(name, device, generator):
 @pytest.mark.parametrize("name, path", [("render_step", ("rays", "poses")), ("optimize_map_", ("poses",))])
 def test_rays_from_no_pose_meet_nothing(name, path, device, generator):
     call = arguments(name, generator, device)
-    results, own = run(name, spoilt(call, path, math.nan))
+    results, own = run(name, corrupted(call, path, math.nan))
     others = [result[1:] if result.shape == (2, 6) else result for result in results]  # but its own gradient
     assert all(result.isfinite().all() for result in others)
     assert all(get(own, part).isfinite().all() for part in tensors(own) if part != path)

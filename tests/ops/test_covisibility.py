@@ -5,6 +5,7 @@ import torch
 
 from spslam import ops
 from tests.ops.arguments import opcheck
+from tests.ops.threads import with_threads
 from tests.reference.covisibility import overlap, select
 
 INTRINSICS = ops.Intrinsics(140.0, 140.0, 79.5, 59.5)
@@ -32,7 +33,7 @@ def make_records(generator, count=2000):
 
 def drawn_points(records, pose, seed, frame):
     """World points float64 [N, 3] of the pixels that the op draws."""
-    draw = ops.sample_indices(seed, ops.Stream.COVISIBILITY, frame, 0, POINTS, len(records))
+    draw = ops.sample_indices(seed, ops.RandomStream.COVISIBILITY, frame, 0, POINTS, len(records))
     chosen = records[draw]
     u, v = (chosen[:, 0] & 0xFFFF).double(), (chosen[:, 0] >> 16).double()
     z = chosen[:, 1].contiguous().view(torch.float32).double()
@@ -136,14 +137,8 @@ def test_nothing_to_choose_from(device, generator):
 
 def test_same_rows_for_any_number_of_threads(generator):
     frames, records = make_frames(generator, 600), make_records(generator)
-    candidates, threads = torch.randperm(590, generator=generator), ops.get_num_threads()
-    rows = []
-    try:
-        for count in (1, 2, 3):
-            ops.set_num_threads(count)
-            rows.append(choose(frames, records, 599, candidates, "cpu").tolist())
-    finally:
-        ops.set_num_threads(threads)
+    candidates = torch.randperm(590, generator=generator)
+    rows = with_threads(lambda: choose(frames, records, 599, candidates, "cpu").tolist(), (1, 2, 3))
     assert rows[0] == rows[1] == rows[2]
 
 

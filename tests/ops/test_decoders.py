@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from spslam import ops
+from tests.ops.threads import assert_same_for_any_threads
 
 # (inputs, hidden, outputs): the two decoders, the prior's encoder, widths that fill no vector, and one that a block's
 # shared memory has no room for.
@@ -129,13 +130,7 @@ def test_nan_passes_through(device):
 def test_gradients_do_not_depend_on_the_number_of_threads():
     x = torch.randn(20_011, 11)
     params = torch.randn(ops.mlp_num_params(11, 32, 1), requires_grad=True)
-    threads = torch.ops.spslam.get_num_threads()
-    results = []
-    for count in (1, 2, 3):
-        torch.ops.spslam.set_num_threads(count)
-        results.append(torch.autograd.grad(ops.mlp(x, params, 32, 1).square().sum(), params)[0])
-    torch.ops.spslam.set_num_threads(threads)
-    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+    assert_same_for_any_threads(lambda: torch.autograd.grad(ops.mlp(x, params, 32, 1).square().sum(), params))
 
 
 @pytest.mark.parametrize(

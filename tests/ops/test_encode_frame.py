@@ -176,14 +176,14 @@ def test_points_far_apart_have_all_their_vertices_to_themselves(device, generato
 
 def test_points_that_are_not_finite_or_too_far_are_skipped(device, generator):
     params, (points, normals) = random_encoder(generator), wall(100, generator)
-    spoilt = points.clone()
-    spoilt[:4, 1] = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e9])
+    corrupted = points.clone()
+    corrupted[:4, 1] = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e9])
     volume, want = SparseVolume(0.04, device=device), SparseVolume(0.04, device=device)
-    encoded = encode(volume, spoilt, normals, params)
+    encoded = encode(volume, corrupted, normals, params)
     normals[:4] = 0
     encode(want, points, normals, params)
     check_same(volume, want, 0.0)
-    assert torch.equal(encoded.bounds, torch.stack([spoilt[3:].amin(0), spoilt[3:].amax(0)]))
+    assert torch.equal(encoded.bounds, torch.stack([corrupted[3:].amin(0), corrupted[3:].amax(0)]))
     nothing = encode(volume, torch.full((5, 3), torch.nan), torch.ones(5, 3), params)
     assert nothing.new_voxels == 0
     assert (nothing.bounds[0] == torch.inf).all()

@@ -136,7 +136,7 @@ class OpsDataset(torch.utils.data.Dataset):
 
     def __getitem__(self, index: int) -> torch.Tensor:
         assert call_ops()
-        return ops.sample_indices(0, ops.Stream.EVALUATION, index, 0, POINTS, 100)
+        return ops.sample_indices(0, ops.RandomStream.EVALUATION, index, 0, POINTS, 100)
 
 
 def test_workers_of_a_data_loader():
@@ -144,5 +144,5 @@ def test_workers_of_a_data_loader():
     loader = torch.utils.data.DataLoader(
         OpsDataset(), batch_size=None, num_workers=2, timeout=LIMIT_S, multiprocessing_context="fork"
     )
-    own = [ops.sample_indices(0, ops.Stream.EVALUATION, index, 0, POINTS, 100) for index in range(8)]
+    own = [ops.sample_indices(0, ops.RandomStream.EVALUATION, index, 0, POINTS, 100) for index in range(8)]
     assert all(torch.equal(a, b) for a, b in zip(loader, own, strict=True))

@@ -1,6 +1,8 @@
 """Gauss-Newton tracking: normal equations against autograd, recovery of a known pose, determinism."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 
 from spslam import ops
 from spslam.geometry import constant_speed, pose7_to_matrix, rotation_angle
+from spslam.ops.gauss_newton import _SCALARS
 from tests.ops.arguments import opcheck
 from tests.ops.scenes import INTRINSICS, TRUNCATION, corner_pixels, make_scene
 from tests.ops.tracking_scene import OPTIONS, POSE, moved_pose, pose7, surface_equations
@@ -55,7 +58,7 @@ FLOAT32_SUMS, TF32_SUMS = 1e-4, 5e-3  # of the largest
 @pytest.mark.parametrize("tf32", [False, True])
 @pytest.mark.parametrize("num_pixels", [50, 1024, 1100, 5000])
 def test_devices_agree(device, generator, tf32, num_pixels):
-    """Whole and part tiles, one a warp and several."""
+    """Whole and part tiles, one per warp and several."""
     scene = make_scene(generator, random_decoder=False, device=device)
     records, start = corner_pixels(POSE, generator), pose7(moved_pose(POSE, 0.01, 0.02))
     options = replace(OPTIONS, num_pixels=num_pixels)
@@ -168,3 +171,11 @@ def test_opcheck(device, generator):
     opcheck(torch.ops.spslam.predict_pose.default, (pose, pose), device)
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)
     opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments), device)
+
+
+HEADER = Path(__file__).parents[2] / "csrc/include/spslam/gauss_newton.h"
+
+
+@pytest.mark.skipif(not HEADER.exists(), reason="the tests stand without the sources")
+def test_python_and_cpp_list_the_same_scalars_in_the_same_order():
+    assert re.findall(r"  FIELD\(\w+, (\w+)\)", HEADER.read_text()) == list(_SCALARS)

@@ -5,6 +5,7 @@ import torch
 
 from spslam import ops
 from tests import reference
+from tests.ops.threads import assert_same_for_any_threads
 
 CELL = 0.04
 LAYOUT = [0, -3, 2, 7, 5, 35, -3, -1, 7, 4, 63, 2, -1, 5, 4]
@@ -151,16 +152,9 @@ def test_non_contiguous(name, device, generator):
 def test_same_bits_for_any_number_of_threads(name, channels, device, generator):
     arguments, differentiable = _arguments(name, device, torch.float32, generator, points=20_000, channels=channels)
     weight = torch.randn(20_000, channels, generator=generator).to(device)
-    threads = ops.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 7):
-            ops.set_num_threads(count)
-            results.append(_value_and_gradients(getattr(ops, name), arguments, differentiable, weight))
-    finally:
-        ops.set_num_threads(threads)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    assert_same_for_any_threads(
+        lambda: _value_and_gradients(getattr(ops, name), arguments, differentiable, weight), (1, 2, 7)
+    )
 
 
 def test_many_points_in_few_rows_and_few_points_in_many_rows(device, generator):

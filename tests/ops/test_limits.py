@@ -194,7 +194,7 @@ def bad_layouts(layout):
 
 @pytest.mark.parametrize("name", ["query_color", "query_sdf", "render_step", "track_adam", "optimize_map_"])
 def test_planes_of_a_scene_stay_within_their_texels(name, device, generator):
-    """A file may say anything: see `spslam.scene.tensor_file`."""
+    """A file may say anything: see `spslam.tensor_file`."""
     call = arguments(name, generator, device)
     for layout in bad_layouts(call["scene"].plane_layout):
         with pytest.raises(ValueError, match=f"{name}: plane_layout must "):
@@ -223,7 +223,7 @@ def test_sizes_without_memory_do_no_harm():
         )
     with pytest.raises(RuntimeError, match=r"hidden must be in \[1, 2\^30\], got"):
         op.mlp(torch.zeros(4, 2), torch.zeros(5), 2**32, 1, 0)
-    with pytest.raises(RuntimeError, match="must have 2 to 1025 samples an axis"):
+    with pytest.raises(RuntimeError, match="must have 2 to 1025 samples per axis"):
         op.marching_cubes(torch.zeros(0, 3, dtype=torch.int32), torch.zeros(0, 2**20, 2**20, 2**20), 0.0)
     with pytest.raises(RuntimeError, match=r"frames must be in \[0, 2\^30\]"):
         op.normal_equations(torch.zeros(2**61, 0), torch.zeros(2**61, 0, 6), torch.zeros(2**61, 0))

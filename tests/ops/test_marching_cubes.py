@@ -9,13 +9,14 @@ from scipy.spatial import cKDTree
 from skimage import measure
 
 from spslam import ops
+from tests.ops.threads import assert_same_for_any_threads
 
 # A vertex is interpolated in float32 from values near 1, on edges of one sample step.
 POSITION_TOLERANCE = 1e-4
 
 
 def _cells(field: np.ndarray, n: int, device="cpu"):
-    """Cuts a dense field, n * cells + 1 samples an axis, into cells that repeat the samples they share."""
+    """Cuts a dense field, n * cells + 1 samples per axis, into cells that repeat the samples they share."""
     counts = [(size - 1) // n for size in field.shape]
     coords = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(-1, 3)
     i = coords[:, :, None] * n + np.arange(n + 1)
@@ -181,13 +182,7 @@ def test_far_and_negative_cells(device):
 
 def test_does_not_depend_on_threads():
     coords, values = _cells(_noise(41), 4)
-    threads = torch.ops.spslam.get_num_threads()
-    results = []
-    for count in (1, 4):
-        torch.ops.spslam.set_num_threads(count)
-        results.append(ops.marching_cubes(coords, values))
-    torch.ops.spslam.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    assert_same_for_any_threads(lambda: ops.marching_cubes(coords, values), (1, 4))
 
 
 def test_same_on_every_device(device):
@@ -221,7 +216,7 @@ def test_non_contiguous(device):
         (torch.zeros(1, 3).int(), torch.zeros(1, 2, 2, 2).double(), TypeError, "values must be float32, got float64"),
         (torch.zeros(1, 3).int(), torch.zeros(1, 2, 3, 2), ValueError, r"values must have shape \[1, 2, 2, 2\], got "),
         (torch.zeros(1, 3).int(), torch.zeros(8), ValueError, r"values must have shape \[M, n \+ 1, .*\], got \[8\]"),
-        (torch.zeros(1, 3).int(), torch.zeros(1, 1, 1, 1), ValueError, "at least 2 samples an axis, got 1"),
+        (torch.zeros(1, 3).int(), torch.zeros(1, 1, 1, 1), ValueError, "at least 2 samples per axis, got 1"),
         (torch.tensor([[0, 2**20, 7]]).int(), torch.zeros(1, 2, 2, 2), ValueError, "2.20 - 1], got 0 to 1048576"),
         (torch.tensor([[0, 0, -(2**20) - 1]]).int(), torch.zeros(1, 2, 2, 2), ValueError, "got -1048577 to 0"),
         (torch.zeros(2, 3).int(), torch.zeros(2, 2, 2, 2), ValueError, "must be distinct, got a row more than once"),

@@ -8,6 +8,7 @@ import torch
 from spslam import ops
 from tests.ops.mapping_scene import RATES, RENDER_OPTIONS, Map
 from tests.ops.scenes import INTRINSICS
+from tests.ops.threads import with_threads
 
 # The first iteration is the same arithmetic; the compiler may fuse its products and sums otherwise.
 FIRST_TOLERANCE = dict(rtol=1e-5, atol=1e-6)
@@ -146,15 +147,12 @@ def test_on_a_side_stream(options):
 
 
 def test_same_bits_for_any_number_of_threads():
-    threads, runs = ops.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            ops.set_num_threads(count)
-            runs.append(Map(torch.device("cpu")))
-            runs[-1].optimize(RENDER_OPTIONS, 2)
-    finally:
-        ops.set_num_threads(threads)
-    assert_equal(*runs)
+    def optimized():
+        mapped = Map(torch.device("cpu"))
+        mapped.optimize(RENDER_OPTIONS, 2)
+        return mapped
+
+    assert_equal(*with_threads(optimized, (1, 3)))
 
 
 def test_opcheck(device, options):

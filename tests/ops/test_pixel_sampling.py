@@ -18,7 +18,7 @@ SAMPLING = ops.PixelSampling(
 )
 # Float32 points within some meters.
 POINT_TOLERANCE_M = 2e-6
-KEY = (2**33 + 5, ops.Stream.PIXEL_DATABASE, 17)
+KEY = (2**33 + 5, ops.RandomStream.PIXEL_DATABASE, 17)
 
 
 def frame(generator, height=50, width=70, noise=0.004):
@@ -185,7 +185,7 @@ def test_wrong_arguments_are_named(generator):
         ({"thumbnail_step": 0}, r"thumbnail_step must be in \[1, 65535\], got 0"),
         ({"fx": 0.0}, "fx must be positive, got 0.0"),
         ({"color": color[1:]}, r"color must have shape \[50, 70, 3\], got \[49, 70, 3\]"),
-        ({"depth": torch.zeros(1, 70_000), "color": color}, r"depth must fit 16 bits a side, got \(1, 70000\)"),
+        ({"depth": torch.zeros(1, 70_000), "color": color}, r"depth must fit 16 bits per side, got \(1, 70000\)"),
     ):
         with pytest.raises(ValueError, match=f"sample_frame_pixels: {message}"):
             sample(**change)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from spslam import ops
+from tests.ops.threads import assert_same_for_any_threads
 from tests.reference import prior_fusion as reference
 
 VOXEL = 0.04
@@ -127,16 +128,7 @@ def test_encoding_is_sorted_and_the_same_for_any_order_of_points_up_to_rounding(
 def test_encoding_does_not_depend_on_the_number_of_threads(generator):
     params = random_encoder(generator)
     points, normals = surface(30_000, generator, extent=4.0)
-    threads = torch.ops.spslam.get_num_threads()
-    try:
-        results = []
-        for count in (1, 2, 5):
-            torch.ops.spslam.set_num_threads(count)
-            results.append(ops.encode_points(points, normals, params, VOXEL))
-    finally:
-        torch.ops.spslam.set_num_threads(threads)
-    for result in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], result, strict=True))
+    assert_same_for_any_threads(lambda: ops.encode_points(points, normals, params, VOXEL), (1, 2, 5))
 
 
 def test_points_beyond_the_range_of_coordinates_are_skipped(device, generator):

@@ -7,6 +7,7 @@ import torch
 from spslam import ops
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
 from tests.ops.arguments import opcheck
+from tests.ops.threads import with_threads
 from tests.reference.projective_icp import icp
 
 WIDTH, HEIGHT = 64, 48
@@ -106,15 +107,13 @@ def test_holes_and_strangers_take_no_part(device):
 
 def test_same_bits_every_time(device):
     points, vertices, normals, _ = problem(0.05, 4.0, device)
-    first = ops.projective_icp(points, vertices, normals, START.to(device), INTRINSICS, **OPTIONS)
-    threads = ops.get_num_threads()
-    try:
-        for count in (1, 2, 3, 4):
-            ops.set_num_threads(count)
-            again = ops.projective_icp(points, vertices, normals, START.to(device), INTRINSICS, **OPTIONS)
-            assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    finally:
-        ops.set_num_threads(threads)
+    start = START.to(device)
+    first = ops.projective_icp(points, vertices, normals, start, INTRINSICS, **OPTIONS)
+    repeated = with_threads(
+        lambda: ops.projective_icp(points, vertices, normals, start, INTRINSICS, **OPTIONS), (1, 2, 3, 4)
+    )
+    for again in repeated:
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
 def test_strided_input(device):

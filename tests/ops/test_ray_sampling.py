@@ -10,7 +10,7 @@ from tests.reference import philox4x32
 from tests.reference.ray_sampling import philox_words
 
 PAPER = dict(num_uniform=32, num_surface=11, near=0.2, far=1.02, truncation=0.08)
-KEY = dict(seed=2**35 + 5, stream=ops.Stream.MAPPING_RAYS, frame=7, iteration=3)
+KEY = dict(seed=2**35 + 5, stream=ops.RandomStream.MAPPING_RAYS, frame=7, iteration=3)
 OPCHECKS = ("test_schema", "test_autograd_registration", "test_faketensor", "test_aot_dispatch_dynamic")
 
 
@@ -20,13 +20,13 @@ def test_reference_reproduces_the_published_vector():
 
 
 def test_uniform_is_the_high_bits_of_philox(device):
-    got = ops.philox_uniform(2**40 + 7, ops.Stream.TRACKING_RAYS, 3, 11, 5000, device).cpu()
+    got = ops.philox_uniform(2**40 + 7, ops.RandomStream.TRACKING_RAYS, 3, 11, 5000, device).cpu()
     want = (philox_words(2**40 + 7, 2, 3, 11, 5000) >> 8).astype(np.float32) / np.float32(2**24)
     assert torch.equal(got, torch.from_numpy(want))
 
 
 def test_indices_cover_the_range_evenly(device):
-    got = ops.sample_indices(1, ops.Stream.PIXEL_DATABASE, 0, 0, 100_000, 7, device).cpu()
+    got = ops.sample_indices(1, ops.RandomStream.PIXEL_DATABASE, 0, 0, 100_000, 7, device).cpu()
     want = (philox_words(1, 0, 0, 0, 100_000).astype(np.uint64) * np.uint64(7)) >> np.uint64(32)
     assert torch.equal(got, torch.from_numpy(want.astype(np.int64)))
     assert (torch.bincount(got, minlength=7) - 100_000 / 7).abs().max() < 600

@@ -10,6 +10,7 @@ from spslam import ops
 from spslam.geometry import matrix_to_pose7, quaternion_to_matrix
 from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, make_scene
 from tests.ops.step_inputs import gradient_buffers, noisy_rays
+from tests.ops.threads import assert_same_for_any_threads
 from tests.reference.render_step import PARAMETERS, render_step
 
 GRADIENTS = dict(
@@ -191,18 +192,13 @@ def test_gradients_of_tables_are_added(device, options, generator):
 def test_same_bits_for_any_number_of_threads(generator):
     scene = make_scene(generator, random_decoder=True)
     rays = noisy_rays(generator, counts=(1500, 900, 41))
-    threads = torch.ops.spslam.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 3):
-            torch.ops.spslam.set_num_threads(count)
-            gradients = gradient_buffers(scene)
-            losses, found = _step(scene, rays, OPTIONS, gradients)
-            results.append([losses, *found.values(), gradients.embedding_stamps, gradients.texel_stamps])
-    finally:
-        torch.ops.spslam.set_num_threads(threads)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+    def step():
+        gradients = gradient_buffers(scene)
+        losses, found = _step(scene, rays, OPTIONS, gradients)
+        return [losses, *found.values(), gradients.embedding_stamps, gradients.texel_stamps]
+
+    assert_same_for_any_threads(step)
 
 
 def test_same_bits_from_run_to_run(device, options, generator):

@@ -63,7 +63,7 @@ def test_sdf_and_gradient(device, generator):
     assert 0.1 < want_valid.float().mean() < 0.9
     assert torch.equal(valid, want_valid)
     assert torch.allclose(sdf.double(), want, atol=ATOL)
-    assert torch.allclose(gradient.double(), exact.grad, atol=50 * ATOL)  # the gradient is in 1/m: 25 voxels a meter
+    assert torch.allclose(gradient.double(), exact.grad, atol=50 * ATOL)  # the gradient is in 1/m: 25 voxels per meter
     assert torch.equal(ops.query_sdf(on_device, points.to(device))[0].cpu(), sdf)
 
 

@@ -10,7 +10,9 @@ from spslam import ops
 from spslam.geometry import matrix_to_pose7
 from tests.ops.scenes import INTRINSICS, OPTIONS, POSES, corner_pixels, make_scene
 
-RENDER_OPTIONS = replace(OPTIONS, cosine_targets=False, seed=77, stream=ops.Stream.TRACKING_RAYS, frame=9, iteration=0)
+RENDER_OPTIONS = replace(
+    OPTIONS, cosine_targets=False, seed=77, stream=ops.RandomStream.TRACKING_RAYS, frame=9, iteration=0
+)
 NUM_PIXELS, ITERATIONS = 200, 6
 RATES = dict(rotation_rate=1e-3, translation_rate=2e-3)
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
@@ -62,7 +64,7 @@ def loop(problem, options, iterations=ITERATIONS):
     best, best_pose, losses = np.inf, start.clone(), []
     slots = torch.zeros(NUM_PIXELS, dtype=torch.int32, device=device)
     for i in range(iterations):
-        stream = ops.Stream.TRACKING_PIXELS
+        stream = ops.RandomStream.TRACKING_PIXELS
         draw = ops.sample_indices(options.seed, stream, options.frame, i, NUM_PIXELS, len(records), device)
         rays = ops.RayBatch(records[draw], slots, pose, INTRINSICS)
         step = ops.render_step(scene, rays, replace(options, iteration=i))

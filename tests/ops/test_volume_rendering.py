@@ -5,6 +5,7 @@ import torch
 
 from spslam import ops
 from tests import reference
+from tests.ops.threads import assert_same_for_any_threads
 
 TRUNCATION = 0.08
 DTYPES = [torch.float32, torch.float64]
@@ -225,16 +226,9 @@ def test_non_contiguous(name, device, generator):
 @each_op
 def test_same_bits_for_any_number_of_threads(name, device, generator):
     arguments, differentiable = CASES[name](generator, torch.float32, device, rays=3000)
-    threads = ops.get_num_threads()
-    results = []
-    try:
-        for count in (1, 2, 7):
-            ops.set_num_threads(count)
-            results.append(_values_and_gradients(getattr(ops, name), arguments, differentiable, generator))
-    finally:
-        ops.set_num_threads(threads)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    assert_same_for_any_threads(
+        lambda: _values_and_gradients(getattr(ops, name), arguments, differentiable, generator), (1, 2, 7)
+    )
 
 
 def test_nan_is_seen(device, generator):

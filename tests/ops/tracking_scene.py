@@ -18,7 +18,7 @@ OPTIONS = ops.GaussNewtonOptions(
     kernel_end=0.02,
     damping=1e-4,
     seed=3,
-    stream=ops.Stream.TRACKING_PIXELS,
+    stream=ops.RandomStream.TRACKING_PIXELS,
     frame=4,
 )
 # A single undamped step, whose kernel and pixels are known.

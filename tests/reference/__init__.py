@@ -1,4 +1,4 @@
-"""Independent formulas in plain torch and NumPy that the kernels are tested against: one module a family."""
+"""Independent formulas in plain torch and NumPy that the kernels are tested against: one module per family."""
 
 from tests.reference import interpolation, ray_sampling, volume_rendering
 from tests.reference.ray_sampling import philox4x32

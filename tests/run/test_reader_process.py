@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from spslam.errors import SpslamError
-from spslam.run import reader_launch
+from spslam.run import frame_feed, reader_launch
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.reader_launch import end_standby, has_standby, launch_standby
 from spslam.run.reader_process import ReaderProcess
@@ -29,8 +29,8 @@ PATIENCE_S = 60
 ROOT = Path(__file__).parents[2]
 
 
-def feed_of(dataset: Recorded) -> FrameFeed:
-    return FrameFeed(dataset, settings("run.reader=process", "run.prefetch_workers=1", "run.prefetch_ahead=2"), CPU)
+def feed_of(dataset: Recorded, reader: str = "process") -> FrameFeed:
+    return FrameFeed(dataset, settings(f"run.reader={reader}", "run.prefetch_workers=1", "run.prefetch_ahead=2"), CPU)
 
 
 def fail(frame):
@@ -56,13 +56,11 @@ def test_starting_the_process_does_not_import_torch():
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=PATIENCE_S)
 
 
-def test_data_set_that_cannot_be_pickled_is_read_by_threads():
-    with feed_of(Recorded(FRAMES, lambda frame: None)) as feed:
-        assert not isinstance(feed.prepare(), ReaderProcess)
-        assert [frame.index for frame in feed] == list(range(FRAMES))
+def not_pickled(monkeypatch):
+    return Recorded(FRAMES, lambda frame: None)
 
 
-def test_data_set_that_cannot_be_imported_is_read_by_threads(monkeypatch):
+def not_imported(monkeypatch):
     class Stranger(Recorded):
         pass
 
@@ -70,9 +68,39 @@ def test_data_set_that_cannot_be_imported_is_read_by_threads(monkeypatch):
     module = types.ModuleType("spslam_nowhere")
     module.Stranger = Stranger
     monkeypatch.setitem(sys.modules, "spslam_nowhere", module)
-    with feed_of(Stranger(FRAMES)) as feed:
+    return Stranger(FRAMES)
+
+
+def not_started(monkeypatch):
+    def fail_to_fork(*_, **__):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(reader_launch.subprocess, "Popen", fail_to_fork)
+    return Recorded(FRAMES)
+
+
+UNAVAILABLE = {
+    not_pickled: "recorded can't be pickled (",
+    not_imported: "spslam_nowhere.Stranger can't be imported by another process",
+    not_started: "the process can't be started ([Errno 11] Resource temporarily unavailable)",
+}
+
+
+@pytest.mark.parametrize("make", UNAVAILABLE)
+def test_auto_falls_back_to_threads(monkeypatch, make):
+    monkeypatch.setattr(frame_feed, "uses_process", lambda reader, device: reader == "auto")
+    with feed_of(make(monkeypatch), "auto") as feed:
         assert not isinstance(feed.prepare(), ReaderProcess)
         assert [frame.index for frame in feed] == list(range(FRAMES))
+
+
+@pytest.mark.parametrize(("make", "reason"), UNAVAILABLE.items())
+def test_a_process_that_was_asked_for_and_cannot_read_is_an_error(monkeypatch, make, reason):
+    with pytest.raises(SpslamError) as caught, feed_of(make(monkeypatch)) as feed:
+        feed.prepare()
+    message = str(caught.value)
+    assert message.startswith(f"run.reader=process can't be used: {reason}")
+    assert message.endswith("; run.reader=threads uses no separate process") and "\n" not in message
 
 
 def test_standby_reader_is_used_once():
@@ -116,7 +144,7 @@ class LateEvent(HostEvent):
 def test_slots_are_freed_when_their_uploads_are_complete(can_lock, notes):
     dataset, config, uploader = Recorded(FRAMES), settings(), LateUploader(can_lock)
     reader = ReaderProcess.start(dataset, config, start=0, workers=1, ahead=4, uploader=uploader)
-    assert reader.is_ready()
+    reader.wait_until_ready()
     frames = list(reader)
     assert [frame.index for frame in frames] == list(range(FRAMES))
     for frame in frames:
@@ -138,7 +166,7 @@ def test_no_standby_reader_where_the_run_uses_threads(options):
     assert not has_standby()
 
 
-def test_exception_in_a_data_set_keeps_its_traceback():
+def test_exception_in_a_dataset_keeps_its_traceback():
     with feed_of(Recorded(FRAMES, fail)) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
         next(feed)
 

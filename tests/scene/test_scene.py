@@ -203,7 +203,7 @@ def test_seeds_that_are_none_are_refused(scene, tmp_path, seed):
     [
         ("[" * 5000, "it is nested too deep"),
         ('{"format": ' + "9" * 5000 + "}", "a whole number must have at most 20 digits, got 5000"),
-        ("[]", "must hold an object with named values, got list"),
+        ("[]", "must contain an object with named values, got list"),
     ],
 )
 def test_a_header_that_is_none_is_one_line(scene, tmp_path, header, message):

@@ -140,9 +140,9 @@ def test_fewer_moments_than_texels_are_refused(load):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda header: header.pop("source"), "source must hold data, next and clock"),
-        (lambda header: header["source"].pop("data"), "source must hold data, next and clock"),
-        (lambda header: header["source"].update(clock=[]), "source must hold data, next and clock"),
+        (lambda header: header.pop("source"), "source must contain data, next and clock"),
+        (lambda header: header["source"].pop("data"), "source must contain data, next and clock"),
+        (lambda header: header["source"].update(clock=[]), "source must contain data, next and clock"),
         (lambda header: header["source"].update(next=1), "next must be a whole number from 2 to"),
         (lambda header: header["source"].update(next="2"), "next must be a whole number from 2 to .*, got '2'"),
         (lambda header: header["source"].update(next=6), "frames must be a whole number from 6 to .*, got 5"),

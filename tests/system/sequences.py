@@ -60,7 +60,7 @@ def settings(*overrides: str, preset: str | None = None) -> Config:
 
 
 def run_on(monkeypatch, dataset: RgbdDataset, output: Path, *overrides: str, **arguments) -> dict:
-    """`run_sequence` over a data set made by a test; returns the metrics."""
+    """`run_sequence` over a dataset made by a test; returns the metrics."""
     config = settings(*overrides, preset=arguments.pop("preset", None))
     monkeypatch.setattr(registry, "open_dataset", lambda *_: dataset)
     progress = arguments.pop("progress", None)

@@ -88,7 +88,7 @@ def test_poses_need_not_be_known(monkeypatch, tmp_path):
     np.testing.assert_array_equal(first, np.eye(4))
 
 
-def test_the_first_pose_is_the_data_sets_or_the_identity(monkeypatch, tmp_path):
+def test_the_first_pose_is_the_datasets_or_the_identity(monkeypatch, tmp_path):
     dataset = Recorded(3)
     for first_pose, expected in (("dataset", dataset.poses()[0]), ("identity", np.eye(4))):
         output = tmp_path / first_pose

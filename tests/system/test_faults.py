@@ -53,7 +53,7 @@ def test_faults_in_recordings(name, preset):
 
 
 class Edited(RgbdDataset):
-    """The generated room's frames in an order of the test's own, some spoilt; they keep the times of a camera."""
+    """The generated room's frames in an order of the test's own, some corrupted; they keep the times of a camera."""
 
     name = "edited"
 

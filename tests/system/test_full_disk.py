@@ -1,4 +1,4 @@
-"""A disk that is full at any output: one line names the file, nothing is half-written, and the run goes on later."""
+"""A disk that is full at any output: one line names the file, nothing is half-written, and the run can be continued."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""Whole runs on a GPU: as accurate as on the CPU, the same bytes each time, and the host waits once a frame."""
+"""Whole runs on a GPU: as accurate as on the CPU, the same bytes each time, and the host waits once per frame."""
 
 import warnings
 from collections.abc import Iterator

@@ -15,7 +15,7 @@ FAST_TURN_CM = 2.7
 
 @pytest.mark.slow
 def test_a_fast_turn_over_a_desk_keeps_its_place():
-    """fr1_rpy: up to 6 degrees a frame, from a desk at 1 m to a floor at 3 m. By depth alone the path is 7 cm off."""
+    """fr1_rpy: up to 6 degrees per frame, from a desk at 1 m to a floor at 3 m. By depth alone the path is 7 cm off."""
     config = load_config("tum", "balanced")
     dataset = open_dataset(config.dataset, shared_data("tum-fr1-rpy-60"))
     system = SlamSystem(config, dataset.camera, dataset.poses()[0])

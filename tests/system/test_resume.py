@@ -197,7 +197,9 @@ def interrupted(monkeypatch, tmp_path):
 
 
 def test_interrupted_run_is_not_overwritten(monkeypatch, interrupted):
-    with pytest.raises(OutputError, match="holds an interrupted run; go on with --resume, or use another --output"):
+    with pytest.raises(
+        OutputError, match="contains an interrupted run; continue it with --resume, or use another --output"
+    ):
         run_on(monkeypatch, Recorded(8), interrupted)
 
 

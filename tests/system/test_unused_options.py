@@ -24,7 +24,7 @@ SITUATIONS = {
     "no prior": ("paper", (*SMALL, "prior.enabled=false", "prior.decoder=random")),
     "surface samples, no color": ("balanced", (*SMALL, "sampling.uniform=0", "loss.rgb=0", "mapping.covisible=0")),
 }
-# What only the reading of data takes is told by the data set's type; weights are read wherever they are given.
+# What only the reading of data takes is told by the dataset's type; weights are read wherever they are given.
 NOT_TESTED_HERE = {path for path, _ in option_fields() if path.startswith("dataset.")} | {"prior.weights"}
 
 

@@ -118,7 +118,7 @@ py::object dispatch_floating(const Argument& argument, const py::object& object,
   refuse_type(argument, "be float32 or float64", dtype_name(py::reinterpret_borrow<py::array>(object)));
 }
 
-// Runs a kernel while other Python threads may go on.
+// Runs a kernel while other Python threads may run.
 template <class F>
 auto without_gil(const F& f) {
   py::gil_scoped_release release;

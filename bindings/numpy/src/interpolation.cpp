@@ -182,10 +182,11 @@ void define_interpolation(py::module_& m) {
         "Values [N, C] of an image [H, W, C] at uv [N, 2] in texels, u along W, clamped to the border.");
   m.def("bilinear_interpolate_backward", &bilinear_backward, py::arg("grad"), py::arg("texels"), py::arg("uv"),
         "Gradients of texels and uv from grad [N, C].");
-  m.def("tri_plane_interpolate", &tri_plane, py::arg("texels"), py::arg("points"), py::arg("cell_size"),
-        py::arg("layout"),
-        "Features [N, C] at points [N, 3] (m), summed over the xy, xz and yz planes; layout is five integers a plane: "
-        "first row of texels [P, C], origin u, origin v, size u, size v.");
+  m.def(
+      "tri_plane_interpolate", &tri_plane, py::arg("texels"), py::arg("points"), py::arg("cell_size"),
+      py::arg("layout"),
+      "Features [N, C] at points [N, 3] (m), summed over the xy, xz and yz planes; layout is five integers per plane: "
+      "first row of texels [P, C], origin u, origin v, size u, size v.");
   m.def("tri_plane_interpolate_backward", &tri_plane_backward, py::arg("grad"), py::arg("texels"), py::arg("points"),
         py::arg("cell_size"), py::arg("layout"), "Gradients of texels and points from grad [N, C].");
 }

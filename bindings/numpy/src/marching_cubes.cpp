@@ -12,8 +12,8 @@ py::tuple mesh(const py::object& cell_coords, const py::object& values, double l
   const Input<float> field({name, "values"}, values, {"M", "n + 1", "n + 1", "n + 1"});
   const std::int64_t count = field.size(0), side = field.size(1);
   const Input<float> cubic({name, "values"}, values, {count, side, side, side});
-  check(side >= 2, {name, "values"}, "have at least 2 samples an axis", side);
-  check(side <= 1025, {name, "values"}, "have at most 1025 samples an axis", side);
+  check(side >= 2, {name, "values"}, "have at least 2 samples per axis", side);
+  check(side <= 1025, {name, "values"}, "have at most 1025 samples per axis", side);
   const Input<std::int32_t> coords({name, "cell_coords"}, cell_coords, {count, 3});
   const MarchingCubesCells cells{coords.data(), field.data(), count, static_cast<int>(side - 1),
                                  static_cast<float>(level)};

@@ -10,7 +10,7 @@ from spslam import ops
 VOXEL = 0.04
 LAYOUT = [0, -3, 2, 7, 5, 35, -3, -1, 7, 4, 63, 2, -1, 5, 4]
 DTYPES = [np.float32, np.float64]
-KEY = (7, int(ops.Stream.MAPPING_RAYS), 3, 1)
+KEY = (7, int(ops.RandomStream.MAPPING_RAYS), 3, 1)
 
 
 @pytest.fixture(autouse=True)

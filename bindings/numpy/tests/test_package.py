@@ -79,12 +79,12 @@ def test_a_type_checker_sees_the_types(tmp_path):
 
 
 def test_enums_are_those_of_the_torch_ops():
-    for name in ("Activation", "Stream"):
+    for name in ("Activation", "RandomStream"):
         own, theirs = getattr(sn, name), getattr(ops, name)
         assert {member.name: member.value for member in own} == {member.name: member.value for member in theirs}
     x, params = np.ones((2, 3), np.float32), np.full(sn.mlp_num_params(3, 4, 1), 0.1, np.float32)
     assert np.array_equal(sn.mlp(x, params, 4, 1, sn.Activation.TANH), sn.mlp(x, params, 4, 1, 1))
-    assert len(sn.philox_uniform(0, sn.Stream.EVALUATION, 0, 0, 5)) == 5
+    assert len(sn.philox_uniform(0, sn.RandomStream.EVALUATION, 0, 0, 5)) == 5
 
 
 def test_the_hash_grows_as_that_of_torch():

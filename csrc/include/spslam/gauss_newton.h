@@ -41,19 +41,27 @@ struct DepthKeyframes {
   std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each keyframe
 };
 
+// The scalars of GaussNewtonOptions, type and name, in the order of the fields of ops.GaussNewtonOptions: a line here
+// and a field there are a new one, from Python down to the kernels.
+#define SPS_GAUSS_NEWTON_SCALARS(FIELD)                                                          \
+  FIELD(float, truncation)            /* m */                                                    \
+  FIELD(float, kernel_start)          /* m, width of the robust kernel at the first iteration */ \
+  FIELD(float, kernel_end)            /* m, at the last iterations */                            \
+  FIELD(double, damping)              /* relative Levenberg damping */                           \
+  FIELD(float, score_kernel)          /* m, of cost and mean weight; 0: the iteration's own */   \
+  FIELD(float, noise_crossover_depth) /* m, where noise that grows with z^2 equals the map's; 0: constant noise */
+#define SPS_DECLARE_FIELD(type, name) type name;
+
 struct GaussNewtonOptions {
   Intrinsics intrinsics;
   std::int64_t num_pixels, iterations;
-  float truncation;                // m
-  float kernel_start, kernel_end;  // m, width of the robust kernel at the first and the last iterations
-  float score_kernel;              // m, width of the kernel of cost and mean weight; 0: the iteration's own
-  double damping;
-  PhiloxKey key;                // its iteration is replaced by the running one
-  float noise_crossover_depth;  // m, where depth noise that grows with z^2 equals that of the map; 0: constant noise
-  bool tf32;  // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
+  SPS_GAUSS_NEWTON_SCALARS(SPS_DECLARE_FIELD)
+  PhiloxKey key;  // its iteration is replaced by the running one
+  bool tf32;      // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
   ReferenceImage reference;
   DepthKeyframes depth_keyframes;
 };
+#undef SPS_DECLARE_FIELD
 
 // next [7]: the pose after `before` [7] and `last` [7] at constant speed.
 template <class Device>

@@ -16,7 +16,7 @@ std::int64_t voxel_hash_workspace_bytes(Device device, std::int64_t n);
 
 struct AbsentVoxels {
   std::int64_t count;         // distinct coordinates that the table lacks
-  std::int64_t out_of_range;  // input rows outside 21 bits an axis
+  std::int64_t out_of_range;  // input rows outside 21 bits per axis
   std::int64_t empty_slots;   // of the table, counted up to `count` at least
 };
 

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spslam_numpy._enums import Activation as Activation
-from spslam_numpy._enums import Stream as Stream
 from spslam_numpy._hash_table import VoxelHash as VoxelHash
 from spslam_numpy._hash_table import VoxelLimitError as VoxelLimitError
 

@@ -11,7 +11,7 @@ class Activation(IntEnum):
     SIGMOID = 2
 
 
-class Stream(IntEnum):
+class RandomStream(IntEnum):
     """What a draw is for; draws of different streams are independent."""
 
     PIXEL_DATABASE = 0
