@@ -17,7 +17,6 @@ from spslam.benchmark.jobs import Job
 from spslam.benchmark.suites import GICP
 from spslam.datasets import open_dataset, open_sequence
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
 from spslam.evaluation.finished_run import NOVEL_VIEWS, surface_figures, view_figures
@@ -83,8 +82,8 @@ def _measure_spslam(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def _true_surface(dataset: RgbdDataset, mesh: str | None) -> Surface | None:
-    if isinstance(dataset, GeneratedDataset):
-        return dataset.room
+    if dataset.surface is not None:
+        return dataset.surface
     return None if mesh is None else TriangleSurface.load(Path(mesh))
 
 

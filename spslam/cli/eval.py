@@ -12,10 +12,18 @@ from spslam.config import load_config
 from spslam.errors import OutputError
 from spslam.run_folder import RunFolder
 
+# Given for --gt-mesh, the surface that the frames were rendered from.
+GENERATED = "generated"
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_folder(parser)
-    parser.add_argument("--gt-mesh", metavar="PLY", type=Path, help="ground-truth mesh, in the ground-truth world")
+    parser.add_argument(
+        "--gt-mesh",
+        metavar="PLY",
+        type=Path,
+        help=f"ground-truth mesh, in the ground-truth world; `{GENERATED}` is the exact surface of generated data",
+    )
     parser.add_argument("--views", action="store_true", help="PSNR and SSIM of the rendered map against the input")
     parser.add_argument("--scale", action="store_true", help="also compute ATE after alignment with scale")
 
@@ -44,9 +52,15 @@ def execute(args: argparse.Namespace) -> None:
 def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> dict[str, float]:
     from spslam.datasets import open_dataset
     from spslam.evaluation.finished_run import surface_figures, view_figures
-    from spslam.evaluation.surface import TriangleSurface
+    from spslam.evaluation.surface import Surface, TriangleSurface
 
-    ground_truth = None if gt_mesh is None else TriangleSurface.load(gt_mesh)
     dataset = open_dataset(load_config(require_run_file(run.folder.config)).dataset)
+    ground_truth: Surface | None
+    if str(gt_mesh) != GENERATED:
+        ground_truth = None if gt_mesh is None else TriangleSurface.load(gt_mesh)
+    elif dataset.surface is None:
+        raise OutputError(f"{run.folder.path}: --gt-mesh {GENERATED} needs a run over generated data")
+    else:
+        ground_truth = dataset.surface
     figures = {} if ground_truth is None else surface_figures(run, dataset, ground_truth)
     return {**figures, **view_figures(run, dataset)} if views else figures

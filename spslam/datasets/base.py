@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.datasets.solids import SolidScene
 from spslam.errors import DatasetError
 
 # Most frames of a sequence that one file tells of: almost five hours at 30 Hz.
@@ -70,6 +71,11 @@ class RgbdDataset(ABC):
     @abstractmethod
     def read(self, index: int) -> RgbdFrame:
         """Frame `index` as it is stored, converted to our units and axes; `dataset[i]` is what to call."""
+
+    @property
+    def surface(self) -> SolidScene | None:
+        """The exact surface of generated data, to evaluate meshes by; None where it is unknown."""
+        return None
 
     def describe(self, index: int) -> str:
         """What an error about frame `index` should name: its files where it has any."""
@@ -145,6 +151,10 @@ class Subset(RgbdDataset):
 
     def read(self, index: int) -> RgbdFrame:
         return replace(self._dataset.read(self._indices[index]), index=index)
+
+    @property
+    def surface(self) -> SolidScene | None:
+        return self._dataset.surface
 
     def describe(self, index: int) -> str:
         return self._dataset.describe(self._indices[index])

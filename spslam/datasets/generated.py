@@ -15,6 +15,7 @@ from spslam.datasets.base import MAX_FRAMES, RgbdDataset, RgbdFrame
 from spslam.datasets.depth_noise import kinect_depth
 from spslam.datasets.images import check_image_size
 from spslam.datasets.room import Room
+from spslam.datasets.solids import SolidScene
 from spslam.errors import DatasetError
 from spslam.geometry import pose_from
 
@@ -76,6 +77,10 @@ class GeneratedDataset(RgbdDataset):
 
     def poses(self) -> np.ndarray:
         return self._poses.copy()
+
+    @property
+    def surface(self) -> SolidScene:
+        return self.room
 
     def read(self, index: int) -> RgbdFrame:
         pose = self._poses[index]

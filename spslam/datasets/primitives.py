@@ -1,7 +1,8 @@
 """Boxes, spheres and cylinders: exact ray intersection, signed distance, normals and area-weighted sampling.
 
-World axes have z up. A ray is an origin [3] and directions [3,...] (structure of arrays); its parameter t is in units
-of the direction's length, so that directions with camera z = 1 give depth. Points are [N,3] in meters.
+World axes have z up. A ray is an origin [3], or origins [3,...] that broadcast with the directions, and directions
+[3,...] (structure of arrays); its parameter t is in units of the direction's length, so that directions with camera
+z = 1 give depth. Points are [N,3] in meters.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class Primitive(ABC):
 
     def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distances t [...], float32, at which rays from outside first meet the solid; infinite where they don't."""
-        enter, leave = self.local_interval(self.to_local(origin), self._directions_to_local(directions))
+        local_origin = np.moveaxis(self.to_local(np.moveaxis(origin, 0, -1)), -1, 0)
+        enter, leave = self.local_interval(local_origin, self._directions_to_local(directions))
         return np.where((enter < leave) & (enter > 0), enter, _NO_HIT).astype(np.float32, copy=False)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
@@ -222,9 +224,9 @@ def _box_distance(excess: np.ndarray) -> np.ndarray:
     return outside + np.minimum(excess.max(axis=1), 0)
 
 
-def _slab(origin: float, direction: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
+def _slab(origin: float | np.ndarray, direction: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
     inverse = 1 / direction
-    middle = -direction.dtype.type(origin) * inverse
+    middle = -np.asarray(origin, dtype=direction.dtype) * inverse
     half_length = direction.dtype.type(half) * np.abs(inverse)
     return middle - half_length, middle + half_length
 
@@ -233,8 +235,8 @@ def _round_interval(origin: np.ndarray, directions: np.ndarray, radius: float) -
     # In single precision the discriminant loses a millimeter at grazing rays.
     origin, directions = origin.astype(np.float64), directions.astype(np.float64)
     a = np.sum(directions * directions, axis=0)
-    half_b = np.tensordot(origin, directions, axes=1)
-    discriminant = half_b * half_b - a * (origin @ origin - radius * radius)
+    half_b = np.tensordot(origin, directions, axes=1) if origin.ndim == 1 else np.sum(origin * directions, axis=0)
+    discriminant = half_b * half_b - a * (np.sum(origin * origin, axis=0) - radius * radius)
     root = np.sqrt(np.maximum(discriminant, 0))
     missed = discriminant <= 0
     return np.where(missed, np.inf, (-half_b - root) / a), np.where(missed, -np.inf, (-half_b + root) / a)

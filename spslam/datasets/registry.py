@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from spslam.datasets.base import RgbdDataset, Subset
 from spslam.datasets.folder import open_folder
 from spslam.datasets.generated import GeneratedDataset
+from spslam.datasets.places import Capture, PlacesDataset
 from spslam.datasets.replica import open_replica
 from spslam.datasets.scannet import open_scannet
 from spslam.datasets.seven_scenes import SPLITS, list_sequences, open_seven_scenes
@@ -26,8 +28,9 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
         config: any object with the attribute `type` (one of `dataset_types()`) and, each optional or None: `path`,
             `stride` (every n-th frame), `min_depth_m`, `max_depth_m` (depth outside comes as 0), `border_px` (so does
             depth this close to the image's border), and the options of the kind: `sequence` (7scenes), `depth_variant`
-            (synthetic_rgbd), `depth_scale` (folder), `frames`, `width`, `height`, `noise`, `seed` (generated).
-        data_dir: the data's folder; overrides `config.path`. Not needed by `generated`.
+            (synthetic_rgbd), `depth_scale` (folder), `frames`, `width`, `height`, `noise`, `seed` (generated), and
+            the arguments of `PlacesDataset` and its `Capture` (places).
+        data_dir: the data's folder; overrides `config.path`. Not needed by `generated` and `places`.
 
     Raises:
         DatasetError: an unknown type, no folder given, or whatever is wrong with the data.
@@ -118,9 +121,13 @@ def _open_folder(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
 
 
 def _open_generated(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    names = ("frames", "width", "height", "noise", "seed")
-    options = {name: _option(config, name) for name in names}
-    return GeneratedDataset(**{name: value for name, value in options.items() if value is not None})
+    return GeneratedDataset(**_given(config, ("frames", "width", "height", "noise", "seed")))
+
+
+def _open_places(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+    capture = Capture(**_given(config, [field.name for field in fields(Capture)]))
+    names = ("place", "motion", "sensor", "frames", "seed", "texture")
+    return PlacesDataset(**_given(config, names), capture=capture)
 
 
 _OPENERS: dict[str, Callable[[Any, str | os.PathLike | None], RgbdDataset]] = {
@@ -131,7 +138,13 @@ _OPENERS: dict[str, Callable[[Any, str | os.PathLike | None], RgbdDataset]] = {
     "scannet": _open_scannet,
     "folder": _open_folder,
     "generated": _open_generated,
+    "places": _open_places,
 }
+
+
+def _given(config: Any, names: Sequence[str]) -> dict[str, Any]:
+    options = {name: _option(config, name) for name in names}
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _folder(config: Any, path: str | os.PathLike | None) -> Path:

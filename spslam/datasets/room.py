@@ -8,6 +8,7 @@ import trimesh
 from spslam.camera import Camera
 from spslam.datasets.furniture import ROOM_SIZE, Material, Piece, furnish, make_material
 from spslam.datasets.primitives import Box, Primitive
+from spslam.datasets.solids import SolidScene
 from spslam.geometry import inverse
 
 # The shell's faces, two an axis (low, high): walls, floor and ceiling with colors of their own.
@@ -23,19 +24,18 @@ _LIGHT = np.array([0.40, 0.29, 0.87])
 _AMBIENT, _DIRECT = 0.76, 0.24
 # How hard the pattern's edges are, and the share of the broad wave.
 _SHARPNESS, _BROAD = 3.0, 0.12
-# A sampled point this far inside another solid is hidden; double precision on coordinates of meters.
-_HIDDEN_M = 1e-9
 # The middles of a round surface's triangles lie this much under it at most.
 _SAGITTA_M = 5e-4
 
 
-class Room:
+class Room(SolidScene):
     """The room of a seed: 5 x 4 x 2.6 m, floor at z = 0, z up, with the furniture of `spslam.datasets.furniture`."""
 
     def __init__(self, seed: int = 0) -> None:
         generator = np.random.default_rng([seed, 2])
         self.pieces = furnish(seed)
-        self._shell = Box((0.0, 0.0, ROOM_SIZE[2] / 2), 0.0, ROOM_SIZE)
+        shell = Box((0.0, 0.0, ROOM_SIZE[2] / 2), 0.0, ROOM_SIZE)
+        super().__init__(shell, [piece.solid for piece in self.pieces])
         self._shell_materials = [make_material(generator, color, 0.2, 0.5) for color in _SHELL_COLORS]
 
     def render(self, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,41 +49,6 @@ class Room:
             depth, owner = self._cast(camera, pose, origin, directions)
         points = (directions * depth).reshape(3, -1).T + origin.astype(np.float32)
         return self._colors(points, owner.reshape(-1)).reshape(camera.height, camera.width, 3), depth
-
-    def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] in meters of points [N,3] to the nearest surface.
-
-        Positive and exact in free space; negative inside furniture and behind the walls, where it is the distance
-        to leave the solid the point is deepest in (a lower bound of the distance to free space).
-        """
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        distance = -self._shell.signed_distance(points)
-        for piece in self.pieces:
-            np.minimum(distance, piece.solid.signed_distance(points), out=distance)
-        return distance
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [N] of points [N,3] to the nearest surface; exact in free space, see `signed_distance`."""
-        return np.abs(self.signed_distance(points))
-
-    def sample_surface(self, count: int, seed: int = 0) -> np.ndarray:
-        """Points [count,3] spread evenly by area over the surfaces that face free space; float64, meters.
-
-        The same count and seed give the same points. `count` 0 gives an empty array.
-        """
-        generator = np.random.default_rng([seed, 3])
-        solids = [self._shell, *(piece.solid for piece in self.pieces)]
-        areas = np.array([solid.area for solid in solids])
-        kept: list[np.ndarray] = [np.zeros((0, 3))]
-        missing = count
-        while missing > 0:
-            # Some are hidden, so a few more are drawn than needed.
-            drawn = generator.multinomial(missing + missing // 2 + 16, areas / areas.sum())
-            points = np.concatenate([solid.sample(generator, n) for solid, n in zip(solids, drawn, strict=True)])
-            visible = points[~self._is_hidden(points, _HIDDEN_M)]
-            kept.append(generator.permutation(visible)[:missing])
-            missing -= len(kept[-1])
-        return np.concatenate(kept)
 
     def mesh(self, longest_edge_m: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The room's surface as triangles: vertices float64 [V,3], faces int64 [F,3], colors uint8 [V,3].
@@ -113,21 +78,6 @@ class Room:
         visible = triangles[~self._is_hidden(points[triangles].mean(axis=1), _SAGITTA_M)]
         used, renumbered = np.unique(visible, return_inverse=True)
         return points[used], renumbered.reshape(-1, 3)
-
-    def _is_hidden(self, points: np.ndarray, deeper_than: float) -> np.ndarray:
-        """Whether points [N,3] lie in furniture or behind a wall by more than a distance; bool [N]."""
-        hidden = self._shell.signed_distance(points) > deeper_than
-        if not len(points):
-            return hidden
-        lowest, highest = points.min(axis=0), points.max(axis=0)
-        for piece in self.pieces:
-            corners = piece.solid.corners()
-            low, high = corners.min(axis=0), corners.max(axis=0)
-            if np.any(highest < low) or np.any(lowest > high):
-                continue
-            near = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
-            hidden[near] |= piece.solid.signed_distance(points[near]) < -deeper_than
-        return hidden
 
     def _cast(
         self, camera: Camera, pose: np.ndarray, origin: np.ndarray, directions: np.ndarray

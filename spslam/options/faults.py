@@ -91,7 +91,9 @@ def _unknown(path: str) -> str:
     siblings = [option.rpartition(".")[2] for option in known if option.rpartition(".")[0] == section]
     near = [f"{section}.{name}".lstrip(".") for name in difflib.get_close_matches(key, siblings, n=1)]
     near = near or [option for option in known if option.rpartition(".")[2] == key]
-    near = near or difflib.get_close_matches(path, known, n=1, cutoff=0.8)
+    # A common section would make any two options alike.
+    elsewhere = [option for option in known if option.rpartition(".")[0] != section]
+    near = near or difflib.get_close_matches(path, elsewhere, n=1, cutoff=0.8)
     hint = f"did you mean {near[0]}?" if near else "docs/configuration.md lists them all"
     return f"{brief(path)} is not an option; {hint}"
 

@@ -7,18 +7,26 @@ from typing import Literal, get_args
 from spslam.options.needs import is_, is_not, need
 from spslam.options.section import Section, option
 
-DatasetType = Literal["generated", "7scenes", "tum", "replica", "synthetic_rgbd", "scannet", "folder"]
+DatasetType = Literal["generated", "places", "7scenes", "tum", "replica", "synthetic_rgbd", "scannet", "folder"]
 DATASET_TYPES: tuple[str, ...] = get_args(DatasetType)
 
 _GENERATED = need(is_("dataset.type", "generated"))
-_READ_FROM_FILES = need(is_not("dataset.type", "generated"))
+_PLACES = need(is_("dataset.type", "places"))
+_RENDERED = need(is_("dataset.type", "generated"), is_("dataset.type", "places"))
+_READ_FROM_FILES = (need(is_not("dataset.type", "generated")), need(is_not("dataset.type", "places")))
+PlaceName = Literal["room", "apartment", "stairwell", "arcade", "desk", "hall"]
+MotionName = Literal["handheld", "walking", "fast_turns", "stop_and_go"]
+SensorName = Literal["exact", "structured_light", "stereo", "time_of_flight", "phone_lidar"]
 
 
 class DatasetOptions(Section):
     """Which frames are read, and from where."""
 
-    type: DatasetType = option("format of the data; `generated` is a procedurally generated room that needs no files")
-    path: str | None = option("folder of the data; `--data` overrides it", needs=(_READ_FROM_FILES,))
+    type: DatasetType = option(
+        "format of the data; `generated` is a procedurally generated room and `places` are generated places with "
+        "sensors and motions to choose; neither needs files"
+    )
+    path: str | None = option("folder of the data; `--data` overrides it", needs=_READ_FROM_FILES)
     stride: int = option("use every n-th frame", "frames", ge=1)
     min_depth_m: float = option("smaller depth is treated as missing", "m", ge=0)
     max_depth_m: float = option("larger depth is treated as missing", "m", gt=0, le=1000)
@@ -38,14 +46,47 @@ class DatasetOptions(Section):
         gt=0,
     )
     frames: int = option(
-        "length of the sequence; 300 frames are one loop around the room", "frames", needs=(_GENERATED,), ge=1
+        "length of the sequence; the path is a loop (300 frames for `generated`), which is repeated as needed",
+        "frames",
+        needs=(_RENDERED,),
+        ge=1,
     )
-    width: int = option("width of the images", "px", needs=(_GENERATED,), ge=16)
-    height: int = option("height of the images", "px", needs=(_GENERATED,), ge=16)
+    width: int | None = option(
+        "width of the images; null is 320 for `generated`, the sensor's for `places`", "px", needs=(_RENDERED,), ge=16
+    )
+    height: int | None = option(
+        "height of the images; null is 240 for `generated`, the sensor's for `places`", "px", needs=(_RENDERED,), ge=16
+    )
     noise: float = option(
         "0 is exact depth and noise-free color, 1 the noise and missing depth of a Kinect", needs=(_GENERATED,), ge=0
     )
-    seed: int = option("seed of the room, the trajectory and the noise", needs=(_GENERATED,), ge=0)
+    seed: int = option("seed of the place, the trajectory and the noise", needs=(_RENDERED,), ge=0, lt=2**63)
+    place: PlaceName = option("the generated place", needs=(_PLACES,))
+    motion: MotionName = option("how the camera is carried", needs=(_PLACES,))
+    sensor: SensorName = option("the depth sensor, which also sets field of view and range", needs=(_PLACES,))
+    texture: float = option(
+        "contrast of all patterns and pictures; at 0 every surface has one plain color", needs=(_PLACES,), ge=0, le=1
+    )
+    rate_hz: float | None = option("frame rate; null is the sensor's", "Hz", needs=(_PLACES,), ge=1, le=120)
+    sensor_noise: float = option(
+        "scale of the sensor's errors: 0 is exact, 1 the sensor",
+        needs=(_PLACES, need(is_not("dataset.sensor", "exact"))),
+        ge=0,
+        le=100,
+    )
+    color_noise: float = option(
+        "standard deviation of color noise at middle gray, of 255 levels", "levels", needs=(_PLACES,), ge=0, le=255
+    )
+    exposure_ms: float = option(
+        "exposure of color images, which blurs with motion", "ms", needs=(_PLACES,), ge=0, le=1000
+    )
+    auto_exposure: bool = option("brightness follows the scene's, and what is too bright is clipped", needs=(_PLACES,))
+    rolling_shutter_ms: float = option(
+        "read-out time from the first row of an image to the last", "ms", needs=(_PLACES,), ge=0, le=1000
+    )
+    color_delay_ms: float = option(
+        "time from a frame's depth image to its color image", "ms", needs=(_PLACES,), ge=-1000, le=1000
+    )
 
     def check(self) -> None:
         if self.max_depth_m <= self.min_depth_m:

@@ -90,6 +90,8 @@ def test_eval_adds_metrics_of_the_mesh(finished, few_samples):
     assert "F1 at 5 cm" in result.stdout
     # Compared with itself, the mesh differs only by the alignment of estimated and ground-truth poses.
     assert json.loads((folder / "out" / "metrics.json").read_text())["f1_5cm"] > 99
+    exact = spslam("eval", "out", "--gt-mesh", "generated", cwd=folder)
+    assert "accuracy" in exact.stdout
     assert_refused(spslam("eval", "out", "--gt-mesh", "absent.ply", cwd=folder), "absent.ply: no such file")
 
 

@@ -85,8 +85,9 @@ def test_one_section_of_options_a_sequence(tmp_path):
 
 
 def test_errors():
-    assert dataset_types() == ["7scenes", "synthetic_rgbd", "tum", "replica", "scannet", "folder", "generated"]
-    with pytest.raises(DatasetError, match="dataset.type must be one of 7scenes, .*, generated, got kitti"):
+    files = ["7scenes", "synthetic_rgbd", "tum", "replica", "scannet", "folder"]
+    assert dataset_types() == [*files, "generated", "places"]
+    with pytest.raises(DatasetError, match="dataset.type must be one of 7scenes, .*, generated, places, got kitti"):
         open_dataset(SimpleNamespace(type="kitti"))
     with pytest.raises(DatasetError, match="dataset.path must name the folder of the tum data"):
         open_dataset(SimpleNamespace(type="tum"))
