@@ -47,8 +47,15 @@ def raise_key_error(folder):
     raise KeyError("data")
 
 
+class TwoLines(DatasetError):
+    """What `SpslamError` prevents."""
+
+    def __str__(self) -> str:
+        return "one\ntwo"
+
+
 def speak_in_lines(folder):
-    raise DatasetError("one\ntwo")
+    raise TwoLines
 
 
 def read_null(folder):
