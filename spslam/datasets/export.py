@@ -24,7 +24,7 @@ def export_folder(dataset: RgbdDataset, folder: str | os.PathLike) -> None:
 
     `spslam run folder --data FOLDER` reads it. Depth is rounded to 0.2 mm; beyond 13.1 m it is 0. Files: PNG images,
     `intrinsics.json`, `poses.txt` (16 numbers per frame, camera to world), `times.txt` (s; frames are read at 30 Hz),
-    `mesh.ply` of generated data.
+    `gt_mesh.ply` of generated data.
 
     Args:
         dataset: the frames.
@@ -48,7 +48,7 @@ def export_folder(dataset: RgbdDataset, folder: str | os.PathLike) -> None:
     if dataset.surface is not None:
         vertices, faces = dataset.surface.triangles()
         mesh = trimesh.Trimesh(vertices, faces, process=False)
-        atomic_write(folder / "mesh.ply", lambda path: mesh.export(path))
+        atomic_write(folder / "gt_mesh.ply", lambda path: mesh.export(path))
 
 
 def _write_frame(frame: RgbdFrame, folder: Path) -> None:

@@ -180,7 +180,7 @@ MATRICES, COMPRESSIONS = 12 + 15, 12 + 15 + 256
         (lambda content: changed(content, COMPRESSIONS, struct.pack("<2i", 2, 2)), "got 2 and 2"),
         (
             lambda content: changed(content, COMPRESSIONS + 8, bytes(4)),
-            "an image must have 1 to 33554432 pixels and at most 32768 along a side, got 0x24",
+            "an image must have 1 to 16777216 pixels and at most 32768 along a side, got 0x24",
         ),
         (
             lambda content: changed(content, COMPRESSIONS + 24, bytes(4)),

@@ -47,7 +47,7 @@ def raise_key_error(folder):
     raise KeyError("data")
 
 
-class TwoLines(DatasetError):
+class TwoLinesError(DatasetError):
     """What `SpslamError` prevents."""
 
     def __str__(self) -> str:
@@ -55,7 +55,7 @@ class TwoLines(DatasetError):
 
 
 def speak_in_lines(folder):
-    raise TwoLines
+    raise TwoLinesError
 
 
 def read_null(folder):

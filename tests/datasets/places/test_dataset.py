@@ -193,6 +193,6 @@ def test_exported_folder_is_read_back(tmp_path):
         np.testing.assert_array_equal(again[index].color, dataset[index].color)
         np.testing.assert_allclose(again[index].depth, dataset[index].depth, atol=1.1e-4)
     np.testing.assert_allclose(again.poses(), dataset.poses(), atol=1e-9)
-    assert (tmp_path / "desk" / "mesh.ply").stat().st_size > 1000
+    assert (tmp_path / "desk" / "gt_mesh.ply").stat().st_size > 1000
     assert len((tmp_path / "desk" / "times.txt").read_text().split()) == 3
     assert cv2.imread(str(tmp_path / "desk/depth/000000.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint16
