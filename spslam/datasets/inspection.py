@@ -9,6 +9,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.frozen_depth import FrameSignature, FrozenDepth
 from spslam.datasets.reprojection import (
     Agreement,
     DepthPair,
@@ -123,7 +124,13 @@ def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> 
         _depth_statistics(depths),
         poses,
     )
-    found.problems = [*_depth_problems(found), *_pose_problems(found, problem), *_time_problems(dataset.timestamps())]
+    frozen = _frozen_frames(dataset, indices[:: max(1, len(indices) // pairs)])
+    found.problems = [
+        *_depth_problems(found),
+        *_frozen_problems(frozen),
+        *_pose_problems(found, problem),
+        *_time_problems(dataset.timestamps()),
+    ]
     return found
 
 
@@ -135,6 +142,26 @@ def _read_depths(dataset: RgbdDataset, indices: np.ndarray) -> tuple[list[np.nda
         except DatasetError as error:
             unreadable.append(str(error))
     return depths, unreadable
+
+
+def _frozen_frames(dataset: RgbdDataset, indices: np.ndarray) -> list[int]:
+    """Frames behind the given ones whose depth image is that of the frame before, but not their color."""
+    frozen = []
+    for index in indices[indices + 1 < len(dataset)]:
+        check = FrozenDepth()
+        try:
+            if any([check.check(FrameSignature.of(dataset[int(i)])) for i in (index, index + 1)]):
+                frozen.append(int(index) + 1)
+        except DatasetError:
+            continue
+    return frozen
+
+
+def _frozen_problems(frozen: list[int]) -> list[str]:
+    if not frozen:
+        return []
+    listed = ", ".join(map(str, frozen[:5])) + (", ..." if len(frozen) > 5 else "")
+    return [f"depth is frozen: the same image as in the frame before, but another color image, in frame {listed}"]
 
 
 def _thinning(height: int, width: int) -> int:

@@ -10,6 +10,7 @@ import torch
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.frozen_depth import FROZEN, FrozenDepth, frozen_depth_before
 from spslam.datasets.prefetch import Prefetcher, prefetch
 from spslam.errors import DatasetError
 from spslam.run.reader_launch import has_standby
@@ -25,7 +26,8 @@ MIN_AHEAD = 8
 
 
 class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
-    """Iterates over the frames of a dataset in order; a frame that can't be read comes as its `DatasetError`.
+    """Iterates over the frames of a dataset in order; a frame that can't be read, or whose depth image is that of the
+    frame before while color goes on, comes as its `DatasetError`.
 
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
     another process do not compete with the frame loop for Python's GIL. If `run.reader` is `auto`, a dataset that no
@@ -45,6 +47,8 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
     def __init__(self, dataset: RgbdDataset, config: Config, device: torch.device, start: int = 0):
         self._record = event_recorder(device)
+        self._dataset, self._start = dataset, start
+        self._frozen_depth: FrozenDepth | None = None
         run = config.run
         workers = automatic_workers(device) if run.prefetch_workers is None else run.prefetch_workers
         ahead = max(2 * workers, MIN_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
@@ -76,9 +80,17 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         reader = self.prepare()
         requested, started = self._record(), time.perf_counter()
         item = next(reader)
-        if isinstance(item, PreparedFrame):
-            item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
+        if isinstance(item, DatasetError):
+            return item
+        if self._is_frozen(item):
+            return DatasetError(f"{self._dataset.describe(item.index)}: {FROZEN}")
+        item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
         return item
+
+    def _is_frozen(self, item: PreparedFrame) -> bool:
+        if self._frozen_depth is None:
+            self._frozen_depth = frozen_depth_before(self._dataset, self._start)
+        return item.signature is not None and self._frozen_depth.check(item.signature)
 
     @contextmanager
     def _fallback(self) -> Iterator[None]:

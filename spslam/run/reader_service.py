@@ -16,6 +16,7 @@ import torch
 from spslam import ops
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.frozen_depth import FrameSignature
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
 from spslam.slam.pixels import FramePixels
@@ -55,7 +56,7 @@ class Message:
     Attributes:
         read_ms: time that a reading thread spent on the frame.
         slot: slot that holds the frame's pixels; None where there is no frame.
-        index, timestamp, decode_ms: as in `PreparedFrame`.
+        index, timestamp, decode_ms, signature: as in `PreparedFrame`.
         valid_depth_share: as in `FramePixels`.
         error: of a frame that can't be read.
         failure: traceback of an exception that is not the data's fault; the process then ends.
@@ -67,6 +68,7 @@ class Message:
     timestamp: float = 0.0
     decode_ms: float = 0.0
     valid_depth_share: float = 0.0
+    signature: FrameSignature | None = None
     error: DatasetError | None = None
     failure: str | None = None
 
@@ -123,7 +125,7 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
                 continue
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
-            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
+            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, frame.signature)
             connection.send(Message(read_ms, slot, *described))
     connection.send(Message())
     # Stay until the loop closes the connection: it still returns slots.

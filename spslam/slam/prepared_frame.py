@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.frozen_depth import FrameSignature
 from spslam.slam.device_events import DeviceEvent
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.upload import Upload, Uploader
@@ -21,6 +22,7 @@ class PreparedFrame:
         decode_ms: reading, decoding and sampling, on the thread that did it.
         wait_ms: how long the host waited for the frame.
         requested: when it was requested; None where nobody kept the time.
+        signature: what tells frozen depth; None where nobody asks.
     """
 
     index: int
@@ -29,6 +31,7 @@ class PreparedFrame:
     decode_ms: float = 0.0
     wait_ms: float = 0.0
     requested: DeviceEvent | None = None
+    signature: FrameSignature | None = None
 
 
 class FramePreparation:
@@ -44,6 +47,7 @@ class FramePreparation:
         began = time.perf_counter()
         frame = self._dataset[i + self._start]
         pixels = sample_frame(frame, self._dataset.camera, self._config)
+        signature = FrameSignature.of(frame)
         decode_ms = 1e3 * (time.perf_counter() - began)
         sent = self._uploader.send(pixels) if self._uploader else pixels
-        return PreparedFrame(frame.index, frame.timestamp, sent, decode_ms)
+        return PreparedFrame(frame.index, frame.timestamp, sent, decode_ms, signature=signature)

@@ -69,6 +69,20 @@ def cast(pose):
     return np.min(np.where(directions != 0, walls, np.inf), axis=-1)
 
 
+def test_frozen_depth_is_reported():
+    room = BoxRoom()
+    read = room.read
+
+    def frozen(index):
+        frame = read(index)
+        frame.depth = read(20).depth if index > 20 else frame.depth
+        frame.color[:, : index + 1] = 255  # something moves
+        return frame
+
+    room.read = frozen
+    assert any(problem.startswith("depth is frozen: ") for problem in inspect_dataset(room).problems)
+
+
 def test_large_images_are_thinned_without_another_finding(monkeypatch):
     whole = inspect_dataset(BoxRoom())
     monkeypatch.setattr(inspection, "_MAX_PIXELS_KEPT", CAMERA.width * CAMERA.height // 4)

@@ -48,6 +48,25 @@ def test_unreadable_frame_is_skipped_and_counted(monkeypatch, tmp_path):
     assert metrics["ate_max_cm"] < 1.5
 
 
+def frozen_depth(*indices):
+    """The frames get the depth of frame `indices[0] - 1`, as from a stream that has frozen."""
+
+    def change(frame):
+        if frame.index in indices:
+            frame.depth[:] = Recorded(indices[0])[indices[0] - 1].depth
+
+    return change
+
+
+def test_frames_with_frozen_depth_are_skipped_and_named(monkeypatch, tmp_path):
+    dataset = Recorded(12, frozen_depth(5, 6, 7))
+    metrics = run_on(monkeypatch, dataset, tmp_path / "out")
+    assert (metrics["frames"], metrics["skipped_frames"], metrics["lost_frames"]) == (9, 3, 0)
+    assert metrics["ate_max_cm"] < 1.5
+    (first, *_) = (tmp_path / "out" / "skipped.jsonl").read_text().splitlines()
+    assert "frame 5: the depth image is the same as in the frame before" in first
+
+
 def test_no_readable_frame_is_one_line(monkeypatch, tmp_path):
     with pytest.raises(DatasetError, match="no frame can be read; the first: frame-000000.color.png: can't be read"):
         run_on(monkeypatch, Recorded(3, unreadable(0, 1, 2)), tmp_path / "out")
