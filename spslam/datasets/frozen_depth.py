@@ -12,8 +12,8 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError
 
 FROZEN = "the depth image is the same as in the frame before while the color image changed: the depth stream is frozen"
-# Every n-th row and column is compared: noise makes no two depth images of a sensor alike even there.
-_DEPTH_STEP, _COLOR_STEP = 4, 2
+# Every n-th row is compared: noise makes no two depth images of a sensor alike even there.
+_ROW_STEP = 4
 _CELLS = (16, 12)
 # Mean change of brightness of a cell, in levels of 255. Noise averages out to under a fifth of it, and a hand-held
 # camera passes it within one to five frames.
@@ -35,9 +35,9 @@ class FrameSignature:
     @classmethod
     def of(cls, frame: RgbdFrame) -> FrameSignature:
         """The signature of a frame."""
-        depth = np.ascontiguousarray(frame.depth[::_DEPTH_STEP, ::_DEPTH_STEP])
-        color = frame.color[::_COLOR_STEP, ::_COLOR_STEP]
-        cells = cv2.cvtColor(cv2.resize(color, _CELLS, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        depth = np.ascontiguousarray(frame.depth[::_ROW_STEP])
+        rows = cv2.resize(frame.color[::_ROW_STEP], _CELLS, interpolation=cv2.INTER_AREA)
+        cells = cv2.cvtColor(rows, cv2.COLOR_RGB2GRAY)
         brightness = cells.astype(np.float32)
         return cls(zlib.crc32(depth.tobytes()) if depth.any() else 0, brightness - brightness.mean())
 
