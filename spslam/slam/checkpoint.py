@@ -22,7 +22,7 @@ from spslam.tensor_schema import CHECKPOINT
 FORMAT = "spslam-checkpoint-2"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
 # Iterations are numbered by int32; this many leave room to continue.
-_MOST_ITERATIONS = 2**30
+_MOST_ITERATIONS = 2**29  # the ops count to 2^30, and the run goes on
 
 
 def fingerprint(config: Config) -> str:

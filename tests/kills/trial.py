@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import safetensors
 import torch
 
@@ -44,9 +45,10 @@ class Reference:
 
 
 def measure(folder: Path) -> Reference:
-    """Runs to the end in a child."""
+    """Runs to the end in a child. A child has none of the threads that OpenCV has here, and would wait for them."""
     ops.set_num_threads(1)
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     _run_in_child(folder / "warm-up", None)
     started = time.monotonic()
     _run_in_child(folder / "reference", None)
