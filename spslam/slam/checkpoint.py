@@ -21,8 +21,8 @@ from spslam.tensor_schema import CHECKPOINT
 
 FORMAT = "spslam-checkpoint-2"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
-# Iterations are numbered by int32; this many leave room to continue.
-_MOST_ITERATIONS = 2**29  # the ops count to 2^30, and the run goes on
+# The ops number iterations up to 2^30; this many leave room to continue.
+_MOST_ITERATIONS = 2**29
 
 
 def fingerprint(config: Config) -> str:
