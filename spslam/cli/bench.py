@@ -17,7 +17,8 @@ from spslam.run.request import parse_frames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, places, ablation, or a dataset's; --list names all")
+    suite = "quick, places, ablation, or a dataset's; --list names all"
+    parser.add_argument("suite", metavar="SUITE", nargs="?", help=suite)
     parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that contains the datasets")
     parser.add_argument(
         "--folders",
