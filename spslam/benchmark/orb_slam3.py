@@ -13,13 +13,17 @@ import importlib.util
 import math
 import multiprocessing
 import os
+import subprocess
+import sys
 import tempfile
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spslam.benchmark.orb_slam3_process import FAILED, LOG, SETTINGS, TRAJECTORY, serve
+from spslam.benchmark import orb_slam3_process
+from spslam.benchmark.orb_slam3_process import FAILED, SETTINGS, TRAJECTORY
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import SpslamError, brief
@@ -27,6 +31,7 @@ from spslam.trajectory import Trajectory
 
 # The variable that pyorbslam3 reads, too.
 VOCABULARY = "PYORBSLAM3_VOCAB"
+_LOG = "log.txt"
 _PYRAMID_LEVELS, _PYRAMID_SCALE = 8, 1.2
 # ORB-SLAM3 divides each pyramid level, less a border of 16 px, into cells of 35 px, and needs one of them.
 _SMALLEST_LEVEL_PX = 35 + 2 * 16
@@ -110,11 +115,7 @@ class OrbSlam3:
         self._folder = tempfile.TemporaryDirectory(prefix="spslam-orb-slam3-")
         folder = Path(self._folder.name)
         (folder / SETTINGS).write_text(settings, encoding="utf-8")
-        context = multiprocessing.get_context("spawn")
-        self._connection, other_end = context.Pipe()
-        self._process = context.Process(target=serve, args=(other_end, folder, orb_vocabulary()), daemon=True)
-        self._process.start()
-        other_end.close()
+        self._connection, self._process = _start(folder)
         try:
             self._receive()
         except BaseException:
@@ -173,7 +174,7 @@ class OrbSlam3:
     def close(self) -> None:
         """Ends the process and removes its files."""
         self._process.kill()
-        self._process.join()
+        self._process.wait()
         self._connection.close()
         self._folder.cleanup()
 
@@ -186,17 +187,32 @@ class OrbSlam3:
         try:
             kind, content = self._connection.recv()
         except (EOFError, OSError):
-            self._process.join()
-            raise SpslamError(f"ORB-SLAM3 ended with exit code {self._process.exitcode}{self._last_words()}") from None
+            code = self._process.wait()
+            raise SpslamError(f"ORB-SLAM3 ended with exit code {code}{self._last_words()}") from None
         if kind == FAILED:
             raise SpslamError(f"ORB-SLAM3 failed: {brief(content, 300)}")
         return content
 
     def _last_words(self) -> str:
-        path = Path(self._folder.name) / LOG
-        lines = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []
-        words = [line.strip() for line in lines if line.strip()]
-        return f": {brief(words[-1], 200)}" if words else ""
+        words = (Path(self._folder.name) / _LOG).read_text(encoding="utf-8", errors="replace").split("\n")
+        lines = [line for line in words if line.strip()]
+        return f": {brief(lines[-1], 200)}" if lines else ""
+
+
+def _start(folder: Path) -> tuple[Connection, subprocess.Popen]:
+    """Starts the process, which finds the same packages as this one and ends when the connection is closed."""
+    connection, other_end = multiprocessing.Pipe()
+    command = [sys.executable, "-m", orb_slam3_process.__name__, other_end.fileno(), folder, orb_vocabulary()]
+    with (folder / _LOG).open("wb") as log, other_end:
+        process = subprocess.Popen(
+            list(map(str, command)),
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
+            pass_fds=[other_end.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+    return connection, process
 
 
 def orb_slam3_settings(camera: Camera, rate_hz: float) -> str:

@@ -1,9 +1,13 @@
-"""The process that ORB-SLAM3 runs in: takes frames over a connection and answers with poses."""
+"""The process that ORB-SLAM3 runs in: takes frames over a connection and answers with poses.
+
+Started as a module, with the connection's file descriptor, the folder and the vocabulary as arguments.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -13,7 +17,7 @@ import numpy as np
 # Kinds of answers: (DONE, result) or (FAILED, reason).
 DONE, FAILED = "done", "failed"
 # Files in the folder that both processes use.
-SETTINGS, TRAJECTORY, LOG = "settings.yaml", "trajectory.txt", "log.txt"
+SETTINGS, TRAJECTORY = "settings.yaml", "trajectory.txt"
 
 
 def serve(connection: Connection, folder: Path, vocabulary: Path) -> None:
@@ -24,12 +28,10 @@ def serve(connection: Connection, folder: Path, vocabulary: Path) -> None:
 
     Args:
         connection: to the process that has the frames.
-        folder: with `SETTINGS`; what the library prints goes to `LOG`, the final trajectory to `TRAJECTORY`, which is
-            not written if no frame was tracked.
+        folder: with `SETTINGS`; the final trajectory goes to `TRAJECTORY`, unless no frame was tracked.
         vocabulary: ORB-SLAM3's vocabulary.
     """
     try:
-        _redirect_output(folder / LOG)
         _answer(connection, folder, vocabulary)
     except (EOFError, ConnectionError):
         pass
@@ -38,12 +40,6 @@ def serve(connection: Connection, folder: Path, vocabulary: Path) -> None:
     finally:
         # Not by the interpreter's exit: the library's destructors can hang or crash while its threads run.
         os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _redirect_output(path: Path) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    os.dup2(descriptor, 1)
-    os.dup2(descriptor, 2)
 
 
 def _answer(connection: Connection, folder: Path, vocabulary: Path) -> None:
@@ -67,3 +63,7 @@ def _track(slam: Any, color: np.ndarray, depth: np.ndarray, timestamp: float) ->
     found = slam.track_rgbd(np.ascontiguousarray(color), np.ascontiguousarray(depth), timestamp)
     # After a failure the pose stays "valid" for a while, but is that of an earlier frame.
     return np.array(found.pose_wc, np.float64) if found.ok else None
+
+
+if __name__ == "__main__":
+    serve(Connection(int(sys.argv[1])), Path(sys.argv[2]), Path(sys.argv[3]))
