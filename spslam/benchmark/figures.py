@@ -24,6 +24,7 @@ class Figure:
 FIGURES = {
     "frames": Figure("frames", "", 0),
     "ate_rmse_cm": Figure("ATE RMSE", "cm", 2),
+    "ate_live_cm": Figure("ATE live", "cm", 2),
     "ate_median_cm": Figure("ATE median", "cm", 2),
     "ate_max_cm": Figure("ATE max", "cm", 2),
     "rpe_cm": Figure("RPE", "cm", 2),

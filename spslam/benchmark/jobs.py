@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Iterator
@@ -10,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from spslam.benchmark.gicp import gicp_off_reason
-from spslam.benchmark.suites import GICP, SPSLAM, Sequence, Suite, Variant
+from spslam.benchmark.orb_slam3 import orb_slam3_off_reason, orb_vocabulary
+from spslam.benchmark.suites import GICP, ORB_SLAM3, SPSLAM, Sequence, Suite, Variant
 from spslam.config import Config, config_names, load_config
 from spslam.prior.encoder import shipped_weights
 from spslam.slam.checkpoint import fingerprint
@@ -25,7 +27,7 @@ class Job:
         config: name of the configuration.
         preset: name of the preset; None for the default one.
         options: changes to the configuration, pairs of `section.key` and value.
-        method: `spslam` or `gicp`.
+        method: `spslam`, `gicp` or `orb_slam3`.
         method_options: options of the baseline, pairs of name and value.
         seed: of the run.
         frames: `START:STOP[:STEP]`; None for all.
@@ -60,12 +62,12 @@ class Job:
         """Name of the run's record: readable words, then a hash of all that its figures depend on.
 
         The hash is over resolved options and the content of the prior's weights, so a changed preset or a retrained
-        prior gives another key. Where the data is stored does not count.
+        prior gives another key, as does another vocabulary of ORB-SLAM3. Where the data is stored does not count.
         """
         content = {
             "settings": fingerprint(self.load_config()),
             "options": self.method_options,
-            "weights": _weights_hash(self.load_config()) if self.method == SPSLAM else "",
+            "weights": _weights_hash(self),
             "sequence": self.sequence,
             "method": self.method,
             "frames": self.frames,
@@ -125,7 +127,7 @@ def make_plan(suite: Suite, data: Path | None, device: str) -> Plan:
                 skipped[sequence.name] = reason
                 continue
             for variant in study.variants:
-                if variant.method == GICP and (reason := gicp_off_reason()):
+                if reason := _off_reason(variant.method):
                     skipped[variant.name] = reason
                     continue
                 job = replace(_job(sequence, variant, folder, data, device), thorough="psnr_db" in study.columns)
@@ -154,8 +156,8 @@ def _job(sequence: Sequence, variant: Variant, folder: Path | None, data: Path |
 
 
 def _seeded(job: Job, seeds: int) -> Iterator[Job]:
-    """The job with each seed; the baseline has no random draws and is run once."""
-    for seed in range(seeds if job.method == SPSLAM else 1):
+    """The job with each seed; GICP is deterministic and run once, ORB-SLAM3 has no seed but differs from run to run."""
+    for seed in range(1 if job.method == GICP else seeds):
         yield replace(job, seed=seed)
 
 
@@ -184,6 +186,23 @@ def _find_mesh(sequence: Sequence, folder: Path | None, data: Path | None) -> Pa
     return None
 
 
-def _weights_hash(config: Config) -> str:
-    path = Path(config.prior.weights) if config.prior.weights else shipped_weights(config.prior.neighborhood)
+def _off_reason(method: str) -> str:
+    reasons = {GICP: gicp_off_reason, ORB_SLAM3: orb_slam3_off_reason}
+    return reasons[method]() if method in reasons else ""
+
+
+def _weights_hash(job: Job) -> str:
+    """Hash of the file with what a method learned from other data; empty without one."""
+    if job.method == SPSLAM:
+        prior = job.load_config().prior
+        return _file_hash(Path(prior.weights) if prior.weights else shipped_weights(prior.neighborhood))
+    vocabulary = orb_vocabulary() if job.method == ORB_SLAM3 else None
+    return _vocabulary_hash(vocabulary) if vocabulary else ""
+
+
+def _file_hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
+
+
+# The official vocabulary has 139 MB, and every run of a plan asks.
+_vocabulary_hash = functools.cache(_file_hash)

@@ -1,7 +1,7 @@
 """What is run: suites of sequences and variants, read from `data/suites/*.yaml`.
 
 Each study of a suite runs every variant over every sequence. The suite of a dataset has one study, whose variants are
-presets and the classical baseline; the ablation has one study per question.
+presets and the baselines; the ablation has one study per question.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import yaml
 from spslam.errors import ConfigError
 
 GICP = "gicp"
+ORB_SLAM3 = "orb_slam3"
 SPSLAM = "spslam"
 PAPER_SEEDS = 5
 DATASET_COLUMNS = (
-    "frames", "ate_rmse_cm", "rpe_cm", "rpe_deg", "lost_frames", "fps", "tracking_ms_per_iteration",
+    "frames", "ate_rmse_cm", "ate_live_cm", "rpe_cm", "rpe_deg", "lost_frames", "fps", "tracking_ms_per_iteration",
     "tracking_iterations", "mapping_ms_per_iteration", "mapping_iterations", "model_mb", "peak_gpu_mb", "peak_rss_mb",
     "accuracy_cm", "completeness_cm", "accuracy_5cm", "completeness_5cm", "f1_5cm", "f1_1cm", "depth_l1_cm",
     "psnr_db", "ssim",
@@ -54,7 +55,7 @@ class Variant:
 
     Attributes:
         name: of the variant.
-        method: `SPSLAM` or `GICP`.
+        method: `SPSLAM`, `GICP` or `ORB_SLAM3`.
         preset: name of a preset; None for the default one.
         options: changes to the configuration, or the baseline's options.
         series: line of the plot that the variant belongs to.
@@ -138,7 +139,7 @@ def load_suite(
         studies: names of the studies to run; None for all.
         frames: `START:STOP[:STEP]` instead of the sequences' own.
         seeds: number of runs of each variant; None for the suite's own number (5 by default, as in the paper).
-        baseline: whether to run the classical baseline.
+        baseline: whether to run the baselines, ORB-SLAM3 and GICP odometry.
 
     Raises:
         ConfigError: a name is unknown; the message lists the known ones.
@@ -203,11 +204,12 @@ def _studies(
         _choose("study", wanted, {"all": None})
     variants = [Variant(f"spslam {preset}", preset=preset) for preset in presets or content["presets"]]
     if baseline:
-        variants += [_baseline(voxel_m) for voxel_m in content["baseline_voxels_m"]]
+        variants.append(Variant("ORB-SLAM3", ORB_SLAM3))
+        variants += [_gicp(voxel_m) for voxel_m in content["baseline_voxels_m"]]
     yield Study("all", content["title"], "", sequences, tuple(variants), DATASET_COLUMNS)
 
 
-def _baseline(voxel_m: float) -> Variant:
+def _gicp(voxel_m: float) -> Variant:
     return Variant(f"GICP odometry, {100 * voxel_m:g} cm", GICP, options=(("voxel_m", voxel_m),))
 
 

@@ -17,7 +17,8 @@ from spslam.run.request import parse_frames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", metavar="SUITE", nargs="?", help="quick, ablation, or a dataset's; --list names all")
+    suite = "quick, places, ablation, or a dataset's; --list names all"
+    parser.add_argument("suite", metavar="SUITE", nargs="?", help=suite)
     parser.add_argument("--data", metavar="ROOT", type=Path, help="folder that contains the datasets")
     parser.add_argument(
         "--folders",
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--studies", metavar="NAME", nargs="+", help="only these studies of the ablation")
     parser.add_argument("--workers", metavar="N", type=at_least_one, help="parallel runs (default: one per GPU)")
     parser.add_argument("--threads", metavar="N", type=at_least_one, help="CPU threads per run")
-    parser.add_argument("--no-baseline", action="store_true", help="skip the GICP baseline")
+    parser.add_argument("--no-baseline", action="store_true", help="skip the baselines, ORB-SLAM3 and GICP odometry")
     parser.add_argument("--keep", action="store_true", help="keep trajectory, mesh and report of each run")
     parser.add_argument("--report", metavar="PAGE", type=Path, help="also update the tables in a Markdown page")
     parser.add_argument("--list", action="store_true", help="list the runs without starting them")

@@ -120,7 +120,7 @@ def test_the_command_prints_tables_and_writes_them(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "SUITE must be one of 7scenes, ablation, quick"),
+        ((), "SUITE must be one of 7scenes, ablation, places, quick"),
         (("replika",), "suite must be one of"),
         (("quick", "--data", "nowhere"), "--data must be a folder that contains the datasets, got nowhere"),
         (("quick", "--frames", "9"), "--frames must be START:STOP"),

@@ -37,12 +37,13 @@ def test_tables_include_the_papers_figures(replica):
     assert rows["SP-SLAM (paper)"] == ("0.5", "0.49", "0.52")
     assert rows["spslam balanced"] == ("1.50 ± 0.71", "1.50 ± 0.71", "1.50")
     assert any(name.startswith("GICP") for name in rows)
+    assert "ORB-SLAM3" in rows
     assert "Table II" in ate.note
     means = {row[0]: dict(zip(averages.header, row, strict=True)) for row in averages.rows}
     assert means["ESLAM"]["F1 % at 5 cm"] == "98.98"
     assert means["spslam paper"]["frames/s"] == "10.0"
     assert means["DROID-SLAM"]["tracking ms/it"] == ""
-    assert len(runs.rows) == 6
+    assert len(runs.rows) == 8
 
 
 def test_ablation_tables_have_a_column_for_each_sequence_and_figure():
@@ -75,7 +76,7 @@ def test_text_and_markdown(replica):
 def test_files(replica, tmp_path):
     write_results(replica, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert len(summary["rows"]) == 6
+    assert len(summary["rows"]) == 8
     assert summary["rows"][0]["figures"]["ate_rmse_cm"]["runs"] == 2
     assert summary["skipped"] == {"absent": "no --data given"}
     assert summary["environments"][0]["commit"] == "abc"

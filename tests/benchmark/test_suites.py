@@ -8,8 +8,9 @@ from spslam.benchmark.figures import FIGURES
 from spslam.benchmark.folders import read_folders, with_folders
 from spslam.benchmark.jobs import Job, make_plan
 from spslam.benchmark.published import AVERAGE, published
-from spslam.benchmark.suites import GICP, load_suite, suite_names
+from spslam.benchmark.suites import GICP, ORB_SLAM3, SPSLAM, load_suite, suite_names
 from spslam.config import load_config
+from spslam.datasets.places.registry import PLACES
 from spslam.errors import ConfigError
 from tests.benchmark.examples import tiny_job
 from tests.cli.command import ROOT
@@ -25,17 +26,17 @@ def test_every_run_of_a_suite_has_a_valid_configuration(name, tmp_path):
         assert set(study.columns) | set(study.plots) <= set(FIGURES)
         for sequence in study.sequences:
             for variant in study.variants:
-                options = (*sequence.options, *(variant.options if variant.method != GICP else ()))
+                options = (*sequence.options, *(variant.options if variant.method == SPSLAM else ()))
                 load_config(sequence.config, variant.preset, options)
 
 
 @pytest.mark.parametrize(("name", "scenes"), DATASETS.items())
-def test_datasets_have_the_papers_scenes_five_seeds_and_the_baseline(name, scenes):
+def test_datasets_have_the_papers_scenes_five_seeds_and_the_baselines(name, scenes):
     suite = load_suite(name)
     (study,) = suite.studies
     assert suite.seeds == 5
     assert [variant.preset for variant in study.variants[:2]] == ["paper", "balanced"]
-    assert study.variants[-1].method == GICP
+    assert [variant.method for variant in study.variants[2:]] == [ORB_SLAM3, GICP]
     names = [sequence.name for sequence in study.sequences]
     assert len(names) == scenes
     columns = published(suite.published)["ate"].columns
@@ -88,9 +89,9 @@ def test_plan_has_the_data_that_is_there_and_lists_what_is_missing(tmp_path):
     (tmp_path / "replica" / "room1").mkdir(parents=True)
     (tmp_path / "replica" / "room1_mesh.ply").touch()
     plan = make_plan(load_suite("replica", seeds=2), tmp_path, "cpu")
-    assert set(plan.skipped) == {f"room{i}" for i in (0, 2)} | {f"office{i}" for i in range(5)}
+    assert set(plan.skipped) == {f"room{i}" for i in (0, 2)} | {f"office{i}" for i in range(5)} | {"ORB-SLAM3"}
     assert f"in {tmp_path}" in plan.skipped["room0"]
-    # Two presets with two seeds, and the baseline, which has none.
+    # Two presets with two seeds, and GICP, which has none.
     assert len(plan.jobs) == 5
     assert {job.mesh for job in plan.jobs.values()} == {str(tmp_path / "replica" / "room1_mesh.ply")}
     assert plan.cells["all", "room1", "spslam paper"] == tuple(
@@ -145,14 +146,29 @@ def test_suites_name_public_folders_only():
 def test_without_data_only_generated_sequences_are_planned():
     plan = make_plan(load_suite("quick"), None, "cpu")
     assert {job.sequence for job in plan.jobs.values()} == {"room"}
+    assert plan.skipped.pop("ORB-SLAM3").startswith("needs ")
     assert set(plan.skipped.values()) == {"no --data given"}
 
 
-def test_without_its_package_the_baseline_is_skipped(monkeypatch):
+def test_generated_places_need_no_data_and_differ():
+    plan = make_plan(load_suite("places", ["balanced"], seeds=1), None, "cpu")
+    assert set(plan.skipped) == {"ORB-SLAM3"}
+    assert len(plan.jobs) == 12
+    places = {job.sequence: job.load_config().dataset for job in plan.jobs.values()}
+    assert set(places) == set(PLACES)
+    assert all(options.place == name for name, options in places.items())
+    assert {(options.sensor, options.motion) for options in places.values()} == {("structured_light", "handheld")}
+
+
+def test_without_its_package_a_baseline_is_skipped(monkeypatch):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
+    monkeypatch.setitem(sys.modules, "pyorbslam3", None)
     plan = make_plan(load_suite("quick", presets=["fast"], sequences=["room"]), None, "cpu")
     assert [job.method for job in plan.jobs.values()] == ["spslam"]
-    assert plan.skipped == {"GICP odometry, 4 cm": "needs small_gicp: pip install 'spslam[bench]'"}
+    assert plan.skipped == {
+        "GICP odometry, 4 cm": "needs small_gicp: pip install 'spslam[bench]'",
+        "ORB-SLAM3": "needs pyorbslam3, which is licensed under GPL-3: pip install 'spslam[orbslam3]'",
+    }
 
 
 def test_studies_share_runs():
