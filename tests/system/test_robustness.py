@@ -10,7 +10,6 @@ from spslam.datasets import registry
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError, OutputError, SpslamError
 from spslam.run.sequence import RunRequest, run_sequence
-from spslam.scene import Scene
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, run_on, settings
@@ -91,10 +90,10 @@ def test_map_starts_with_the_first_frame_that_has_depth(monkeypatch, tmp_path, c
     np.testing.assert_allclose(first_mapped, Recorded(8).poses()[0], atol=1e-6)
 
 
-def test_sequence_without_any_depth_finishes(monkeypatch, tmp_path):
-    metrics = run_on(monkeypatch, Recorded(3, without_depth(0, 1, 2)), tmp_path / "out", mesh=True)
-    assert (metrics["lost_frames"], metrics["voxels"]) == (3, 0)
-    assert Scene.load(tmp_path / "out" / "map.safetensors").volume.num_voxels == 0
+def test_sequence_without_any_depth_is_one_line(monkeypatch, tmp_path):
+    with pytest.raises(DatasetError, match="recorded: all frames are lost: none shows a surface between"):
+        run_on(monkeypatch, Recorded(3, without_depth(0, 1, 2)), tmp_path / "out", mesh=True)
+    assert not (tmp_path / "out" / "mesh.ply").exists()
 
 
 def test_black_frames_are_tracked_by_their_depth(monkeypatch, tmp_path):
