@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spslam_numpy._enums import Activation as Activation
+from spslam_numpy._enums import RandomStream as RandomStream
 from spslam_numpy._hash_table import VoxelHash as VoxelHash
 from spslam_numpy._hash_table import VoxelLimitError as VoxelLimitError
 
