@@ -17,7 +17,7 @@ import numpy as np
 # Kinds of answers: (DONE, result) or (FAILED, reason).
 DONE, FAILED = "done", "failed"
 # Files in the folder that both processes use.
-SETTINGS, TRAJECTORY = "settings.yaml", "trajectory.txt"
+SETTINGS, TRAJECTORY = "settings.yaml", "orb_slam3.txt"
 
 
 def serve(connection: Connection, folder: Path, vocabulary: Path) -> None:
