@@ -16,6 +16,8 @@ COMMAND := $(PYTHON) -m spslam
 endif
 # Commands that come with the environment are looked for beside its Python first.
 RUN = PATH="$(dir $(abspath $(PYTHON))):$$PATH"
+# A process per core takes files of tests in turn; threads that wait for work leave the core to the other processes.
+PYTEST = OMP_WAIT_POLICY=passive $(PYTHON) -m pytest -n $(JOBS) --dist loadfile
 # This machine's best instruction set is all that development needs.
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
@@ -29,10 +31,10 @@ demo: dev ## track and map a generated room with exact ground truth, into runs/d
 	$(COMMAND) demo
 
 test: dev ## build, then run the tests on the CPU, without the slow sweeps
-	$(PYTHON) -m pytest
+	$(PYTEST)
 
 test-all: dev ## the same with the slow sweeps, as CI does
-	$(PYTHON) -m pytest -m ""
+	$(PYTEST) -m ""
 
 test-gpu: ## run the tests that need a CUDA device, with the kernels that are there: built in place, or a wheel's
 	$(PYTHON) tests/run_on_gpu.py

@@ -19,6 +19,7 @@ inline void load_rays(const RayBatch& batch, const RenderOptions& options, std::
   Pose<float> pose{};
   for (std::int64_t i = 0; i < chunk.num_rays; ++i) {
     Ray& ray = chunk.rays[i];
+    ray.origin = ray.direction = {};
     ray.pixel = unpack_pixel(batch.pixels + kPixelWords * (begin + i));
     ray.frame = batch.ray_frames[begin + i];
     ray.valid = has_depth(ray.pixel.depth) && ray.frame >= 0 && ray.frame < batch.num_frames;

@@ -99,7 +99,7 @@ def test_missing_package_is_named(monkeypatch):
 def test_missing_vocabulary_is_named(fake_orb_slam3, monkeypatch):
     assert orb_slam3_off_reason() == ""
     fake_orb_slam3.unlink()
-    with pytest.raises(SpslamError, match=rf"{VOCABULARY} must name ORBvoc.txt, .*, got .*ORBvoc.txt, which is not a"):
+    with pytest.raises(SpslamError, match=rf"{VOCABULARY} must name ORBvoc.txt, .*, got .*, which is not a"):
         OrbSlam3(Recorded(1).camera, RATE_HZ)
     monkeypatch.delenv(VOCABULARY)
     assert orb_slam3_off_reason().endswith("ORBvoc.txt.tar.gz of github.com/UZ-SLAMLab/ORB_SLAM3")

@@ -231,6 +231,16 @@ def test_rays_without_depth_add_nothing_but_count(device, options, generator):
     torch.testing.assert_close(got.grad_poses, want.grad_poses / 2, rtol=1e-4, atol=1e-4)
 
 
+def test_a_call_on_poses_that_are_none_leaves_no_trace(device, options, generator):
+    """A ray without depth has no direction; one kept from the call before would make 0 * nan of its gradient."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    rays = noisy_rays(generator, counts=(64,), device=device)
+    want = ops.render_step(scene, rays, options)
+    ops.render_step(scene, replace(rays, poses=torch.full_like(rays.poses, torch.nan)), options)
+    got = ops.render_step(scene, rays, options)
+    assert torch.equal(got.losses, want.losses) and torch.equal(got.grad_poses, want.grad_poses)
+
+
 def test_outside_the_map(device, options, generator):
     """Every sample is free space of SDF 1: only the mask of the terms is left, which is nothing."""
     scene = make_scene(generator, random_decoder=True, device=device)

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spslam.datasets.furniture import SINK_M
 from spslam.datasets.places.finish import Color, Finish
 from spslam.datasets.places.route import Gaze, Route
 from spslam.datasets.places.textures import POSTERS
 from spslam.datasets.primitives import Box, Primitive
 
-# Parts reach this far into what carries them, so that no two surfaces coincide.
-SINK_M = 0.01
 # Nothing is put closer to the camera's way; its shake and steps take up to 4 cm of it.
 CLEARANCE_M = 0.32
 # Between pieces of furniture, and to the walls.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from spslam.datasets.places.builder import SINK_M, Builder, tint
+from spslam.datasets.furniture import SINK_M
+from spslam.datasets.places.builder import Builder, tint
 from spslam.datasets.places.finish import Finish
 from spslam.datasets.places.interiors import furnish, wall_finish
 from spslam.datasets.places.pieces import chair, crates, table

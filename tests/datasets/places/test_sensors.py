@@ -6,9 +6,9 @@ import pytest
 
 from spslam.camera import Camera
 from spslam.datasets.places.sensors import SENSORS
+from spslam.datasets.places.sensors.occlusion import occluded
 from spslam.datasets.places.sensors.phone_lidar import SPOT_M, SPOT_SHARE
 from spslam.datasets.places.sensors.stereo import BASELINE_M, FULL_WIDTH_PX, SUBPIXEL, texture_of
-from spslam.datasets.places.sensors.structured_light import shadow
 from spslam.datasets.places.sensors.time_of_flight import DEVIATION_M, WIGGLE_M
 
 NOISY = [name for name in SENSORS if name != "exact"]
@@ -94,11 +94,11 @@ def test_neighbors_err_alike_where_windows_are_matched():
 
 def test_shadow_is_as_wide_as_the_difference_of_disparity():
     near, far, disparity_px_m = 1.0, 2.0, 20.0
-    hidden = shadow(step(near, far), disparity_px_m, 0.25)
+    hidden = occluded(disparity_px_m / step(near, far), 0.25)
     width = disparity_px_m * (1 / near - 1 / far)
     assert hidden[60].sum() == pytest.approx(width, abs=1)
     assert hidden[60, 120 - int(width) + 1 : 120].all()
-    assert not shadow(wall(2.0), disparity_px_m, 0.25).any()
+    assert not occluded(disparity_px_m / wall(2.0), 0.25).any()
 
 
 def test_structured_light_loses_the_shadow_and_stereo_the_occluded():

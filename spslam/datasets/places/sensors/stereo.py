@@ -15,12 +15,15 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.places.sensors.noise import smooth_noise
+from spslam.datasets.places.sensors.occlusion import occluded
 
 BASELINE_M = 0.05
 SUBPIXEL = 0.08
 # Pixels are those of a width of 848 px, the sensor's best; smaller images are decimated from it. Correlation of the
 # error, and reach of a near edge.
 _WINDOW_SIGMA_PX, _FAT_PX, FULL_WIDTH_PX = 3.0, 3.0, 848
+# A surface must hide another by this much in the right image, or its own slope would.
+_HIDDEN_PX = 0.5
 # Larger steps of disparity are edges.
 _EDGE_PX = 0.75
 # Texture is the mean gradient (levels per px) in a window; with `_GOOD_TEXTURE` the error is the stated one, below
@@ -71,6 +74,5 @@ def texture_of(color: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 def _unmatched(disparity: np.ndarray) -> np.ndarray:
     """Pixels whose point is outside the right image or hidden in it: they lie to the left of near surfaces."""
-    right = np.arange(disparity.shape[1], dtype=np.float32) - disparity
-    hidden = right > np.minimum.accumulate(right[:, ::-1], axis=1)[:, ::-1] + np.float32(0.5)
-    return hidden | (right < -0.5)
+    outside = np.arange(disparity.shape[1], dtype=np.float32) - disparity < -0.5
+    return occluded(disparity, _HIDDEN_PX) | outside

@@ -13,6 +13,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.depth_noise import kinect_depth
+from spslam.datasets.places.sensors.occlusion import occluded
 
 BASELINE_M = 0.075
 # A surface must hide another by this much in the projector's image, or its own slope would count as a shadow.
@@ -32,18 +33,6 @@ def measure_structured_light(
         generator: decides on everything.
     """
     measured = kinect_depth(depth, camera.fx, level, generator)
-    measured[shadow(depth, camera.fx * BASELINE_M * min(level, 1.0), _HIDDEN_PX * depth.shape[1] / 640)] = 0
+    disparity = np.float32(camera.fx * BASELINE_M * min(level, 1.0)) / depth
+    measured[occluded(disparity, _HIDDEN_PX * depth.shape[1] / 640)] = 0
     return measured
-
-
-def shadow(depth: np.ndarray, disparity_px_m: float, least_px: float) -> np.ndarray:
-    """Which pixels [H, W] a projector to the camera's right doesn't light.
-
-    Args:
-        depth: [H, W], m, exact.
-        disparity_px_m: focal length times baseline.
-        least_px: how far a surface must reach over another in the projector's image.
-    """
-    columns = np.arange(depth.shape[1], dtype=np.float32) - np.float32(disparity_px_m) / depth
-    nearest = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
-    return columns > nearest + np.float32(least_px)
