@@ -1,4 +1,4 @@
-"""Notices a depth stream that has frozen: the same depth image again while color goes on."""
+"""Detects a frozen depth stream: the same depth image again, with another color image."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ MIN_AHEAD = 8
 
 
 class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
-    """Iterates over the frames of a dataset in order; a frame that can't be read, or whose depth image is that of the
-    frame before while color goes on, comes as its `DatasetError`.
+    """Iterates over the frames of a dataset in order; a frame that can't be read, or whose depth stream is frozen,
+    comes as its `DatasetError`.
 
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
     another process do not compete with the frame loop for Python's GIL. If `run.reader` is `auto`, a dataset that no
