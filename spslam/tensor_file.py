@@ -30,6 +30,7 @@ _DTYPES = {
     "F64": torch.float64,
     "I32": torch.int32,
     "I64": torch.int64,
+    "U8": torch.uint8,
     "U16": torch.uint16,
 }
 

@@ -250,14 +250,20 @@ CHECKPOINT = TensorSchema(
         "frames.depth_thumbnails": TensorRule(torch.float16, ("frames", "thumbnail_rows", "thumbnail_columns"), low=0),
         "pixels.records": TensorRule(torch.int32, ("frames", "pixels", 3)),
         "pixels.has_pixels": TensorRule(torch.bool, ("frames",)),
+        "noise.model": TensorRule(torch.float32, (4,), low=0),
+        "noise.counts": TensorRule(torch.int32, (2, 32, 128), low=0),
         "depth_keyframes.images": TensorRule(
             torch.uint16, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
+        ),
+        "depth_keyframes.intensities": TensorRule(
+            torch.uint8, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
         ),
         "depth_keyframes.frames": TensorRule(torch.int64, ("depth_images",), low=-1, optional=True),
         **_moment_rules(_MOMENTS),
     },
     (_check_planes("scene."), _check_unit_quaternions, _check_pixels, _check_depth_keyframes, _check_moments),
     (
+        ("depth_keyframes.images", "depth_keyframes.intensities"),
         ("depth_keyframes.images", "depth_keyframes.frames"),
         *((f"moments.{name}.first", f"moments.{name}.second") for name, _ in _MOMENTS),
     ),

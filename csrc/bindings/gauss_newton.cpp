@@ -1,6 +1,6 @@
 #include "spslam/gauss_newton.h"
 
-#include "bindings/number_list.h"
+#include "bindings/depth_keyframes.h"
 #include "bindings/scene.h"
 
 namespace spslam::bindings {
@@ -25,16 +25,6 @@ enum class Scalar { kFx, kFy, kCx, kCy, SPS_GAUSS_NEWTON_SCALARS(SPS_NAME_PLACE)
 #undef SPS_NAME_PLACE
 enum class Integer { kNumPixels, kIterations, kSeed, kStream, kFrame, kTf32, kCount };
 enum class ReferenceScalar { kFx, kFy, kCx, kCy, kWeight, kKernel, kCount };
-enum class KeyframeScalar { kFx, kFy, kCx, kCy, kUnit, kKernelEnd, kCount };
-// Before the rows of each depth keyframe's image and pose.
-enum class KeyframeInteger { kFirstIteration, kCount };
-
-std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
-  std::vector<Tensor> result;
-  for (const Tensor& tensor : tensors) result.push_back(contiguous(tensor));
-  return result;
-}
-
 // Of the cells and the pose; none without tensors. They must outlive the launch.
 ReferenceImage load_reference(const std::vector<Tensor>& tensors, const std::vector<double>& numbers) {
   if (tensors.empty()) return {};
@@ -48,39 +38,6 @@ ReferenceImage load_reference(const std::vector<Tensor>& tensors, const std::vec
           load_intrinsics(scalars),
           scalars.as<float>(ReferenceScalar::kWeight),
           scalars.as<float>(ReferenceScalar::kKernel)};
-}
-
-// Of the images and the poses; none without tensors. They must outlive the launch.
-DepthKeyframes load_depth_keyframes(const std::vector<Tensor>& tensors, const std::vector<double>& numbers,
-                                    const std::vector<std::int64_t>& integers) {
-  if (tensors.empty()) return {};
-  const Scalars<KeyframeScalar> scalars(kName, "depth_keyframe_scalars", numbers);
-  SPS_CHECK(tensors.size() == 2 && tensors[0].dim() == 3 && tensors[1].dim() == 2 && tensors[1].size(1) == kPoseSize,
-            kName, ": depth_keyframes must be images [R, H, W] and poses [F, 7]");
-  SPS_CHECK(scalars[KeyframeScalar::kUnit] > 0.0 && scalars[KeyframeScalar::kKernelEnd] > 0.0, kName,
-            ": depth_keyframes must have a positive unit and kernel_end");
-  constexpr std::size_t kFirstRow = static_cast<std::size_t>(KeyframeInteger::kCount);
-  SPS_CHECK(integers.size() % 2 == kFirstRow % 2 && integers.size() >= kFirstRow &&
-                integers.size() <= kFirstRow + 2 * kMaxDepthKeyframes,
-            kName, ": depth_keyframes must be at most ", kMaxDepthKeyframes);
-  DepthKeyframes keyframes{};
-  keyframes.images = data<std::uint16_t>(tensors[0]);
-  keyframes.poses = data<float>(tensors[1]);
-  keyframes.height = tensors[0].size(1);
-  keyframes.width = tensors[0].size(2);
-  keyframes.intrinsics = load_intrinsics(scalars);
-  keyframes.unit = scalars.as<float>(KeyframeScalar::kUnit);
-  keyframes.kernel_end = scalars.as<float>(KeyframeScalar::kKernelEnd);
-  keyframes.first_iteration = integers[static_cast<std::size_t>(KeyframeInteger::kFirstIteration)];
-  keyframes.count = static_cast<int>((integers.size() - kFirstRow) / 2);
-  for (int k = 0; k < keyframes.count; ++k) {
-    const std::int64_t image = integers[kFirstRow + 2 * k], pose = integers[kFirstRow + 2 * k + 1];
-    SPS_CHECK(image >= 0 && image < tensors[0].size(0) && pose >= 0 && pose < tensors[1].size(0), kName,
-              ": depth_keyframes must name images and poses that are there, got ", image, " and ", pose);
-    keyframes.image_rows[k] = image;
-    keyframes.pose_rows[k] = pose;
-  }
-  return keyframes;
 }
 
 GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<Integer>& integers) {
@@ -100,21 +57,27 @@ GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<I
 
 std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
     std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars, std::vector<std::int64_t> plane_layout,
-    Tensor pixels, Tensor pose, std::vector<double> scalars, std::vector<std::int64_t> integers,
+    std::vector<Tensor> frame, std::vector<double> scalars, std::vector<std::int64_t> integers,
     std::vector<Tensor> reference, std::vector<double> reference_scalars, std::vector<Tensor> depth_keyframes,
     std::vector<double> depth_keyframe_scalars, std::vector<std::int64_t> depth_keyframe_integers) {
+  SPS_CHECK(frame.size() == 2 || frame.size() == 3, kName, ": frame must be pixels, a pose and, if known, noise");
+  frame = all_contiguous(frame);
+  const Tensor &pixels = frame[0], &pose = frame[1];
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3 && pixels.size(0) > 0, kName,
             ": pixels must have shape [P, 3] with P >= 1");
   SPS_CHECK(pose.numel() == kPoseSize, kName, ": pose must have 7 elements");
   DeviceScope scope(pixels);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
-  pixels = contiguous(pixels);
   reference = all_contiguous(reference);
   depth_keyframes = all_contiguous(depth_keyframes);
   GaussNewtonOptions options = load_options({kName, "scalars", scalars}, {kName, "integers", integers});
+  SPS_CHECK(frame.size() == 2 || frame[2].numel() == kSensorNoiseSize, kName, ": noise must have ", kSensorNoiseSize,
+            " elements");
+  options.noise = frame.size() == 2 ? nullptr : data<float>(frame[2]);
   options.reference = load_reference(reference, reference_scalars);
-  options.depth_keyframes = load_depth_keyframes(depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);
-  Tensor result = torch::stable::clone(contiguous(pose));
+  options.depth_keyframes =
+      load_depth_keyframes(kName, depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);
+  Tensor result = torch::stable::clone(pose);
   Tensor stats = empty(pose, {options.iterations, kTrackingStatSize}, ScalarType::Float);
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
   Tensor workspace =
@@ -157,9 +120,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
   m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
-        ", Tensor pixels, Tensor pose, float[] scalars, int[] integers, Tensor[] reference, "
-        "float[] reference_scalars, Tensor[] depth_keyframes, float[] depth_keyframe_scalars, "
-        "int[] depth_keyframe_integers) -> (Tensor, Tensor, Tensor)");
+        ", Tensor[] frame, float[] scalars, int[] integers, Tensor[] reference, "
+        "float[] reference_scalars, " SPS_DEPTH_KEYFRAMES_SCHEMA ") -> (Tensor, Tensor, Tensor)");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
         "-> (Tensor, Tensor, Tensor, Tensor)");

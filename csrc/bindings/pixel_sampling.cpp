@@ -50,12 +50,14 @@ PixelSampling load_sampling(const Scalars<Scalar>& scalars, const Integers<Integ
           scalars.as<float>(Scalar::kDepthImageUnit)};
 }
 
-std::int64_t words_of_halves(std::int64_t count) {
-  return (count + 1) / 2;
+// Words that hold `count` numbers, of which `per_word` fit in one.
+std::int64_t words_of(std::int64_t count, std::int64_t per_word) {
+  return (count + per_word - 1) / per_word;
 }
 
 // For the CPU alone, where frames arrive. One buffer for all: records [count, 3], normals [count, 3] as
-// their bits, the depth thumbnail's halves in pairs, the depth image's 16-bit numbers in pairs.
+// their bits, the depth thumbnail's halves in pairs, the depth image's 16-bit numbers in pairs, the intensity image's
+// bytes by fours.
 std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, std::vector<double> scalar_list,
                                                      std::vector<std::int64_t> integer_list) {
   const Scalars<Scalar> scalars("sample_frame_pixels", "scalars", scalar_list);
@@ -75,14 +77,17 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
                                  thumbnail_size(width, sampling.thumbnail_step);
   const std::int64_t depth_image = static_cast<std::int64_t>(depth_image_size(height, sampling.depth_image_step)) *
                                    depth_image_size(width, sampling.depth_image_step);
-  const std::int64_t thumbnail_at = 6 * sampling.count, depth_image_at = thumbnail_at + words_of_halves(thumbnail);
-  const Tensor buffer = empty(depth, {depth_image_at + words_of_halves(depth_image)}, ScalarType::Int);
+  const std::int64_t thumbnail_at = 6 * sampling.count, depth_image_at = thumbnail_at + words_of(thumbnail, 2);
+  const std::int64_t intensity_at = depth_image_at + words_of(depth_image, 2);
+  const Tensor buffer = empty(depth, {intensity_at + words_of(depth_image, 4)}, ScalarType::Int);
   std::int32_t* words = mutable_data<std::int32_t>(buffer);
   if (thumbnail % 2 != 0) words[depth_image_at - 1] = 0;
-  if (depth_image % 2 != 0) words[buffer.numel() - 1] = 0;
+  if (depth_image % 2 != 0) words[intensity_at - 1] = 0;
+  if (depth_image % 4 != 0) words[buffer.numel() - 1] = 0;
   const SampledPixels out{words, reinterpret_cast<float*>(words + 3 * sampling.count),
                           reinterpret_cast<std::uint16_t*>(words + thumbnail_at),
-                          reinterpret_cast<std::uint16_t*>(words + depth_image_at)};
+                          reinterpret_cast<std::uint16_t*>(words + depth_image_at),
+                          reinterpret_cast<std::uint8_t*>(words + intensity_at)};
   return {buffer, sample_pixels(image, load_key(integers, 0), sampling, out)};
 }
 

@@ -6,7 +6,7 @@ extern "C" __attribute__((used)) const char spslam_cuda_archs[] = "spslam-cuda-a
 #else
 #include "bindings/common.h"
 #include "core/parallel.h"
-#include "spslam/gauss_newton.h"
+#include "spslam/types/luma.h"
 
 namespace spslam::bindings {
 namespace {

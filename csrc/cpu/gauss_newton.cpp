@@ -21,18 +21,19 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
   GeometryTile tile(net);
   SurfacePoint points[kTileRows];
   Vec3<float> gradients[kTileRows];
-  float sdf[kTileRows], certainty[kTileRows];
+  PixelNoise noise[kTileRows];
+  float sdf[kTileRows];
   const float inverse_voxel = 1.0f / scene.voxel_size;
-  const auto add_keyframes = [&](const SurfacePoint& point, float certain, const MapResidual& map) {
-    add_keyframe_residuals(measure, point, certain, map, 0, 1, terms + kTrackingTerms);
+  const auto add_keyframes = [&](const SurfacePoint& point, const PixelNoise& own, const MapResidual& map) {
+    add_keyframe_residuals(measure, point, own, map, 0, 1, terms + kTrackingTerms);
   };
   const auto flush = [&] {
     tile.decode(sdf);
     tile.position_gradient(scene, gradients);
     for (std::int64_t i = 0; i < tile.size(); ++i) {
       const bool known = is_tracking_inlier(1.0f, true, sdf[i]);
-      add_keyframes(points[i], certainty[i], {sdf[i] * options.truncation, known});
-      if (known) add_map_residual(measure, points[i].offset, sdf[i], gradients[i], certainty[i], terms);
+      add_keyframes(points[i], noise[i], {sdf[i] * options.truncation, known});
+      if (known) add_map_residual(measure, points[i].offset, sdf[i], gradients[i], noise[i].map_certainty, terms);
     }
     tile.clear();
   };
@@ -42,13 +43,13 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
     const SurfacePoint point = surface_point(pixel, pose, options.intrinsics);
     add_reference_residual(measure, pixel, point, terms);
     const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
-    const float certain = depth_certainty(pixel.depth, options.noise_crossover_depth);
+    const PixelNoise own = noise_of(measure, pixel);
     if (!cell.corner_ids) {
-      add_keyframes(point, certain, {0.0f, false});
+      add_keyframes(point, own, {0.0f, false});
       continue;
     }
     points[tile.size()] = point;
-    certainty[tile.size()] = certain;
+    noise[tile.size()] = own;
     tile.add(scene, point.world, cell);
     if (tile.full()) flush();
   }

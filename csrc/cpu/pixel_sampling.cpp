@@ -60,6 +60,16 @@ void write_depth_image(const RgbdImage& image, const PixelSampling& sampling, Pa
   }
 }
 
+void write_intensity_image(const RgbdImage& image, std::int32_t step, std::uint8_t* intensity_image) {
+  if (step == 0) return;
+  for (std::int32_t v = 0; v < image.height; v += step) {
+    const std::uint8_t* row = image.color + 3 * static_cast<std::int64_t>(v) * image.width;
+    const std::int32_t columns = depth_image_size(image.width, step);
+    SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) intensity_image[c] = rounded_luma(row + 3 * c * step);
+    intensity_image += columns;
+  }
+}
+
 // Draws pixels [first, first + n) of the frame.
 void draw_batch(const RgbdImage& image, PaddedDepth& depth, const std::int32_t* valid, std::int64_t num_valid,
                 PhiloxKey key, const PixelSampling& sampling, std::int64_t first, int n, const SampledPixels& out) {
@@ -94,6 +104,7 @@ std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSam
   const std::int64_t num_valid = list_valid(image, sampling, depth, valid);
   write_thumbnail(image, sampling.thumbnail_step, depth, out.depth_thumbnail);
   write_depth_image(image, sampling, depth, out.depth_image);
+  write_intensity_image(image, sampling.depth_image_step, out.intensity_image);
   if (num_valid == 0) {
     std::fill(out.records, out.records + kPixelWords * sampling.count, 0);
     std::fill(out.normals, out.normals + 3 * sampling.count, 0.0f);

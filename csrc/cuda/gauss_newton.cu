@@ -66,12 +66,11 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   // Two lanes hold the same pixel: one adds its residuals against the map and the reference, and they share the depth
   // keyframes.
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
-  const float certainty = depth_certainty(pixel.depth, options.noise_crossover_depth);
+  const PixelNoise noise = noise_of(measure, pixel);
   if (pixel.depth > 0.0f) {
-    add_keyframe_residuals(measure, point, certainty, {sdf * options.truncation, known}, lane % 4 / 2, 2,
-                           keyframe_terms);
+    add_keyframe_residuals(measure, point, noise, {sdf * options.truncation, known}, lane % 4 / 2, 2, keyframe_terms);
   }
-  if (adds && known) add_map_residual(measure, point.offset, sdf, gradient, certainty, terms);
+  if (adds && known) add_map_residual(measure, point.offset, sdf, gradient, noise.map_certainty, terms);
   if (adds) add_reference_residual(measure, pixel, point, terms);
 }
 

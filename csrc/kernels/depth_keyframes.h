@@ -8,6 +8,7 @@
 #include "core/macros.h"
 #include "core/vec.h"
 #include "kernels/earlier_frame.h"
+#include "kernels/pixel_noise.h"
 #include "kernels/robust_residual.h"
 #include "spslam/gauss_newton.h"
 
@@ -18,17 +19,21 @@ namespace spslam {
 constexpr int kKeyframeTerms = kNormalTerms + 3;
 // Four pixels whose inverse depths spread more than this share have an edge between them.
 constexpr float kMaxInverseDepthSpread = 0.03f;
+// A point whose depth differs from the surface's by more than this share is not on it.
+constexpr float kMaxDepthDifference = 0.05f;
 // The least and the most weight of the map against one keyframe's pixel.
 constexpr double kMinMapShare = 1e-3, kMaxMapShare = 4.0;
 
 // One of them with its pose read.
 struct DepthKeyframe {
   const std::uint16_t* image;
+  const std::uint8_t* intensities;  // null where there are none
   Pose<float> pose;
 };
 
 SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& keyframes, int k) {
-  return {keyframes.images + keyframes.image_rows[k] * keyframes.height * keyframes.width,
+  const std::int64_t first = keyframes.image_rows[k] * keyframes.height * keyframes.width;
+  return {keyframes.images + first, keyframes.intensities ? keyframes.intensities + first : nullptr,
           load_pose(keyframes.poses + kPoseSize * keyframes.pose_rows[k])};
 }
 
@@ -43,32 +48,80 @@ struct MapResidual {
   bool known;
 };
 
-// Adds a world point's signed distance (m) from the surface that a keyframe measured, positive beyond it, to terms of
-// type T; nothing where the point falls off the image or between pixels without depth or with an edge. The inverse
-// depth q of a plane is linear in the image, so z q(u, v) - 1 is linear in the point, and divided by the norm of its
-// gradient a distance.
-template <class T>
-SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
-                                            const Vec3<float>& world, const Vec3<float>& offset, float kernel,
-                                            float certainty, const MapResidual& map, T* terms) {
-  const FrameProjection at =
-      project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, world);
-  if (!at.inside) return;
+// A point's signed distance (m) from the surface that a keyframe measured, positive beyond it, and its derivative by
+// the point in the keyframe's camera axes.
+struct SurfaceDistance {
+  float value;
+  Vec3<float> slope;
+  bool known, near;  // near: the point is on that surface, not on another before or behind it
+};
+
+// Unknown between pixels without depth or with an edge. The inverse depth q of a plane is linear in the image, so
+// z q(u, v) - 1 is linear in the point, and divided by the norm of its gradient a distance.
+SPS_INLINE SurfaceDistance surface_distance(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
+                                            const FrameProjection& at) {
   const std::uint16_t* row = keyframe.image + at.row * keyframes.width + at.column;
   const std::uint16_t d00 = row[0], d01 = row[1], d10 = row[keyframes.width], d11 = row[keyframes.width + 1];
-  if (d00 == 0 || d01 == 0 || d10 == 0 || d11 == 0) return;
+  if (d00 == 0 || d01 == 0 || d10 == 0 || d11 == 0) return {};
   const float q00 = 1.0f / (keyframes.unit * d00), q01 = 1.0f / (keyframes.unit * d01);
   const float q10 = 1.0f / (keyframes.unit * d10), q11 = 1.0f / (keyframes.unit * d11);
   const float most = std::fmax(std::fmax(q00, q01), std::fmax(q10, q11));
   const float least = std::fmin(std::fmin(q00, q01), std::fmin(q10, q11));
-  if (!(most - least < kMaxInverseDepthSpread * most)) return;
+  if (!(most - least < kMaxInverseDepthSpread * most)) return {};
   const BilinearValue q = bilinear_value(q00, q01, q10, q11, at.a, at.b);
   const float x = q.by_u * keyframes.intrinsics.fx, y = q.by_v * keyframes.intrinsics.fy;
   const Vec3<float> gradient{x, y, q.value - (x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
   const float inverse_slope = 1.0f / std::fmax(std::sqrt(dot(gradient, gradient)), 1e-6f);
-  const float residual = (at.in_camera.z * q.value - 1.0f) * inverse_slope;
+  const float excess = at.in_camera.z * q.value - 1.0f;
+  return {excess * inverse_slope, inverse_slope * gradient, true, std::fabs(excess) < kMaxDepthDifference};
+}
+
+// An earlier image's intensity at a projection less a pixel's own, and its derivatives (1/px).
+struct IntensityDifference {
+  float value, by_u, by_v;
+};
+
+SPS_INLINE IntensityDifference intensity_difference(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
+                                                    const FrameProjection& at, float intensity) {
+  constexpr float kStep = 1.0f / 255.0f;
+  const std::uint8_t* row = keyframe.intensities + at.row * keyframes.width + at.column;
+  const BilinearValue value = bilinear_value(kStep * row[0], kStep * row[1], kStep * row[keyframes.width],
+                                             kStep * row[keyframes.width + 1], at.a, at.b);
+  return {value.value - intensity, value.by_u, value.by_v};
+}
+
+// Adds the difference of intensities in meters: as many as the deviation of the sensor's noise is worth.
+template <class T>
+SPS_INLINE void add_keyframe_intensity(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
+                                       const FrameProjection& at, const PixelNoise& noise, float width,
+                                       const Vec3<float>& offset, T* terms) {
+  const IntensityDifference difference = intensity_difference(keyframes, keyframe, at, noise.intensity);
+  const float deviation = intensity_deviation(noise.sensor, difference.by_u, difference.by_v);
+  const float meters = noise.intensity_meters / deviation;
+  const float x = difference.by_u * keyframes.intrinsics.fx * at.inverse_z;
+  const float y = difference.by_v * keyframes.intrinsics.fy * at.inverse_z;
+  const Vec3<float> by_point{x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
+  add_weighted_residual(offset, meters * difference.value, keyframe.pose.rotation * (meters * by_point),
+                        static_cast<T>(robust_weight(difference.value, kRobustDeviations * width * deviation)), terms);
+}
+
+// Adds what a keyframe measured at a world point to terms of type T: the distance from its surface, and where the noise
+// of intensities is known their difference; nothing where the point falls off the image or its surface is unknown.
+template <class T>
+SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
+                                            const Vec3<float>& world, const Vec3<float>& offset, float kernel,
+                                            const PixelNoise& noise, const MapResidual& map, T* terms) {
+  const FrameProjection at =
+      project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, world);
+  if (!at.inside) return;
+  const SurfaceDistance surface = surface_distance(keyframes, keyframe, at);
+  if (!surface.known) return;
+  if (noise.sensor && keyframe.intensities && surface.near) {
+    add_keyframe_intensity(keyframes, keyframe, at, noise, kernel / keyframes.kernel_end, offset, terms);
+  }
+  const float residual = surface.value, certainty = noise.keyframe_certainty;
   const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel));
-  add_weighted_residual(offset, residual, keyframe.pose.rotation * (inverse_slope * gradient), weight, terms);
+  add_weighted_residual(offset, residual, keyframe.pose.rotation * surface.slope, weight, terms);
   if (!map.known) return;
   const T map_weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(map.value, kernel));
   const T squared = static_cast<T>(residual) * static_cast<T>(residual);

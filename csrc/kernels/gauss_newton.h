@@ -7,6 +7,7 @@
 #include "core/macros.h"
 #include "core/vec.h"
 #include "kernels/depth_keyframes.h"
+#include "kernels/pixel_noise.h"
 #include "kernels/pixel_record.h"
 #include "kernels/reference_image.h"
 #include "kernels/robust_residual.h"
@@ -20,8 +21,9 @@ constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms;
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
 
-// The earlier frames that a call compares with: their poses, read once.
+// The earlier frames that a call compares with and the sensor's noise, read once.
 struct EarlierFrames {
+  SensorNoise noise;
   Pose<float> reference;
   DepthKeyframe keyframes[kMaxDepthKeyframes];
 };
@@ -30,6 +32,7 @@ constexpr int kMaxEarlierFrames = 1 + kMaxDepthKeyframes;
 // Reads number i of kMaxEarlierFrames, if there is one: the reference image is 0, the depth keyframes follow.
 SPS_INLINE void load_earlier_frame(const GaussNewtonOptions& options, int i, EarlierFrames& frames) {
   if (i == 0 && options.reference.height > 0) frames.reference = load_pose(options.reference.pose);
+  if (i == 0 && options.noise) frames.noise = load_sensor_noise(options.noise);
   if (i > 0 && i <= options.depth_keyframes.count) {
     frames.keyframes[i - 1] = load_depth_keyframe(options.depth_keyframes, i - 1);
   }
@@ -61,13 +64,18 @@ SPS_INLINE void add_map_residual(const Measurement& measure, const Vec3<float>& 
   add_robust_residual(offset, sdf * truncation, truncation * gradient, measure.kernel, certainty, terms);
 }
 
+SPS_INLINE PixelNoise noise_of(const Measurement& measure, const Pixel& pixel) {
+  const SensorNoise* sensor = measure.options->noise ? &measure.frames->noise : nullptr;
+  return pixel_noise(sensor, pixel.depth, luma(pixel.color));
+}
+
 // Adds a point's residuals against every stride-th depth keyframe of the iteration, from `first` on.
 template <class T>
-SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const SurfacePoint& point, float certainty,
+SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const SurfacePoint& point, const PixelNoise& noise,
                                        const MapResidual& map, int first, int stride, T* terms) {
   for (int k = first; k < measure.num_keyframes; k += stride) {
     add_depth_keyframe_residual(measure.options->depth_keyframes, measure.frames->keyframes[k], point.world,
-                                point.offset, measure.kernel.keyframe, certainty, map, terms);
+                                point.offset, measure.kernel.keyframe, noise, map, terms);
   }
 }
 

@@ -10,6 +10,7 @@
 #include "core/macros.h"
 #include "core/vec.h"
 #include "spslam/types/camera.h"
+#include "spslam/types/luma.h"
 
 namespace spslam {
 
@@ -47,6 +48,19 @@ SPS_INLINE void pack_pixel(std::int32_t u, std::int32_t v, float depth, const st
   words[0] = static_cast<std::int32_t>(static_cast<std::uint32_t>(u) | static_cast<std::uint32_t>(v) << 16);
   __builtin_memcpy(words + 1, &depth, sizeof(float));
   words[2] = static_cast<std::int32_t>(color[0] | color[1] << 8 | color[2] << 16 | c << 24);
+}
+
+// Intensity of a color in [0, 1].
+SPS_INLINE float luma(const float* color) {
+  constexpr float kRed = kLumaWeights[0] / 1000.0f, kGreen = kLumaWeights[1] / 1000.0f,
+                  kBlue = kLumaWeights[2] / 1000.0f;
+  return kRed * color[0] + kGreen * color[1] + kBlue * color[2];
+}
+
+// The same of a color of 8 bits per channel.
+SPS_INLINE std::uint8_t rounded_luma(const std::uint8_t* color) {
+  constexpr std::uint32_t kRed = kLumaWeights[0], kGreen = kLumaWeights[1], kBlue = kLumaWeights[2];
+  return static_cast<std::uint8_t>((kRed * color[0] + kGreen * color[1] + kBlue * color[2] + 500) / 1000);
 }
 
 // Direction of a pixel's ray in camera axes, with z = 1: a point on it is depth times direction.

@@ -18,13 +18,6 @@ namespace spslam {
 // other.
 constexpr float kReferenceDepthAgreement = 0.1f;
 
-// Intensity of a color in [0, 1].
-SPS_INLINE float luma(const float* color) {
-  constexpr float kRed = kLumaWeights[0] / 1000.0f, kGreen = kLumaWeights[1] / 1000.0f,
-                  kBlue = kLumaWeights[2] / 1000.0f;
-  return kRed * color[0] + kGreen * color[1] + kBlue * color[2];
-}
-
 struct ReferenceCorner {
   float intensity, depth;
 };

@@ -28,14 +28,6 @@ SPS_INLINE float robust_weight(float residual, float kernel) {
   return root * root;
 }
 
-// Inverse variance of a residual as a share of that at the camera: the noise of structured-light and stereo depth grows
-// with z^2, and adds to that of the map.
-SPS_INLINE float depth_certainty(float depth, float noise_crossover_depth) {
-  if (!(noise_crossover_depth > 0.0f)) return 1.0f;
-  const float ratio = depth / noise_crossover_depth, squared = ratio * ratio;
-  return 1.0f / (1.0f + squared * squared);
-}
-
 // Adds a residual (m) of a weight to the hessian and gradient in sums of type T, and nothing to the cost. slope is its
 // derivative by the surface point, offset the point seen from the camera center that the increment turns about.
 template <class T>

@@ -19,6 +19,7 @@ from spslam.ops.ray_sampling import RandomStream, philox_uniform, sample_along_r
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.sensor_noise import SensorNoise, measure_noise_
 from spslam.ops.track_adam import track_adam
 from spslam.ops.volume_rendering import rendering_losses, volume_render
 from spslam.ops.voxel_hash import (
@@ -54,6 +55,7 @@ __all__ = [
     "RenderStep",
     "SceneGradients",
     "SceneView",
+    "SensorNoise",
     "VoxelHash",
     "VoxelLimitError",
     "VolumeBuffers",
@@ -66,6 +68,7 @@ __all__ = [
     "gauss_newton_poses",
     "get_num_threads",
     "marching_cubes",
+    "measure_noise_",
     "mlp",
     "mlp_num_params",
     "new_gradient_sums",

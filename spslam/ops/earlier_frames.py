@@ -57,6 +57,8 @@ class DepthKeyframes(NamedTuple):
         intrinsics: of the images, px.
         kernel_end: last width of the robust kernel of these distances, m; the first is that of the map's.
         first_iteration: from which on they take part; the map alone has the larger basin of convergence.
+        intensities: uint8 [R, H, W] intensity (`LUMA_WEIGHTS`) in 1/255, compared where the depth is and agrees with
+            the point's own to 5 %; None compares none.
     """
 
     images: torch.Tensor
@@ -66,12 +68,16 @@ class DepthKeyframes(NamedTuple):
     intrinsics: Intrinsics
     kernel_end: float
     first_iteration: int = 0
+    intensities: torch.Tensor | None = None
 
     def check(self, function: str, like: torch.Tensor) -> None:
         """Raises TypeError or ValueError, naming `function`, where something does not fit."""
         name = "depth_keyframes"
         check_tensor(function, f"{name}.images", self.images, ("R", "H", "W"), torch.uint16, like=like)
         check_tensor(function, f"{name}.poses", self.poses, ("F", 7), torch.float32, like=like)
+        if self.intensities is not None:
+            shape = self.images.shape
+            check_tensor(function, f"{name}.intensities", self.intensities, shape, torch.uint8, like=like)
         check_intrinsics(function, self.intrinsics, f"{name}.intrinsics")
         check(self.unit > 0, function, f"{name}.unit", "be positive", self.unit)
         check(self.kernel_end > 0, function, f"{name}.kernel_end", "be positive", self.kernel_end)
@@ -83,7 +89,8 @@ class DepthKeyframes(NamedTuple):
             check(inside, function, f"{name}.rows", "name images and poses that are there", (image, pose))
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
-        """What the schema takes: the enums KeyframeScalar and KeyframeInteger in csrc/bindings/gauss_newton.cpp."""
+        """What schemas take: the enums KeyframeScalar and KeyframeInteger in csrc/bindings/depth_keyframes.h."""
         rows = [row for pair in self.rows for row in pair]
         scalars = [*self.intrinsics, self.unit, self.kernel_end]
-        return [self.images, self.poses], scalars, [self.first_iteration, *rows]
+        intensities = [] if self.intensities is None else [self.intensities]
+        return [self.images, self.poses, *intensities], scalars, [self.first_iteration, *rows]

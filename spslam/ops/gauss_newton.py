@@ -4,14 +4,19 @@ A pixel of depth z is the world point x = R (z d) + t. Its residual is r = trunc
 1 / (1 + (r / k)^2)^2 (Geman-McClure's), and the increment (dt, domega) moves the camera by dt and turns it by
 exp(domega) about its center, so that dr = truncation * grad s . (dt + domega x (x - t)).
 
-Where the noise of depth grows with z^2, as for structured light and stereo, a residual's inverse variance falls as
-1 / (1 + (z / z0)^4).
+With the sensor's noise (`SensorNoise`) a residual's weight is multiplied by m^2 / (m^2 + v(z)), v(z) being the variance
+of the pixel's depth and m = 3 mm the deviation of the map; against a keyframe by v(0) / v(z), v(0) at most m^2.
 
 Each depth keyframe, an earlier frame's depth image, adds the signed distance of x from the surface that it measured,
 (z' q(u', v') - 1) / |grad|, q being the inverse depth between four pixels, which on a plane is linear in the image.
 The map's equations weigh c = (v_keyframes / v_map)^2 in [1e-3, 4] against the mean of the keyframes', v being the
 weighted mean squared residuals where both are known: squared, as the map's error is alike for neighboring pixels and,
 unlike a sensor's noise, does not average out.
+
+Where the noise and a keyframe's intensities are given, each pixel adds the photometric residual of direct methods (Kerl
+et al. 2013) against it, 2 sqrt(v(0)) min(1, e0 / e) (I_keyframe(u', v') - I) / d, with the deviation
+d = sqrt(s^2 + e^2 |grad I_keyframe|^2), the robust weight of width 3 d (wider in early iterations, as the kernel of
+distances), and e0 = 0.3 px: images that are worse registered are so alike for neighboring pixels.
 
 A reference image adds the photometric residual of direct methods (Kerl et al. 2013) for each pixel: the intensity I of
 an earlier frame at the projection of x, less the pixel's own, times a weight in meters.
@@ -74,8 +79,6 @@ class GaussNewtonOptions:
         seed, stream, frame: keys of the draws, see `philox_uniform`.
         score_kernel: width of the robust kernel that the statistics are computed with, m, so that they compare whatever
             kernel finds the pose; None takes the iteration's own.
-        noise_crossover_depth: depth z0 at which noise that grows with z^2 is as large as that of the map, m; weights
-            are multiplied by 1 / (1 + (z / z0)^4). 0 weighs near and far alike.
         tf32: on CUDA devices from sm_80 on, let tensor cores multiply in the decoder, with factors rounded to 10 bits
             of mantissa: under 0.1 mm of SDF. Elsewhere, and without it, everything is float32.
     """
@@ -90,7 +93,6 @@ class GaussNewtonOptions:
     stream: int
     frame: int
     score_kernel: float | None = _scalar(None, above=0)
-    noise_crossover_depth: float = _scalar(0.0, at_least=0)
     tf32: bool = True
 
     def check(self, function: str) -> None:
@@ -124,6 +126,7 @@ def track_gauss_newton(
     intrinsics: Intrinsics,
     options: GaussNewtonOptions,
     *,
+    noise: torch.Tensor | None = None,
     reference: ReferenceImage | None = None,
     depth_keyframes: DepthKeyframes | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -140,10 +143,11 @@ def track_gauss_newton(
         pose: float32 [7] start, unit quaternion (w, x, y, z) and translation (m), T_world_camera.
         intrinsics: of the camera.
         options: pixels, iterations, kernels and random keys.
+        noise: float32 [4], `SensorNoise.model`; None weighs near and far alike and compares no keyframe's intensities.
         reference: an earlier frame to compare colors with; None uses the surface alone. It takes no part in the
             statistics.
-        depth_keyframes: earlier frames' depth images to align the surface with; None uses the map alone. They take no
-            part in the statistics and H.
+        depth_keyframes: earlier frames' images to align the surface with; None uses the map alone. They take no part in
+            the statistics and H.
 
     Returns:
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of pixels on
@@ -173,14 +177,15 @@ def track_gauss_newton(
     check_tensor(name, "pose", pose, (7,), torch.float32, like=scene.embeddings)
     check_intrinsics(name, intrinsics)
     options.check(name)
+    if noise is not None:
+        check_tensor(name, "noise", noise, (4,), torch.float32, like=scene.embeddings)
     if reference is not None:
         reference.check(name, like=scene.embeddings)
     if depth_keyframes is not None:
         depth_keyframes.check(name, like=scene.embeddings)
     return torch.ops.spslam.track_gauss_newton(
         *scene.arguments(),
-        pixels,
-        pose,
+        [pixels, pose] if noise is None else [pixels, pose, noise],
         *options.arguments(intrinsics),
         *(([], []) if reference is None else reference.arguments()),
         *(([], [], []) if depth_keyframes is None else depth_keyframes.arguments()),
@@ -238,7 +243,8 @@ def _(before, last):
 
 
 @torch.library.register_fake("spslam::track_gauss_newton")
-def _(scene, scene_scalars, plane_layout, pixels, pose, scalars, integers, *_):
+def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *_):
+    pose = frame[1]
     return pose.new_empty(7), pose.new_empty((integers[_ITERATIONS], 5)), pose.new_empty((6, 6))
 
 

@@ -21,7 +21,8 @@ class PixelSampling:
         min_depth, max_depth: pixels nearer or farther, m, are not drawn.
         step_px, max_jump: of the normals, see `depth_normals`.
         thumbnail_step: distance of the depth thumbnail's pixels, px; the first lies at half of it.
-        depth_image_step: distance of the small depth image's pixels, px; the first lies at 0. With 0 there is none.
+        depth_image_step: distance of the pixels of the small depth and intensity images, px; the first lies at 0. With
+            0 there are none.
         depth_image_unit: m, of the small image's depth.
     """
 
@@ -40,7 +41,7 @@ class PixelSampling:
         return len(range(first, height, step)), len(range(first, width, step))
 
     def depth_image_shape(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the small depth image of an image; 0 and 0 where there is none."""
+        """Rows and columns of the small images of an image; 0 and 0 where there are none."""
         return _depth_image_size(height, self.depth_image_step), _depth_image_size(width, self.depth_image_step)
 
 
@@ -76,11 +77,12 @@ def sample_frame_pixels(
         seed, stream, frame: key of the draw, as in `philox_uniform`.
 
     Returns:
-        buffer int32 [3 P + 3 P + ceil(h w / 2) + ceil(h' w' / 2)]: the records [P, 3]; the normals [P, 3] as the bits
-        of float32; the depth thumbnail, float16 [h, w] (m, 0 where invalid) at every `thumbnail_step`-th pixel, two per
-        word; and the small depth image, uint16 [h', w'] in `depth_image_unit`, rounded (0 where invalid or beyond
-        65535), at every `depth_image_step`-th pixel, two per word. And the number of valid pixels. Where that is 0,
-        records and normals are 0. The same bits on every run.
+        buffer int32 [3 P + 3 P + ceil(h w / 2) + ceil(h' w' / 2) + ceil(h' w' / 4)]: the records [P, 3]; the normals
+        [P, 3] as the bits of float32; the depth thumbnail, float16 [h, w] (m, 0 where invalid) at every
+        `thumbnail_step`-th pixel, two per word; the small depth image, uint16 [h', w'] in `depth_image_unit`, rounded
+        (0 where invalid or beyond 65535), at every `depth_image_step`-th pixel, two per word; and of the same pixels
+        the intensity image, uint8 [h', w'] (`LUMA_WEIGHTS`, 1/255), four per word. And the number of valid pixels.
+        Where that is 0, records and normals are 0. The same bits on every run.
 
     Raises:
         ValueError: wrong shapes or devices, or a number out of range.
@@ -183,5 +185,5 @@ def _(depth, color, scalars, integers):
     count, _, thumbnail_step, depth_image_step = integers[:4]
     height, width = (max(0, -((thumbnail_step // 2 - size) // thumbnail_step)) for size in depth.shape)
     rows, columns = (_depth_image_size(size, depth_image_step) for size in depth.shape)
-    words = 6 * count + (height * width + 1) // 2 + (rows * columns + 1) // 2
+    words = 6 * count + -(-height * width // 2) + -(-rows * columns // 2) + -(-rows * columns // 4)
     return depth.new_empty((words,), dtype=torch.int32), 0

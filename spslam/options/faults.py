@@ -15,7 +15,8 @@ from spslam.options.section import Section
 
 # Names of earlier versions, and what the options are called now.
 RENAMED = {
-    "tracking.noise_depth_m": "tracking.noise_crossover_depth_m",
+    "tracking.noise_depth_m": "tracking.depth_noise_m",
+    "tracking.noise_crossover_depth_m": "tracking.depth_noise_m",
     "tracking.depth_views": "tracking.depth_keyframes",
     "tracking.view_kernel_m": "tracking.depth_keyframe_kernel_m",
     "tracking.rescue": "tracking.recovery",

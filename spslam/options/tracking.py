@@ -39,25 +39,30 @@ class TrackingOptions(Section):
     )
     kernel_end_m: float = option("Gauss-Newton: width of the robust kernel in the last iteration", "m", gt=0)
     damping: float = option("Gauss-Newton: fraction of its diagonal that is added to the normal matrix", ge=0)
-    noise_crossover_depth_m: float = option(
-        "Gauss-Newton: depth at which sensor noise, which grows with the square of depth, equals the error of the map; "
-        "0 weights all depths equally",
+    depth_noise_m: float | None = option(
+        "Gauss-Newton: standard deviation of depth at 1 m, which grows with the square of depth; null measures it "
+        "against depth keyframes, 0 weights all depths equally",
         "m",
         ge=0,
+        le=0.1,
     )
     color_weight_m: float = option(
-        "Gauss-Newton: weight of brightness residuals against the last mapped frame: the distance that is equivalent "
-        "to a difference from black to white; 0 disables them",
+        "Gauss-Newton: weight of brightness residuals against a small image of the last mapped frame: the distance "
+        "that is equivalent to a difference from black to white; 0 disables them",
         "m",
         ge=0,
     )
     color_kernel: float = option(
-        "Gauss-Newton: width of the robust kernel of brightness differences; white is 1",
+        "Gauss-Newton: width of the robust kernel of these differences; white is 1",
         needs=(need(above("tracking.color_weight_m", 0)),),
         gt=0,
     )
     depth_keyframes: bool = option(
         "Gauss-Newton: also align with the depth images of the last frame, one 10 to 19 and one 40 to 49 frames earlier"
+    )
+    color: bool = option(
+        "Gauss-Newton: also compare brightness with these frames, weighted by its noise as measured",
+        needs=(need(is_("tracking.depth_keyframes", True)),),
     )
     depth_keyframe_kernel_m: float = option(
         "Gauss-Newton: width of the robust kernel of distances to these depth images in the last iteration",

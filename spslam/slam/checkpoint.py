@@ -19,7 +19,7 @@ from spslam.slam.state import Moments, SlamState
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
 from spslam.tensor_schema import CHECKPOINT
 
-FORMAT = "spslam-checkpoint-2"
+FORMAT = "spslam-checkpoint-3"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
 # The ops number iterations up to 2^30; this many leave room to continue.
 _MOST_ITERATIONS = 2**29
@@ -69,6 +69,7 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
         **_prefixed("frames.", state.frames.tensors()),
         **_prefixed("pixels.", {"records": state.pixels.records, "has_pixels": state.pixels.has_pixels}),
     }
+    tensors.update(_prefixed("noise.", state.noise.tensors()))
     if state.depth_keyframes is not None:
         tensors.update(_prefixed("depth_keyframes.", state.depth_keyframes.tensors()))
     # Moments that the next mapping call resets anyway need no place.
@@ -130,6 +131,7 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
     state.scene.load_state_dict(_section(tensors, "scene."))
     state.frames.load_state_dict(_section(tensors, "frames."))
     state.pixels.load_state_dict(_section(tensors, "pixels."))
+    state.noise.load_state_dict(_section(tensors, "noise."))
     if state.depth_keyframes is not None:
         state.depth_keyframes.load_state_dict(_section(tensors, "depth_keyframes."))
     device = state.scene.device

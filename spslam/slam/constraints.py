@@ -1,6 +1,8 @@
-"""Tracking constraints beside the map: depth images of earlier frames, and the last mapped one's brightness."""
+"""Tracking constraints beside the map: images of earlier frames, and the noise that they are weighed by."""
 
 from dataclasses import dataclass
+
+import torch
 
 from spslam import ops
 from spslam.camera import Camera
@@ -17,12 +19,14 @@ class Constraints:
     """Terms of Gauss-Newton tracking beside the map's.
 
     Attributes:
+        noise: float32 [4] of the sensor, see `ops.SensorNoise`; None weighs all depths alike.
         reference: the last mapped frame, to compare brightness with; None compares none.
         depth_keyframes: depth images of earlier frames; None uses the map alone.
         keyframes_from_start: whether these take part in all iterations. Normally they join in the second half, as the
             map alone has the larger convergence basin; but with little depth the map does not constrain the pose.
     """
 
+    noise: torch.Tensor | None = None
     reference: ops.ReferenceImage | None = None
     depth_keyframes: ops.DepthKeyframes | None = None
     keyframes_from_start: bool = False
@@ -44,13 +48,17 @@ class ConstraintSource:
 
     def __init__(self, config: Config, camera: Camera):
         weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
+        self._color = config.tracking.color
         self._references = ReferenceCache(camera, weight_m, kernel) if weight_m > 0 else None
         self._mapping_every = config.mapping.every
 
     def gather(self, history: FrameHistory, pixels: FramePixels) -> Constraints:
         """The constraints of the next frame, of the given pixels."""
         from_start = pixels.valid_depth_share < LITTLE_DEPTH_SHARE
-        return Constraints(self._reference(history), history.depth_keyframes(), from_start)
+        keyframes = history.depth_keyframes()
+        if keyframes is not None and not self._color:
+            keyframes = keyframes._replace(intensities=None)
+        return Constraints(history.noise, self._reference(history), keyframes, from_start)
 
     def _reference(self, history: FrameHistory) -> ops.ReferenceImage | None:
         mapped = history.last_mapped(self._mapping_every) if self._references else None

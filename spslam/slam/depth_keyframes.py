@@ -1,4 +1,4 @@
-"""Depth images of earlier frames, with which tracking aligns a frame beside the map."""
+"""Depth and intensity images of earlier frames, with which tracking aligns a frame beside the map."""
 
 import torch
 
@@ -12,10 +12,11 @@ UNITS = 2**16 - 1  # depth is stored in 16 bits
 
 
 class DepthKeyframeStore:
-    """The last frame's depth image, and those of every tenth frame while they are used.
+    """The last frame's images, and those of every tenth frame while they are used.
 
     Attributes:
         images: uint16 [S, h, w] depth in units of `unit` m, 0 where unknown; the first is the last frame's.
+        intensities: uint8 [S, h, w] in 1/255.
         frames: number of the frame that each image is of, -1 for none.
         unit: m.
     """
@@ -35,15 +36,17 @@ class DepthKeyframeStore:
         slots = 2 + max(AGES)
         rows, columns = (-(-size // self.step) for size in (camera.height, camera.width))
         self.images = torch.zeros(slots, rows, columns, dtype=torch.uint16, device=device)
+        self.intensities = torch.zeros_like(self.images, dtype=torch.uint8)
         self.frames = [-1] * slots
         fx, fy, cx, cy = (number / self.step for number in (camera.fx, camera.fy, camera.cx, camera.cy))
         self.intrinsics = ops.Intrinsics(fx, fy, cx, cy)
 
-    def add(self, frame: int, image: torch.Tensor) -> None:
-        """Stores the depth image uint16 [h, w] of frame number `frame`, asynchronously."""
+    def add(self, frame: int, depth: torch.Tensor, intensity: torch.Tensor) -> None:
+        """Stores the images uint16 and uint8 [h, w] of frame number `frame`, asynchronously."""
         slots = [0] if frame % INTERVAL else [0, self._slot(frame)]
         for slot in slots:
-            self.images[slot].copy_(image)
+            self.images[slot].copy_(depth)
+            self.intensities[slot].copy_(intensity)
             self.frames[slot] = frame
 
     def select(self, frame: int, lost: torch.Tensor, poses: torch.Tensor) -> ops.DepthKeyframes | None:
@@ -65,15 +68,18 @@ class DepthKeyframeStore:
         rows = tuple((slot, of) for slot, of in wanted if of >= 0 and self.frames[slot] == of and not lost[of])
         if not rows:
             return None
-        return ops.DepthKeyframes(self.images, self.unit, poses, rows, self.intrinsics, self._kernel_m)
+        return ops.DepthKeyframes(
+            self.images, self.unit, poses, rows, self.intrinsics, self._kernel_m, intensities=self.intensities
+        )
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All that a checkpoint needs."""
-        return {"images": self.images, "frames": torch.tensor(self.frames)}
+        return {"images": self.images, "intensities": self.intensities, "frames": torch.tensor(self.frames)}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replaces the content by a copy of what `tensors()` returned."""
         self.images.copy_(state["images"])
+        self.intensities.copy_(state["intensities"])
         self.frames = state["frames"].tolist()
 
     @staticmethod

@@ -77,12 +77,21 @@ class FrameHistory:
                 return row, self.frame(row)
         return None
 
+    @property
+    def noise(self) -> torch.Tensor:
+        """float32 [4] what was measured of the sensor's noise, on the device; see `ops.SensorNoise`."""
+        return self._state.noise.model
+
     def depth_keyframes(self) -> ops.DepthKeyframes | None:
-        """Earlier depth images to align the next frame with; None if there is none with a trusted pose."""
+        """Earlier images to align the next frame with; None if there is none with a trusted pose."""
+        return self.depth_keyframes_before(len(self._state.frames))
+
+    def depth_keyframes_before(self, number: int) -> ops.DepthKeyframes | None:
+        """The same of frame `number`, the next one or the last."""
         state = self._state
         if state.depth_keyframes is None:
             return None
-        return state.depth_keyframes.select(len(state.frames), state.frames.lost, state.frames.poses)
+        return state.depth_keyframes.select(number, state.frames.lost, state.frames.poses)
 
     def usable_rows(self) -> torch.Tensor:
         """int64 on the CPU, ascending: frames that have pixels and a trusted pose."""

@@ -25,11 +25,11 @@ class FramePixels:
     """What tracking and mapping need of a frame, in one buffer, so that an upload is one copy.
 
     Attributes:
-        buffer: int32 words of the records, normals, depth thumbnail and depth image, as `ops.sample_frame_pixels`
-            returns them.
+        buffer: int32 words of the records, normals, depth thumbnail, depth image and intensity image, as
+            `ops.sample_frame_pixels` returns them.
         capacity: records that the buffer holds; without depth they are 0 and none of them counts.
         thumbnail_shape: rows and columns of the depth thumbnail.
-        depth_image_shape: rows and columns of the depth image; 0 and 0 without one.
+        depth_image_shape: rows and columns of the depth and intensity images; 0 and 0 without.
         valid_depth_share: share of the image's pixels with usable depth.
     """
 
@@ -64,8 +64,19 @@ class FramePixels:
     def depth_image(self) -> torch.Tensor:
         """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown; a view of the buffer."""
         rows, columns = self.depth_image_shape
-        words = self.buffer[len(self.buffer) - -(-rows * columns // 2) :]
+        words = self.buffer[len(self.buffer) - sum(self._image_words) :][: self._image_words[0]]
         return words.view(torch.uint16)[: rows * columns].view(rows, columns)
+
+    @cached_property
+    def intensity_image(self) -> torch.Tensor:
+        """uint8 [h', w'] intensity in 1/255 of the same pixels; a view of the buffer."""
+        rows, columns = self.depth_image_shape
+        words = self.buffer[len(self.buffer) - self._image_words[1] :]
+        return words.view(torch.uint8)[: rows * columns].view(rows, columns)
+
+    @property
+    def _image_words(self) -> tuple[int, int]:
+        return _image_words(self.depth_image_shape)
 
     def to(self, device: torch.device, non_blocking: bool = False) -> "FramePixels":
         """The same on another device; one copy."""
@@ -107,8 +118,15 @@ def blank_pixels(camera: Camera, config: Config) -> FramePixels:
     sampling = _sampling(camera, config)
     size = camera.height, camera.width
     shapes = sampling.thumbnail_shape(*size), sampling.depth_image_shape(*size)
-    words = 6 * sampling.count + sum(-(-rows * columns // 2) for rows, columns in shapes)
+    (rows, columns), images = shapes[0], _image_words(shapes[1])
+    words = 6 * sampling.count + -(-rows * columns // 2) + sum(images)
     return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, *shapes, 0.0)
+
+
+def _image_words(shape: tuple[int, int]) -> tuple[int, int]:
+    """Words that a depth and an intensity image of a shape take."""
+    pixels = shape[0] * shape[1]
+    return -(-pixels // 2), -(-pixels // 4)
 
 
 def _sampling(camera: Camera, config: Config) -> ops.PixelSampling:

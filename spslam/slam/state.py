@@ -15,6 +15,7 @@ from spslam.scene.sparse_volume import resize_rows
 from spslam.slam.depth_keyframes import DepthKeyframeStore
 from spslam.slam.pixel_database import PixelDatabase
 from spslam.slam.pixels import THUMBNAIL_STEP_PX
+from spslam.slam.sensor_noise import SensorNoiseEstimate
 
 _FIRST_CAPACITY = 64
 
@@ -181,7 +182,8 @@ class SlamState:
         scene: the map.
         frames: poses and bookkeeping of every frame.
         pixels: pixel records of every frame.
-        depth_keyframes: depth images of some earlier frames; None where tracking does not use them.
+        noise: of the sensor.
+        depth_keyframes: images of some earlier frames; None where tracking does not use them.
         moments: optimizer state by parameter name.
         steps: Adam steps since the moments were last reset.
         stamp: number of mapping iterations ever done; marks rows touched by the current one.
@@ -191,6 +193,7 @@ class SlamState:
     scene: Scene
     frames: FrameTable
     pixels: PixelDatabase
+    noise: SensorNoiseEstimate
     depth_keyframes: DepthKeyframeStore | None = None
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
@@ -227,4 +230,5 @@ class SlamState:
         depth_keyframes = None
         if tracking.depth_keyframes:
             depth_keyframes = DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
-        return cls(scene, FrameTable(camera, device), pixels, depth_keyframes)
+        noise = SensorNoiseEstimate(camera, tracking.depth_noise_m, device)
+        return cls(scene, FrameTable(camera, device), pixels, noise, depth_keyframes)

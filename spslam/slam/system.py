@@ -157,7 +157,10 @@ class SlamSystem:
         )
         state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records)
         if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:
-            state.depth_keyframes.add(number, pixels.depth_image)
+            earlier = self.history.depth_keyframes_before(number)
+            if earlier is not None:
+                state.noise.measure(pixels, tracked.pose, earlier)
+            state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image)
 
     def _map(
         self, pixels: FramePixels, tracked: TrackedFrame, number: int, events: FrameEvents

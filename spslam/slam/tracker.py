@@ -122,9 +122,9 @@ class Tracker:
                 stream=ops.RandomStream.TRACKING_PIXELS,
                 frame=problem.frame,
                 score_kernel=self._score_kernel_m,
-                noise_crossover_depth=tracking.noise_crossover_depth_m,
                 tf32=self.config.precision == "tf32",
             ),
+            noise=problem.constraints.noise,
             reference=problem.constraints.reference,
             depth_keyframes=problem.constraints.depth_keyframes_of(iterations),
         )

@@ -53,7 +53,7 @@ VALUES: tuple[Any, ...] = (
 )
 TYPES = {"BOOL": 1, "U8": 1, "I8": 1, "U16": 2, "I16": 2, "F16": 2, "BF16": 2, "U32": 4, "I32": 4, "F32": 4, "I64": 8}
 TYPES |= {"U64": 8, "F64": 8}
-_NUMPY = {"BOOL": "u1", "U16": "<u2", "F16": "<f2", "I32": "<i4", "F32": "<f4", "I64": "<i8", "F64": "<f8"}
+_NUMPY = {"BOOL": "u1", "U8": "u1", "U16": "<u2", "F16": "<f2", "I32": "<i4", "F32": "<f4", "I64": "<i8", "F64": "<f8"}
 
 
 def mutate_value(random: Random, value: Any, times: int | None = None) -> Any:
@@ -97,10 +97,14 @@ def _spoil(random: Random, value: Any) -> Any:
             value[place] = _spoil(random, value[place])
         return value
     if isinstance(value, (int, float)) and not isinstance(value, bool) and random.random() < 0.6:
-        return random.choice(
-            (value + 1, value - 1, -value, value * random.choice((0.5, 2, 10, 1000, 1e-3)), random.choice(INTERESTING))
-        )
+        return random.choice((value + 1, value - 1, -value, _scaled(random, value), random.choice(INTERESTING)))
     return _any_value(random)
+
+
+def _scaled(random: Random, value: float) -> float:
+    factor = random.choice((0.5, 2, 10, 1000, 1e-3))
+    # A whole number too large for a float has no half.
+    return value * factor if isinstance(factor, int) or abs(value) < 1e300 else value * 10
 
 
 def _any_value(random: Random) -> Any:

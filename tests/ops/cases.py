@@ -244,6 +244,7 @@ CASES = {
     "query_color": Case(scene_cases.scene_points),
     "render_step": Case(scene_cases.render_step),
     "track_gauss_newton": Case(scene_cases.track),
+    "measure_noise_": Case(scene_cases.measure_noise),
     "gauss_newton_poses": Case(scene_cases.frame_equations),
     "track_adam": Case(scene_cases.track_adam),
     "optimize_map_": Case(scene_cases.optimize_map),

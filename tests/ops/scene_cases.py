@@ -44,7 +44,7 @@ def render_step(generator, device, n):
 
 def track(generator, device, n):
     scene = make_scene(generator, random_decoder=True, device=device)
-    widths = dict(kernel_start=0.08, kernel_end=0.02, damping=1e-4, noise_crossover_depth=1.0)
+    widths = dict(kernel_start=0.08, kernel_end=0.02, damping=1e-4)
     key = {name: value for name, value in KEY.items() if name != "iteration"}
     options = ops.GaussNewtonOptions(num_pixels=32, iterations=2, truncation=TRUNCATION, **widths, **key)
     cells = torch.stack([uniform(generator, 6, 8), 1 + 0.05 * uniform(generator, 6, 8)], -1).to(device)
@@ -56,6 +56,29 @@ def track(generator, device, n):
         pose=POSE.to(device),
         intrinsics=INTRINSICS,
         options=options,
+        noise=torch.tensor([1e-6, 1e-5, 1e-4, 0.1], device=device),
+    )
+
+
+def measure_noise(generator, device, n):
+    images = (2000 + 100 * uniform(generator, 2, 12, 16)).to(torch.int32)
+    intensities = (255 * uniform(generator, 2, 12, 16)).to(torch.uint8).to(device)
+    keyframes = ops.DepthKeyframes(
+        images.to(torch.uint16).to(device),
+        1e-3,
+        POSE[None].to(device),
+        ((0, 0), (1, 0)),
+        INTRINSICS,
+        0.01,
+        0,
+        intensities,
+    )
+    return dict(
+        noise=ops.SensorNoise.unknown(device),
+        pixels=pixel_records(generator, n).to(device),
+        pose=POSE.to(device),
+        intrinsics=INTRINSICS,
+        depth_keyframes=keyframes,
     )
 
 

@@ -71,6 +71,7 @@ ELSEWHERE = {
     "encode_points": "test_prior_fusion.test_points_beyond_the_range_of_coordinates_are_skipped",
     "encode_frame_": "test_encode_frame.test_points_that_are_not_finite_or_too_far_are_skipped",
     "sample_frame_pixels": "test_pixel_sampling.test_pixels_are_those_of_numpy",
+    "measure_noise_": "test_sensor_noise.test_pixels_without_depth_add_nothing",
     "marching_cubes": "test_marching_cubes.test_unknown_samples_open_the_surface_around_them",
     "projective_icp": "test_projective_icp.test_holes_and_strangers_take_no_part",
 }

@@ -15,10 +15,12 @@ from tests.ops.tracking_scene import (
     OPTIONS,
     POSE,
     camera_points,
+    certainties,
     corner_depth,
     drawn_pixels,
     moved_points,
     moved_pose,
+    noise_model,
     pose7,
     rotation_exp,
     surface_equations,
@@ -115,21 +117,21 @@ def test_distances_are_those_from_the_walls(generator):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-@pytest.mark.parametrize("noise_crossover_depth", [0.0, 1.0])
-def test_the_step_is_that_of_autograd(device, generator, count, noise_crossover_depth):
+@pytest.mark.parametrize("noise", [None, (1e-6, 9e-6)])
+def test_the_step_is_that_of_autograd(device, generator, count, noise):
     """On a map without voxels the mean of the keyframes' equations is all there is."""
     scene, keyframes = ops.SceneView.empty(device=device), _keyframes(EARLIER[:count], device, 0.003, generator)
     records = corner_pixels(POSE, generator, 400)
     drawn = drawn_pixels(records)
-    certainty = 1 / (1 + (camera_points(drawn)[:, 2] / noise_crossover_depth) ** 4) if noise_crossover_depth else 1.0
+    noise = None if noise is None else noise_model(*noise, device=device)
+    certainty = certainties(noise, camera_points(drawn)[:, 2])[1]
     hessian, gradient = torch.zeros(6, 6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
     for k in range(count):
         residual, jacobian, compared = _equations(keyframes, k, drawn)
         h, g = _sums(residual, jacobian, _weight(residual) * compared * certainty)
         hessian, gradient = hessian + h / count, gradient + g / count
-    options = replace(ONE_STEP, noise_crossover_depth=noise_crossover_depth)
     pose, stats, map_hessian = ops.track_gauss_newton(
-        scene, records.to(device), pose7(POSE, device), INTRINSICS, options, depth_keyframes=keyframes
+        scene, records.to(device), pose7(POSE, device), INTRINSICS, ONE_STEP, noise=noise, depth_keyframes=keyframes
     )
     delta = _step(hessian, gradient)
     assert delta.norm() > 1e-3
@@ -271,6 +273,6 @@ def test_bad_keyframes_are_named(generator):
 def test_opcheck_with_keyframes(device, generator):
     scene, keyframes = make_scene(generator, random_decoder=False), _keyframes(EARLIER)
     options = replace(OPTIONS, num_pixels=32, iterations=2)
-    arguments = corner_pixels(POSE, generator, 50), pose7(POSE), *options.arguments(INTRINSICS)
+    arguments = [corner_pixels(POSE, generator, 50), pose7(POSE)], *options.arguments(INTRINSICS)
     call = (*scene.arguments(), *arguments, [], [], *keyframes.arguments())
     opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)

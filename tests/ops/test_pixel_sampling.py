@@ -34,32 +34,35 @@ def frame(generator, height=50, width=70, noise=0.004):
 
 
 def split(buffer, sampling, shape):
-    """Records, normals, depth thumbnail and small depth image as the buffer holds them."""
+    """Records, normals, depth thumbnail, small depth image and intensity image as the buffer holds them."""
     (h, w), (rows, columns) = sampling.thumbnail_shape(*shape), sampling.depth_image_shape(*shape)
-    words, depth_thumbnail, depth_image = buffer.split(
-        [6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2]
+    words, depth_thumbnail, depth_image, intensities = buffer.split(
+        [6 * sampling.count, (h * w + 1) // 2, (rows * columns + 1) // 2, (rows * columns + 3) // 4]
     )
     records, normals = words.view(2, sampling.count, 3)
     depth_thumbnail, depth_image = depth_thumbnail.view(torch.float16), depth_image.view(torch.uint16)
     assert not depth_thumbnail[h * w :].any()
-    assert not depth_image[rows * columns :].any()
+    intensities = intensities.view(torch.uint8)
+    assert not depth_image[rows * columns :].any() and not intensities[rows * columns :].any()
     return (
         records,
         normals.view(torch.float32),
         depth_thumbnail[: h * w].view(h, w),
         depth_image[: rows * columns].view(rows, columns),
+        intensities[: rows * columns].view(rows, columns),
     )
 
 
 def check_against_numpy(depth, color, sampling):
     buffer, num_valid = ops.sample_frame_pixels(depth, color, *CAMERA, sampling, *KEY)
-    records, normals, depth_thumbnail, depth_image = split(buffer, sampling, depth.shape)
+    records, normals, depth_thumbnail, depth_image, intensities = split(buffer, sampling, depth.shape)
     want = reference.sample_frame_pixels(depth.numpy(), color.numpy(), *CAMERA, sampling, *KEY)
-    assert num_valid == want[4]
+    assert num_valid == want[5]
     np.testing.assert_array_equal(records.numpy(), want[0])
     np.testing.assert_array_equal(normals.numpy(), want[1])
     np.testing.assert_array_equal(depth_thumbnail.numpy(), want[2])
     np.testing.assert_array_equal(depth_image.numpy(), want[3])
+    np.testing.assert_array_equal(intensities.numpy(), want[4])
     return records, normals
 
 
@@ -118,13 +121,15 @@ def test_half_precision_of_every_size_of_depth():
     assert torch.equal(split(buffer, sampling, huge.shape)[2], huge.half())
 
 
-def test_without_valid_depth_all_is_zero(generator):
+def test_without_valid_depth_all_but_intensities_is_zero(generator):
     depth, color = frame(generator)
     for nothing in (torch.zeros_like(depth), torch.full_like(depth, torch.nan), torch.zeros(0, 0)):
         shape = nothing.shape
         buffer, num_valid = ops.sample_frame_pixels(nothing, color[: shape[0], : shape[1]], *CAMERA, SAMPLING, *KEY)
         assert num_valid == 0
-        assert not buffer.any()
+        *others, intensities = split(buffer, SAMPLING, shape)
+        assert not any(part.any() for part in others)
+        assert intensities.any() == (intensities.numel() > 0)
 
 
 def test_strided_images(generator):
@@ -213,7 +218,7 @@ def test_opcheck_of_unprojection(device):
 def test_unprojection_is_the_formula(device, generator):
     depth, color = frame(generator)
     buffer, _ = ops.sample_frame_pixels(depth, color, *CAMERA, SAMPLING, *KEY)
-    records, normals, _, _ = split(buffer, SAMPLING, depth.shape)
+    records, normals, _, _, _ = split(buffer, SAMPLING, depth.shape)
     pose = torch.tensor([0.7, -0.3, 0.5, 0.2, 1.5, -2.0, 0.3])  # not of unit length
     rotation = torch.from_numpy(quaternion_to_matrix(pose[:4].double().numpy() / pose[:4].double().norm().item()))
     u, v = records[:, 0] & 0xFFFF, records[:, 0] >> 16

@@ -14,46 +14,54 @@ from tests.ops.tracking_scene import (
     OPTIONS,
     POSE,
     camera_points,
+    certainties,
     corner_depth,
     drawn_pixels,
     moved_points,
     moved_pose,
+    noise_model,
     pose7,
     surface_equations,
 )
 
+NOISES = [None, (0.0, 4e-5), (1e-6, 1e-6)]
 
-@pytest.mark.parametrize("noise_crossover_depth", [0.0, 0.7, 2.0])
-def test_far_pixels_weigh_less(device, generator, noise_crossover_depth):
-    """By 1 / (1 + (z / z0)^4) in the equations, which are told at a mean weight of 1; the fit doesn't know of it."""
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_far_pixels_weigh_less(device, generator, noise):
+    """By their variance in the equations, which are told at a mean weight of 1; the fit doesn't know of it."""
+    noise = None if noise is None else noise_model(*noise, device=device)
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
     drawn = drawn_pixels(records)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     depth = camera_points(drawn)[:, 2]
-    certain = weight / (1 + (depth / noise_crossover_depth) ** 4) if noise_crossover_depth else weight
-    options = replace(ONE_STEP, noise_crossover_depth=noise_crossover_depth, tf32=False)
-    _, stats, hessian = ops.track_gauss_newton(scene, records.to(device), pose7(POSE, device), INTRINSICS, options)
+    certain = weight * certainties(noise, depth)[0]
+    options = replace(ONE_STEP, tf32=False)
+    _, stats, hessian = ops.track_gauss_newton(
+        scene, records.to(device), pose7(POSE, device), INTRINSICS, options, noise=noise
+    )
     want = torch.einsum("n,ni,nj->ij", certain, jacobian, jacobian) * weight.sum() / certain.sum()
     assert torch.allclose(hessian.cpu().double(), want, rtol=0, atol=2e-3 * want.abs().max())
     assert stats[0, 0].item() == pytest.approx(float((weight * residual**2).sum() / weight.sum()), rel=1e-3)
     assert stats[0, 4].item() == pytest.approx(float(weight.mean()), rel=2e-3)
 
 
-@pytest.mark.parametrize("noise_crossover_depth", [0.0, 2.0])
-def test_statistics_have_a_kernel_of_their_own(device, generator, noise_crossover_depth):
+@pytest.mark.parametrize("noise", NOISES)
+def test_statistics_have_a_kernel_of_their_own(device, generator, noise):
     """The step is that of the iteration's kernel; the fit and the size of the equations are those of the other."""
+    noise = None if noise is None else noise_model(*noise, device=device)
     scene = make_scene(generator, random_decoder=True, device=device)
     records = corner_pixels(POSE, generator, 400)
     drawn = drawn_pixels(records)
     residual, jacobian, weight, _ = surface_equations(scene, drawn, 0.03)
     score_weight = surface_equations(scene, drawn, 0.05)[2]
     depth = camera_points(drawn)[:, 2]
-    certain = weight / (1 + (depth / noise_crossover_depth) ** 4) if noise_crossover_depth else weight
+    certain = weight * certainties(noise, depth)[0]
     arguments = scene, records.to(device), pose7(POSE, device), INTRINSICS
-    options = replace(ONE_STEP, noise_crossover_depth=noise_crossover_depth, tf32=False)
-    pose, plain, _ = ops.track_gauss_newton(*arguments, options)
-    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, replace(options, score_kernel=0.05))
+    options = replace(ONE_STEP, tf32=False)
+    pose, plain, _ = ops.track_gauss_newton(*arguments, options, noise=noise)
+    same_pose, stats, hessian = ops.track_gauss_newton(*arguments, replace(options, score_kernel=0.05), noise=noise)
     assert torch.equal(pose, same_pose)
     assert torch.equal(plain[:, 1:4], stats[:, 1:4])
     assert stats[0, 0].item() == pytest.approx(float((score_weight * residual**2).sum() / score_weight.sum()), rel=1e-3)
@@ -191,7 +199,8 @@ def test_devices_agree_with_a_reference(device, generator):
                 records.to(place),
                 start.to(place),
                 INTRINSICS,
-                replace(OPTIONS, noise_crossover_depth=1.0, tf32=False),
+                replace(OPTIONS, tf32=False),
+                noise=noise_model(1e-6, 9e-6, device=place),
                 reference=_reference(POSE, place),
             )  # fmt: skip
         )
@@ -216,6 +225,6 @@ def test_bad_references_are_named(generator):
 def test_opcheck_with_a_reference(generator):
     scene, reference = make_scene(generator, random_decoder=False), _reference(POSE)
     options = replace(OPTIONS, num_pixels=32, iterations=2)
-    arguments = corner_pixels(POSE, generator, 50), pose7(POSE), *options.arguments(INTRINSICS)
+    arguments = [corner_pixels(POSE, generator, 50), pose7(POSE)], *options.arguments(INTRINSICS)
     call = (*scene.arguments(), *arguments, *reference.arguments(), [], [], [])
     torch.library.opcheck(torch.ops.spslam.track_gauss_newton.default, call)

@@ -53,16 +53,16 @@ def rotation_exp(omega):
     return torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
 
 
-def camera_points(records):
+def camera_points(records, camera=INTRINSICS):
     """float64 [P, 3] surface points in camera axes."""
     u, v = (records[:, 0] & 0xFFFF).double(), (records[:, 0] >> 16).double()
     depth = records[:, 1].contiguous().view(torch.float32).double()
-    rays = [(u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy, torch.ones_like(u)]
+    rays = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)]
     return torch.stack(rays, 1) * depth[:, None]
 
 
-def moved_points(local, increment):
-    rotation, translation = torch.from_numpy(POSE[:3, :3]), torch.from_numpy(POSE[:3, 3])
+def moved_points(local, increment, pose=POSE):
+    rotation, translation = torch.from_numpy(pose[:3, :3]), torch.from_numpy(pose[:3, 3])
     return local @ (rotation_exp(increment[3:]) @ rotation).T + translation + increment[:3]
 
 
@@ -85,3 +85,18 @@ def surface_equations(scene, records, kernel):
     residual = TRUNCATION * sdf.double()
     jacobian = TRUNCATION * torch.einsum("ni,nij->nj", gradient.double(), points_by_increment)
     return residual, jacobian, (1 / (1 + (residual / kernel) ** 2)) ** 2 * inlier, inlier
+
+
+def noise_model(depth_floor, depth_growth, intensity_floor=1.0, intensity_growth=0.0, device="cpu"):
+    """`SensorNoise.model` of these variances."""
+    return torch.tensor([depth_floor, depth_growth, intensity_floor, intensity_growth], device=device)
+
+
+def certainties(noise, depth):
+    """Weights of residuals against the map and against keyframes, by depth (m); 1 without noise."""
+    if noise is None:
+        return torch.ones_like(depth), torch.ones_like(depth)
+    floor, growth = noise.cpu().double()[:2]
+    variance, most = floor + growth * depth**4, 0.003**2
+    surface = torch.clamp(1e-8 + floor, max=most)
+    return most / (most + variance), surface / torch.clamp(1e-8 + variance, min=surface)

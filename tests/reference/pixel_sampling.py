@@ -13,7 +13,7 @@ def usable_depth(depth: np.ndarray, min_depth: float, max_depth: float) -> np.nd
 
 
 def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSampling, seed, stream, frame):
-    """Records int32 [P, 3], normals float32 [P, 3], thumbnail float16, depth image uint16, number of valid pixels."""
+    """Records int32 [P, 3], normals float32 [P, 3], thumbnail, depth image, intensity image, number of valid pixels."""
     depth = usable_depth(depth, sampling.min_depth, sampling.max_depth)
     valid = np.flatnonzero(depth)
     count = sampling.count if len(valid) else 0
@@ -33,7 +33,14 @@ def sample_frame_pixels(depth, color, fx, fy, cx, cy, sampling: ops.PixelSamplin
     records[:, 2] = rgbc.view(np.uint32)[:, 0]
     step = sampling.thumbnail_step
     depth_thumbnail = depth[step // 2 :: step, step // 2 :: step].astype(np.float16)
-    return records.view(np.int32), normals, depth_thumbnail, _depth_image(depth, sampling), len(valid)
+    return (
+        records.view(np.int32),
+        normals,
+        depth_thumbnail,
+        _depth_image(depth, sampling),
+        _intensity_image(color, sampling),
+        len(valid),
+    )
 
 
 def _depth_image(depth: np.ndarray, sampling: ops.PixelSampling) -> np.ndarray:
@@ -42,3 +49,10 @@ def _depth_image(depth: np.ndarray, sampling: ops.PixelSampling) -> np.ndarray:
     kept = depth[:: sampling.depth_image_step, :: sampling.depth_image_step]
     units = np.floor(kept * (np.float32(1) / np.float32(sampling.depth_image_unit)) + np.float32(0.5))
     return np.where(units < 65536, units, 0).astype(np.uint16)
+
+
+def _intensity_image(color: np.ndarray, sampling: ops.PixelSampling) -> np.ndarray:
+    if sampling.depth_image_step == 0:
+        return np.zeros((0, 0), np.uint8)
+    kept = np.asarray(color)[:: sampling.depth_image_step, :: sampling.depth_image_step].astype(np.int64)
+    return ((kept @ np.array(ops.LUMA_WEIGHTS) + 500) // 1000).astype(np.uint8)

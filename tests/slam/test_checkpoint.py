@@ -84,6 +84,8 @@ def test_an_unchanged_checkpoint_is_read(load, checkpoint):
         ("pixels.records", (1, 256, 3), r"must be int32 \[2, 256, 3\], got int32 \[1, 256, 3\]"),
         ("pixels.has_pixels", (5,), r"must be bool \[2\], got bool \[5\]"),
         ("depth_keyframes.images", (6, 48, 63), r"must be uint16 \[6, 48, 64\], got uint16 \[6, 48, 63\]"),
+        ("depth_keyframes.intensities", (6, 48, 63), r"must be uint8 \[6, 48, 64\], got uint8 \[6, 48, 63\]"),
+        ("noise.counts", (2, 32, 127), r"must be int32 \[2, 32, 128\], got int32 \[2, 32, 127\]"),
         ("depth_keyframes.frames", (7,), r"must be int64 \[6\], got int64 \[7\]"),
         ("moments.geometry_decoder.first", (7,), r"must be float32 \[1473\], got float32 \[7\]"),
         ("moments.embeddings.second", (9, 8), r"must be float32 \[\d+, 8\], got float32 \[9, 8\]"),

@@ -1,4 +1,4 @@
-"""The depth images that tracking keeps: which, for how long, what of a lost frame; and what they are good for."""
+"""The images that tracking keeps: which, for how long, what of a lost frame; and what they are good for."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def filled(frames, skipped=()):
     store = DepthKeyframeStore(CAMERA, max_depth_m=6.5535, kernel_m=0.01)
     for frame in range(frames):
         if frame not in skipped:
-            store.add(frame, image(frame))
+            store.add(frame, image(frame), image(frame).to(torch.uint8))
     return store
 
 

@@ -12,10 +12,6 @@ namespace spslam {
 // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean score weight over all pixels
 constexpr int kTrackingStatSize = 5;
 
-// Weights of red, green and blue in an intensity (Rec. 601), in thousandths: whole numbers, so that means over many
-// pixels can be summed exactly. Python reads them by the op luma_weights.
-constexpr std::int64_t kLumaWeights[3] = {299, 587, 114};
-
 // A small gray image of an earlier frame, which tracking compares colors with; none where height is 0.
 struct ReferenceImage {
   const float* cells;  // [height, width, 2] intensity in [0, 1], depth (m; 0 where unknown)
@@ -26,12 +22,21 @@ struct ReferenceImage {
   float kernel;           // width of the robust kernel, intensity
 };
 
+// The variance of a pixel's depth z is depth_floor + depth_growth z^4 (m^2), that of the difference between its
+// intensity and an earlier image's, where that has the gradient g (1/px), intensity_floor + intensity_growth g^2.
+struct SensorNoise {
+  float depth_floor, depth_growth;          // m^2, 1/m^2
+  float intensity_floor, intensity_growth;  // of [0, 1], px^2
+};
+constexpr int kSensorNoiseSize = 4;
+
 constexpr int kMaxDepthKeyframes = 8;
 
 // Depth images of earlier frames, which tracking aligns surface points with; none where count is 0.
 struct DepthKeyframes {
-  const std::uint16_t* images;  // [R, height, width] depth in `unit`, 0 where unknown
-  const float* poses;           // [F, 7] T_world_camera
+  const std::uint16_t* images;      // [R, height, width] depth in `unit`, 0 where unknown
+  const std::uint8_t* intensities;  // [R, height, width] intensity in 1/255; may be null
+  const float* poses;               // [F, 7] T_world_camera
   std::int64_t height, width;
   Intrinsics intrinsics;         // of the images
   float unit;                    // m
@@ -43,21 +48,21 @@ struct DepthKeyframes {
 
 // The scalars of GaussNewtonOptions, type and name, in the order of the fields of ops.GaussNewtonOptions: a line here
 // and a field there are a new one, from Python down to the kernels.
-#define SPS_GAUSS_NEWTON_SCALARS(FIELD)                                                          \
-  FIELD(float, truncation)            /* m */                                                    \
-  FIELD(float, kernel_start)          /* m, width of the robust kernel at the first iteration */ \
-  FIELD(float, kernel_end)            /* m, at the last iterations */                            \
-  FIELD(double, damping)              /* relative Levenberg damping */                           \
-  FIELD(float, score_kernel)          /* m, of cost and mean weight; 0: the iteration's own */   \
-  FIELD(float, noise_crossover_depth) /* m, where noise that grows with z^2 equals the map's; 0: constant noise */
+#define SPS_GAUSS_NEWTON_SCALARS(FIELD)                                                 \
+  FIELD(float, truncation)   /* m */                                                    \
+  FIELD(float, kernel_start) /* m, width of the robust kernel at the first iteration */ \
+  FIELD(float, kernel_end)   /* m, at the last iterations */                            \
+  FIELD(double, damping)     /* relative Levenberg damping */                           \
+  FIELD(float, score_kernel) /* m, of cost and mean weight; 0: the iteration's own */
 #define SPS_DECLARE_FIELD(type, name) type name;
 
 struct GaussNewtonOptions {
   Intrinsics intrinsics;
   std::int64_t num_pixels, iterations;
   SPS_GAUSS_NEWTON_SCALARS(SPS_DECLARE_FIELD)
-  PhiloxKey key;  // its iteration is replaced by the running one
-  bool tf32;      // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
+  PhiloxKey key;       // its iteration is replaced by the running one
+  bool tf32;           // on CUDA devices that have it: factors of products in the decoder keep 10 bits of mantissa
+  const float* noise;  // [kSensorNoiseSize], the fields of SensorNoise; null weighs all depths alike, no intensities
   ReferenceImage reference;
   DepthKeyframes depth_keyframes;
 };

@@ -23,7 +23,7 @@ struct PixelSampling {
   std::int32_t step_px;           // of the normals' differences
   float max_jump;                 // of depth beside a normal, as a share
   std::int32_t thumbnail_step;    // px; the first pixel of the depth thumbnail lies at half of it
-  std::int32_t depth_image_step;  // px; the first pixel of the small depth image lies at 0; 0: no depth image
+  std::int32_t depth_image_step;  // px; the first pixel of the small images lies at 0; 0: no small images
   float depth_image_unit;         // m, of its depth
 };
 
@@ -33,6 +33,7 @@ struct SampledPixels {
   float* normals;                  // [count, 3], camera axes, towards the camera; 0 where unknown
   std::uint16_t* depth_thumbnail;  // [thumbnail_size(height), thumbnail_size(width)] float16 m, 0 where invalid
   std::uint16_t* depth_image;      // [depth_image_size(height), depth_image_size(width)] units, 0: invalid or too far
+  std::uint8_t* intensity_image;   // of the same size: intensity in 1/255
 };
 
 constexpr std::int32_t thumbnail_size(std::int32_t size, std::int32_t step) {

@@ -1,0 +1,30 @@
+#include "kernels/sensor_noise.h"
+
+namespace spslam {
+
+template <>
+void measure_noise<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t num_pixels, const float* pose,
+                        const Intrinsics& intrinsics, const DepthKeyframes& keyframes, std::int32_t* counts,
+                        float* noise) {
+  const Pose<float> T_world_camera = load_pose(pose);
+  DepthKeyframe loaded[kMaxDepthKeyframes];
+  for (int k = 0; k < keyframes.count; ++k) loaded[k] = load_depth_keyframe(keyframes, k);
+  for (std::int64_t i = 0; i < num_pixels; ++i) {
+    const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
+    if (!(pixel.depth > 0.0f)) continue;
+    const Vec3<float> world = surface_point(pixel, T_world_camera, intrinsics).world;
+    for (int k = 0; k < keyframes.count; ++k) {
+      count_residuals(keyframes, loaded[k], pixel, world, [&](std::int64_t at) { counts[at] += kResidualCount; });
+    }
+  }
+  for (int histogram = 0; histogram < kNoiseHistograms; ++histogram) {
+    BinVariance bins[kNoiseBins];
+    for (int b = 0; b < kNoiseBins; ++b) {
+      bins[b] = bin_variance(counts + (std::int64_t{histogram} * kNoiseBins + b) * kNoiseLevels, histogram);
+    }
+    fit_noise(bins, histogram, noise + 2 * histogram);
+  }
+  for (std::int64_t i = 0; i < kNoiseCounts; ++i) counts[i] -= counts[i] >> kFadeShift;
+}
+
+}  // namespace spslam

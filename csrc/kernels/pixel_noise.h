@@ -1,0 +1,63 @@
+// What the measured noise of a sensor means for a pixel's residuals: their weights.
+#pragma once
+
+#include <cmath>
+
+#include "core/macros.h"
+#include "core/vec.h"
+#include "spslam/gauss_newton.h"
+
+namespace spslam {
+
+// m, of the map's surface, and at most of a keyframe's, beside the noise of a pixel that grows with depth.
+constexpr float kSurfaceDeviation = 0.003f;
+// m, of a keyframe's surface at least.
+constexpr float kLeastSurfaceDeviation = 0.0001f;
+// A difference of intensities of one deviation counts as so many of a keyframe's surface.
+constexpr float kIntensityGain = 2.0f;
+// px, of images that are registered: what remains is alike for few pixels only.
+constexpr float kRegistrationError = 0.3f;
+// Width of the robust kernel of intensities, in deviations.
+constexpr float kRobustDeviations = 3.0f;
+
+SPS_INLINE SensorNoise load_sensor_noise(const float* numbers) {
+  return {numbers[0], numbers[1], numbers[2], numbers[3]};
+}
+
+SPS_INLINE float depth_variance(const SensorNoise& noise, float depth) {
+  const float squared = depth * depth;
+  return noise.depth_floor + noise.depth_growth * squared * squared;
+}
+
+// Of a difference between intensities where the image has these derivatives (1/px).
+SPS_INLINE float intensity_deviation(const SensorNoise* noise, float by_u, float by_v) {
+  return std::sqrt(noise->intensity_floor + noise->intensity_growth * (by_u * by_u + by_v * by_v));
+}
+
+// Share of the weight of intensities: images that are not registered are so alike for neighboring pixels, and that does
+// not average out, so their deviation counts twice.
+SPS_INLINE float intensity_share(const SensorNoise& noise) {
+  constexpr float kRegistered = kRegistrationError * kRegistrationError;
+  return kRegistered / std::fmax(noise.intensity_growth, kRegistered);
+}
+
+// Of a pixel of one depth and intensity: inverse variances of its residuals as shares of those without noise. A
+// keyframe's pixel has noise of its own, as large as the pixel's.
+struct PixelNoise {
+  const SensorNoise* sensor;  // null where the noise is not known
+  float map_certainty, keyframe_certainty;
+  float intensity;
+  float intensity_meters;  // that a difference of intensities of one deviation counts as
+};
+
+SPS_INLINE PixelNoise pixel_noise(const SensorNoise* sensor, float depth, float intensity) {
+  if (!sensor) return {nullptr, 1.0f, 1.0f, intensity, 0.0f};
+  constexpr float kMost = kSurfaceDeviation * kSurfaceDeviation,
+                  kLeast = kLeastSurfaceDeviation * kLeastSurfaceDeviation;
+  const float variance = depth_variance(*sensor, depth);
+  const float surface = std::fmin(kLeast + sensor->depth_floor, kMost);
+  return {sensor, kMost / (kMost + variance), surface / std::fmax(kLeast + variance, surface), intensity,
+          kIntensityGain * std::sqrt(surface * intensity_share(*sensor))};
+}
+
+}  // namespace spslam

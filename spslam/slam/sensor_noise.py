@@ -1,0 +1,48 @@
+"""The noise of the recording's depth and color, measured while it is tracked."""
+
+import torch
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.slam.pixels import FramePixels
+
+PIXELS = 3000  # of a frame, that residuals are counted of
+
+
+class SensorNoiseEstimate:
+    """What is known of the noise; see `ops.SensorNoise` for the model.
+
+    Args:
+        camera: of all frames.
+        depth_noise_m: deviation of depth at 1 m, which grows with its square; None measures it.
+        device: where it is measured.
+    """
+
+    def __init__(self, camera: Camera, depth_noise_m: float | None = None, device: torch.device | str = "cpu"):
+        self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+        self._noise = ops.SensorNoise.unknown(device)
+        self._depth_noise_m = depth_noise_m
+        self._fix_depth()
+
+    @property
+    def model(self) -> torch.Tensor:
+        """float32 [4] for `ops.track_gauss_newton`, on the device."""
+        return self._noise.model
+
+    def measure(self, pixels: FramePixels, pose: torch.Tensor, depth_keyframes: ops.DepthKeyframes) -> None:
+        """Takes account of a frame at a trusted pose, float32 [7]; asynchronously."""
+        ops.measure_noise_(self._noise, pixels.records[:PIXELS], pose, self._intrinsics, depth_keyframes)
+        self._fix_depth()
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All that a checkpoint needs."""
+        return self._noise._asdict()
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Replaces the content by a copy of what `tensors()` returned."""
+        for name, tensor in self.tensors().items():
+            tensor.copy_(state[name])
+
+    def _fix_depth(self) -> None:
+        if self._depth_noise_m is not None:
+            self._noise.model[1].fill_(self._depth_noise_m**2)
