@@ -14,10 +14,19 @@ namespace spslam {
 
 // Bins are quarters of an octave, levels eighths: the first bits of a float's mantissa.
 constexpr int kBinShift = 21, kLevelShift = 20;
-// Of depth (m) and of the gradient (1/px): the lower end of the first bin. Smaller ones belong to it too.
-constexpr float kFirstBin[kNoiseHistograms] = {0.25f, 0x1p-9f};
+// Of depth (m) and of the gradient (1/px): the lower end of the first bin. Smaller ones belong to it too. Functions, as
+// device code has no arrays of constants of the host.
+SPS_INLINE constexpr float first_bin(int histogram) {
+  return histogram == 0 ? 0.25f : 0x1p-9f;
+}
 // Of distances (m) and differences of intensity: the lower end of the first level.
-constexpr float kFirstLevel[kNoiseHistograms] = {0x1p-18f, 0x1p-15f};
+SPS_INLINE constexpr float first_level(int histogram) {
+  return histogram == 0 ? 0x1p-18f : 0x1p-15f;
+}
+// m^2; of [0, 1]: of the rounding of two intensities to 8 bits.
+SPS_INLINE constexpr double least_variance(int histogram) {
+  return histogram == 0 ? 1e-10 : 2.6e-6;
+}
 // A residual adds so much, so that counts fade by whole numbers; after every frame they lose a share of 1/16.
 constexpr std::int32_t kResidualCount = 256;
 constexpr int kFadeShift = 4;
@@ -60,8 +69,8 @@ SPS_INLINE float noise_step_value(double step, float first, int shift) {
 }
 
 SPS_INLINE std::int64_t noise_count_at(int histogram, float by, float residual) {
-  const int bin = noise_step(by, kFirstBin[histogram], kBinShift, kNoiseBins);
-  const int level = noise_step(std::fabs(residual), kFirstLevel[histogram], kLevelShift, kNoiseLevels);
+  const int bin = noise_step(by, first_bin(histogram), kBinShift, kNoiseBins);
+  const int level = noise_step(std::fabs(residual), first_level(histogram), kLevelShift, kNoiseLevels);
   return (std::int64_t{histogram} * kNoiseBins + bin) * kNoiseLevels + level;
 }
 
@@ -94,16 +103,16 @@ SPS_INLINE BinVariance bin_variance(const std::int32_t* counts, int histogram) {
   int level = 0;
   while (2 * (below + counts[level]) < total) below += counts[level++];
   const double within = (0.5 * static_cast<double>(total) - static_cast<double>(below)) / counts[level];
-  const float median = noise_step_value(level + within, kFirstLevel[histogram], kLevelShift);
+  const float median = noise_step_value(level + within, first_level(histogram), kLevelShift);
   const double deviation = static_cast<double>(kDeviationsPerMedian * median);
-  const double variance = deviation * deviation + kLeastVariance[histogram];
+  const double variance = deviation * deviation + least_variance(histogram);
   const double residuals = static_cast<double>(total) / kResidualCount;
   return {variance, residuals / (residuals + kHalfWeightResiduals)};
 }
 
 // What the variance grows with: the fourth power of depth, the square of the gradient.
 SPS_INLINE double noise_growth_of(int histogram, int bin) {
-  const double by = static_cast<double>(noise_step_value(bin + 0.5, kFirstBin[histogram], kBinShift));
+  const double by = static_cast<double>(noise_step_value(bin + 0.5, first_bin(histogram), kBinShift));
   return histogram == 0 ? by * by * by * by : by * by;
 }
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 
 # Sizes and indices that overflow, or that a check is likely to be off by one at.
+MAX_TEXT = 1_000_000  # characters
 INTERESTING = (
     *(0, 1, 2, 3, 4, 7, 8, 15, 16, 17, 31, 32, 63, 64, 100, 127, 128, 255, 256, 1000, 1023, 1024, 4095, 4096),
     *(2**15 - 1, 2**15, 2**16 - 1, 2**16, 2**20 - 1, 2**20, 2**21, 2**24, 2**25, 2**30, 2**31 - 1, 2**31, 2**31 + 1),
@@ -62,7 +63,8 @@ def mutate_text(random: Random, text: str, times: int | None = None) -> str:
     if random.random() < 0.125:
         return mutate_bytes(random, to_bytes(text)).decode("utf-8", "surrogateescape")
     for _ in range(times or random.choice((1, 1, 1, 2, 3, 4))):
-        text = random.choice(_TEXT_MUTATIONS)(random, text)
+        # Lines are repeated a thousand times, up to four times over: the harness has a limit on memory too.
+        text = random.choice(_TEXT_MUTATIONS)(random, text)[:MAX_TEXT]
     return text
 
 
