@@ -40,7 +40,6 @@ constexpr float kDeviationsPerMedian = 1.4826f;
 // Where the growth is determined by less than this, as all pixels have one depth, it stays nearly as it was: the share
 // of its information that the floor leaves.
 constexpr double kDeterminedShare = 0.01;
-constexpr double kLeastVariance[kNoiseHistograms] = {1e-10, 2.6e-6};
 
 SPS_INLINE std::int32_t float_bits(float value) {
   std::int32_t bits;
