@@ -14,8 +14,8 @@ namespace spslam {
 
 // Bins are quarters of an octave, levels eighths: the first bits of a float's mantissa.
 constexpr int kBinShift = 21, kLevelShift = 20;
-// Of depth (m) and of the gradient (1/px): the lower end of the first bin. Smaller ones belong to it too. Functions, as
-// device code has no arrays of constants of the host.
+// Of depth (m) and of the gradient (1/px): the lower end of the first bin. Smaller ones belong to it too. A function,
+// as device code cannot read arrays of the host.
 SPS_INLINE constexpr float first_bin(int histogram) {
   return histogram == 0 ? 0.25f : 0x1p-9f;
 }
@@ -23,7 +23,7 @@ SPS_INLINE constexpr float first_bin(int histogram) {
 SPS_INLINE constexpr float first_level(int histogram) {
   return histogram == 0 ? 0x1p-18f : 0x1p-15f;
 }
-// m^2; of [0, 1]: of the rounding of two intensities to 8 bits.
+// Of a bin, m^2; of [0, 1]: that of the rounding of two intensities to 8 bits.
 SPS_INLINE constexpr double least_variance(int histogram) {
   return histogram == 0 ? 1e-10 : 2.6e-6;
 }
@@ -36,7 +36,6 @@ constexpr std::int64_t kLeastResiduals = 50;
 constexpr double kHalfWeightResiduals = 200.0;
 // Standard deviation of normal numbers over the median of their sizes.
 constexpr float kDeviationsPerMedian = 1.4826f;
-// m^2; of [0, 1]: of the rounding of two intensities to 8 bits.
 // Where the growth is determined by less than this, as all pixels have one depth, it stays nearly as it was: the share
 // of its information that the floor leaves.
 constexpr double kDeterminedShare = 0.01;
