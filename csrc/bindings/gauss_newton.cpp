@@ -25,6 +25,7 @@ enum class Scalar { kFx, kFy, kCx, kCy, SPS_GAUSS_NEWTON_SCALARS(SPS_NAME_PLACE)
 #undef SPS_NAME_PLACE
 enum class Integer { kNumPixels, kIterations, kSeed, kStream, kFrame, kTf32, kCount };
 enum class ReferenceScalar { kFx, kFy, kCx, kCy, kWeight, kKernel, kCount };
+
 // Of the cells and the pose; none without tensors. They must outlive the launch.
 ReferenceImage load_reference(const std::vector<Tensor>& tensors, const std::vector<double>& numbers) {
   if (tensors.empty()) return {};

@@ -41,8 +41,8 @@ SPS_INLINE float intensity_share(const SensorNoise& noise) {
   return kRegistered / std::fmax(noise.intensity_growth, kRegistered);
 }
 
-// Of a pixel of one depth and intensity: inverse variances of its residuals as shares of those without noise. A
-// keyframe's pixel has noise of its own, as large as the pixel's.
+// Of a pixel of one depth and intensity: inverse variances of its residuals, against the map as a share of that without
+// noise, against a keyframe as a share of that of the nearest pixels.
 struct PixelNoise {
   const SensorNoise* sensor;  // null where the noise is not known
   float map_certainty, keyframe_certainty;

@@ -41,7 +41,7 @@ class TrackingOptions(Section):
     damping: float = option("Gauss-Newton: fraction of its diagonal that is added to the normal matrix", ge=0)
     depth_noise_m: float | None = option(
         "Gauss-Newton: standard deviation of depth at 1 m, which grows with the square of depth; null measures it "
-        "against depth keyframes, 0 weights all depths equally",
+        "against depth keyframes, and without them assumes that of a Kinect; 0 weights all depths equally",
         "m",
         ge=0,
         le=0.1,

@@ -1,4 +1,4 @@
-"""Generated places: exact depth, closed surfaces, ways without collision, and how fast they render."""
+"""Generated places: exact depth, closed surfaces, and ways without collision."""
 
 import numpy as np
 import pytest
