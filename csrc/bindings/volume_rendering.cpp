@@ -30,18 +30,26 @@ void check_shape(const char* function, const char* argument, const Tensor& tenso
   SPS_CHECK(has_shape(tensor, shape), function, ": ", argument, " must fit the shape of sdf");
 }
 
+// Channels of the color of a ray's samples: 3, or 0 where only depth and weights are wanted.
+std::int64_t color_channels(const char* function, const Samples& samples, const Tensor& color) {
+  const bool colored = !has_shape(color, {-1, -1, 0});
+  check_shape(function, "color", color, {samples.rays(), samples.count(), colored ? 3 : 0});
+  return colored ? 3 : 0;
+}
+
 std::tuple<Tensor, Tensor, Tensor> volume_render(Tensor sdf, Tensor color, Tensor t, Tensor valid, double truncation) {
   const Samples samples("volume_render", sdf, t, valid);
-  check_shape("volume_render", "color", color, {samples.rays(), samples.count(), 3});
+  const std::int64_t channels = color_channels("volume_render", samples, color);
   DeviceScope scope(sdf);
   color = contiguous(color);
   const ScalarType dtype = sdf.scalar_type();
-  Tensor out_color = empty(sdf, {samples.rays(), 3}, dtype), out_depth = empty(sdf, {samples.rays()}, dtype);
+  Tensor out_color = empty(sdf, {samples.rays(), channels}, dtype), out_depth = empty(sdf, {samples.rays()}, dtype);
   Tensor weights = empty(sdf, {samples.rays(), samples.count()}, dtype);
   dispatch_floating("volume_render", sdf, [&](auto zero) {
     using T = decltype(zero);
     spslam::volume_render(scope.context, samples.table<T>(), data<T>(color), static_cast<T>(truncation),
-                          mutable_data<T>(out_color), mutable_data<T>(out_depth), mutable_data<T>(weights));
+                          channels ? mutable_data<T>(out_color) : nullptr, mutable_data<T>(out_depth),
+                          mutable_data<T>(weights));
   });
   return {out_color, out_depth, weights};
 }
@@ -51,9 +59,9 @@ std::tuple<Tensor, Tensor, Tensor> volume_render_backward(Tensor grad_color, Ten
                                                           Tensor t, Tensor valid, Tensor weights, double truncation) {
   const char* name = "volume_render_backward";
   const Samples samples(name, sdf, t, valid);
-  check_shape(name, "color", color, {samples.rays(), samples.count(), 3});
+  const std::int64_t channels = color_channels(name, samples, color);
   check_shape(name, "weights", weights, {samples.rays(), samples.count()});
-  check_shape(name, "grad_color", grad_color, {samples.rays(), 3});
+  check_shape(name, "grad_color", grad_color, {samples.rays(), channels});
   check_shape(name, "grad_depth", grad_depth, {samples.rays()});
   if (grad_weights) check_shape(name, "grad_weights", *grad_weights, {samples.rays(), samples.count()});
   DeviceScope scope(sdf);
@@ -64,14 +72,14 @@ std::tuple<Tensor, Tensor, Tensor> volume_render_backward(Tensor grad_color, Ten
   if (grad_weights) grad_weights = contiguous(*grad_weights);
   const ScalarType dtype = sdf.scalar_type();
   const std::int64_t rays = samples.rays(), count = samples.count();
-  Tensor sdf_out = empty(sdf, {rays, count}, dtype), color_out = empty(sdf, {rays, count, 3}, dtype);
+  Tensor sdf_out = empty(sdf, {rays, count}, dtype), color_out = empty(sdf, {rays, count, channels}, dtype);
   Tensor t_out = empty(sdf, {rays, count}, dtype);
   dispatch_floating(name, sdf, [&](auto zero) {
     using T = decltype(zero);
     spslam::volume_render_backward(scope.context, samples.table<T>(), data<T>(color), data<T>(weights),
-                                   static_cast<T>(truncation), data<T>(grad_color), data<T>(grad_depth),
-                                   grad_weights ? data<T>(*grad_weights) : nullptr, mutable_data<T>(sdf_out),
-                                   mutable_data<T>(color_out), mutable_data<T>(t_out));
+                                   static_cast<T>(truncation), channels ? data<T>(grad_color) : nullptr,
+                                   data<T>(grad_depth), grad_weights ? data<T>(*grad_weights) : nullptr,
+                                   mutable_data<T>(sdf_out), mutable_data<T>(color_out), mutable_data<T>(t_out));
   });
   return {sdf_out, color_out, t_out};
 }

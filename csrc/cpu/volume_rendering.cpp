@@ -66,11 +66,45 @@ class PaddedSamples {
 // Deeper than any surface: such a sample is neither near nor free. Its square may overflow, and is not used.
 constexpr double kBehindEverything = 1e30;
 
+template <class T>
+void render_without_color(const SampleTable<T>& table, T truncation, T* out_depth, T* weights) {
+  parallel_for(table.num_rays, kRayGrain, [&](std::int64_t begin, std::int64_t end) {
+    PaddedSamples<T> samples(table, T(0));
+    PaddedRow<T> ray_weights(table.num_samples, 1, T(0));
+    for (std::int64_t r = begin; r < end; ++r) {
+      T* const no_color = nullptr;
+      render_ray<false>(samples.load(r), no_color, truncation, no_color, out_depth + r, ray_weights.data());
+      ray_weights.store(weights, r);
+    }
+  });
+}
+
+template <class T>
+void render_without_color_backward(const SampleTable<T>& table, const T* weights, T truncation, const T* grad_out_depth,
+                                   const T* grad_weights, T* grad_sdf, T* grad_t) {
+  const std::int64_t count = table.num_samples;
+  parallel_for(table.num_rays, kRayGrain, [&](std::int64_t begin, std::int64_t end) {
+    PaddedSamples<T> samples(table, T(0));
+    PaddedRow<T> ray_weights(count, 1, T(0)), ray_grad_weights(count, 1, T(0));
+    PaddedRow<T> ray_grad_sdf(count, 1, T(0)), ray_grad_t(count, 1, T(0));
+    for (std::int64_t r = begin; r < end; ++r) {
+      const RenderGradient<T> grad{nullptr, grad_out_depth[r],
+                                   grad_weights ? ray_grad_weights.load(grad_weights, r) : ray_grad_weights.data()};
+      T* const no_color = nullptr;
+      render_ray_backward<false>(samples.load(r), no_color, ray_weights.load(weights, r), truncation, grad,
+                                 ray_grad_sdf.data(), no_color, ray_grad_t.data());
+      ray_grad_sdf.store(grad_sdf, r);
+      ray_grad_t.store(grad_t, r);
+    }
+  });
+}
+
 }  // namespace
 
 template <class Device, class T>
 void volume_render(Device, const SampleTable<T>& table, const T* color, T truncation, T* out_color, T* out_depth,
                    T* weights) {
+  if (!out_color) return render_without_color(table, truncation, out_depth, weights);
   parallel_for(table.num_rays, kRayGrain, [&](std::int64_t begin, std::int64_t end) {
     PaddedSamples<T> samples(table, T(0));
     PaddedRow<T> ray_color(table.num_samples, 3, T(0)), ray_weights(table.num_samples, 1, T(0));
@@ -86,6 +120,9 @@ template <class Device, class T>
 void volume_render_backward(Device, const SampleTable<T>& table, const T* color, const T* weights, T truncation,
                             const T* grad_out_color, const T* grad_out_depth, const T* grad_weights, T* grad_sdf,
                             T* grad_color, T* grad_t) {
+  if (!grad_out_color) {
+    return render_without_color_backward(table, weights, truncation, grad_out_depth, grad_weights, grad_sdf, grad_t);
+  }
   const std::int64_t count = table.num_samples;
   parallel_for(table.num_rays, kRayGrain, [&](std::int64_t begin, std::int64_t end) {
     PaddedSamples<T> samples(table, T(0));

@@ -16,6 +16,13 @@ template <class Device, class T>
 void volume_render(Device device, const SampleTable<T>& table, const T* color, T truncation, T* out_color, T* out_depth,
                    T* weights) {
   const SampleTable<T> samples = table;
+  if (!out_color) {
+    return for_each(device, samples.num_rays, [=] __device__(std::int64_t r) {
+      T* const no_color = nullptr;
+      render_ray<false>(ray_samples(samples, r), no_color, truncation, no_color, out_depth + r,
+                        weights + r * samples.num_samples);
+    });
+  }
   for_each(device, samples.num_rays, [=] __device__(std::int64_t r) {
     const std::int64_t first = r * samples.num_samples;
     render_ray(ray_samples(samples, r), color + 3 * first, truncation, out_color + 3 * r, out_depth + r,
@@ -28,6 +35,15 @@ void volume_render_backward(Device device, const SampleTable<T>& table, const T*
                             const T* grad_out_color, const T* grad_out_depth, const T* grad_weights, T* grad_sdf,
                             T* grad_color, T* grad_t) {
   const SampleTable<T> samples = table;
+  if (!grad_out_color) {
+    return for_each(device, samples.num_rays, [=] __device__(std::int64_t r) {
+      const std::int64_t first = r * samples.num_samples;
+      T* const no_color = nullptr;
+      const RenderGradient<T> grad{no_color, grad_out_depth[r], grad_weights ? grad_weights + first : nullptr};
+      render_ray_backward<false>(ray_samples(samples, r), no_color, weights + first, truncation, grad, grad_sdf + first,
+                                 no_color, grad_t + first);
+    });
+  }
   for_each(device, samples.num_rays, [=] __device__(std::int64_t r) {
     const std::int64_t first = r * samples.num_samples;
     const RenderGradient<T> grad{grad_out_color + 3 * r, grad_out_depth[r],

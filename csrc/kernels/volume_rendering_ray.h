@@ -27,8 +27,8 @@ SPS_INLINE T first_crossing(const RaySamples<T, Mask>& ray) {
   return first;
 }
 
-// Color [3], depth and normalized weights of a ray (5, 6). `color` is [S, 3].
-template <class T, class Mask>
+// Color [3], depth and normalized weights of a ray (5, 6). `color` is [S, 3]. With kColored false there is no color.
+template <bool kColored = true, class T, class Mask>
 SPS_INLINE void render_ray(const RaySamples<T, Mask>& ray, const T* color, T truncation, T* out_color, T* out_depth,
                            T* weights) {
   const T first = first_crossing(ray), inverse_truncation = 1 / truncation;
@@ -46,14 +46,18 @@ SPS_INLINE void render_ray(const RaySamples<T, Mask>& ray, const T* color, T tru
   for (std::int32_t i = 0; i < ray.count; ++i) {
     const T weight = weights[i] * scale;
     weights[i] = weight;
-    red += weight * color[3 * i];
-    green += weight * color[3 * i + 1];
-    blue += weight * color[3 * i + 2];
+    if constexpr (kColored) {
+      red += weight * color[3 * i];
+      green += weight * color[3 * i + 1];
+      blue += weight * color[3 * i + 2];
+    }
     depth += weight * ray.t[i];
   }
-  out_color[0] = red;
-  out_color[1] = green;
-  out_color[2] = blue;
+  if constexpr (kColored) {
+    out_color[0] = red;
+    out_color[1] = green;
+    out_color[2] = blue;
+  }
   *out_depth = depth;
 }
 
@@ -65,14 +69,16 @@ struct RenderGradient {
   const T* weights;
 
   // d L / d weight of a sample.
+  template <bool kColored>
   SPS_INLINE T of_weight(std::int32_t i, const T* sample_color, T t) const {
+    if constexpr (!kColored) return depth * t + (weights ? weights[i] : T(0));
     const T* c = sample_color + 3 * i;
     return color[0] * c[0] + color[1] * c[1] + color[2] * c[2] + depth * t + (weights ? weights[i] : T(0));
   }
 };
 
 // `weights` are those that render_ray returned.
-template <class T, class Mask>
+template <bool kColored = true, class T, class Mask>
 SPS_INLINE void render_ray_backward(const RaySamples<T, Mask>& ray, const T* color, const T* weights, T truncation,
                                     const RenderGradient<T>& grad, T* grad_sdf, T* grad_color, T* grad_t) {
   const T first = first_crossing(ray), inverse_truncation = 1 / truncation;
@@ -84,16 +90,18 @@ SPS_INLINE void render_ray_backward(const RaySamples<T, Mask>& ray, const T* col
     const Bell<T> b = bell(ray.sdf[i], inverse_truncation);
     sum += visible ? b.value : T(0);
     slopes[i] = visible ? b.slope : T(0);
-    mean += weights[i] * grad.of_weight(i, color, ray.t[i]);
+    mean += weights[i] * grad.template of_weight<kColored>(i, color, ray.t[i]);
   }
   const T scale = inverse_weight_sum(sum);
   SPS_SIMD
   for (std::int32_t i = 0; i < ray.count; ++i) {
-    grad_sdf[i] = weight_backward(grad.of_weight(i, color, ray.t[i]), mean, slopes[i], scale);
+    grad_sdf[i] = weight_backward(grad.template of_weight<kColored>(i, color, ray.t[i]), mean, slopes[i], scale);
     grad_t[i] = weights[i] * grad.depth;
-    grad_color[3 * i] = weights[i] * grad.color[0];
-    grad_color[3 * i + 1] = weights[i] * grad.color[1];
-    grad_color[3 * i + 2] = weights[i] * grad.color[2];
+    if constexpr (kColored) {
+      grad_color[3 * i] = weights[i] * grad.color[0];
+      grad_color[3 * i + 1] = weights[i] * grad.color[1];
+      grad_color[3 * i + 2] = weights[i] * grad.color[2];
+    }
   }
 }
 

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 import torch
 
 FLOATING = (torch.float32, torch.float64)
+# Of tables that are read in float32 where they are smaller.
+TABLES = (*FLOATING, torch.float16, torch.bfloat16)
+INTEGERS = (torch.int32, torch.int64)
 
 
 def check(condition: bool, function: str, argument: str, rule: str, actual: object) -> None:
@@ -23,7 +26,7 @@ def check_tensor(
     function: str,
     argument: str,
     tensor: torch.Tensor,
-    shape: Sequence[int | str],
+    shape: Sequence[int | str] | None,
     dtype: torch.dtype | Sequence[torch.dtype],
     like: torch.Tensor | None = None,
 ) -> None:
@@ -33,7 +36,7 @@ def check_tensor(
         function: name of the public function, for the message.
         argument: name of the argument, for the message.
         tensor: what the caller passed.
-        shape: an int fixes an axis, a str only names it.
+        shape: an int fixes an axis, a str only names it; None allows any shape.
         dtype: the dtype or dtypes allowed.
         like: a tensor whose device must be the same.
 
@@ -47,11 +50,34 @@ def check_tensor(
     if tensor.dtype not in dtypes:
         names = " or ".join(str(d).removeprefix("torch.") for d in dtypes)
         raise TypeError(f"{function}: {argument} must be {names}, got {str(tensor.dtype).removeprefix('torch.')}")
-    fits = tensor.dim() == len(shape) and all(
-        not isinstance(axis, int) or tensor.shape[i] == axis for i, axis in enumerate(shape)
-    )
-    if not fits:
+    sizes = tuple(tensor.shape)  # read once: ops are called several times a frame
+    if shape is not None and (
+        len(sizes) != len(shape)
+        or any(size != axis and not isinstance(axis, str) for size, axis in zip(sizes, shape, strict=True))
+    ):
         wanted = "[" + ", ".join(str(axis) for axis in shape) + "]"
         raise ValueError(f"{function}: {argument} must have shape {wanted}, got {list(tensor.shape)}")
     if like is not None and tensor.device != like.device:
         raise ValueError(f"{function}: {argument} must be on {like.device}, got {tensor.device}")
+
+
+def wide(table: torch.Tensor) -> torch.Tensor:
+    """A table in the dtype that kernels compute in: float32 for float16 and bfloat16. Gradients flow back."""
+    return table.float() if table.dtype in (torch.float16, torch.bfloat16) else table
+
+
+def rows_shape(tensor: torch.Tensor, *trailing: int | str) -> tuple[int | str, ...]:
+    """The shape to check rows against that may have more than one leading axis: [N, ...] or [..., ...]."""
+    leading = getattr(tensor, "ndim", 0) - len(trailing)
+    return (*tensor.shape[:leading], *trailing) if leading > 1 else ("N", *trailing)
+
+
+def flat_rows(tensor: torch.Tensor, trailing: int = 1) -> torch.Tensor:
+    """The tensor with all axes before the last `trailing` ones made one, where they are more than one."""
+    leading = tensor.ndim - trailing
+    return tensor.flatten(0, leading - 1) if leading > 1 else tensor
+
+
+def unflat_rows(tensor: torch.Tensor, leading: Sequence[int]) -> torch.Tensor:
+    """The tensor with its first axis made the axes `leading` again."""
+    return tensor.view(*leading, *tensor.shape[1:]) if len(leading) > 1 else tensor

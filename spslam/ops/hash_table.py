@@ -1,16 +1,19 @@
 """The voxel hash as an object that grows: the table, its coordinates, and the corners of every cell."""
 
+from typing import Literal, overload
+
 import torch
 
-from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._checks import FLOATING, INTEGERS, check, check_tensor, flat_rows, rows_shape, unflat_rows
 from spslam.ops._public import public_op
+from spslam.ops._voxel_queries import as_voxel_coords, vertices_around
+from spslam.ops.hash_lookup import LARGEST_REACH, VoxelLookup
 from spslam.ops.voxel_hash import (
     absent_voxels,
     new_voxel_hash,
     voxel_hash_build_,
     voxel_hash_find,
     voxel_hash_insert,
-    voxel_hash_lookup,
     voxel_hash_update_corner_ids,
 )
 
@@ -32,12 +35,15 @@ class VoxelLimitError(RuntimeError):
         self.max_voxels = max_voxels
 
 
-class VoxelHash:
+class VoxelHash(VoxelLookup):
     """A set of V voxel vertices, each with an id that it keeps; tables of features have a row for each id.
 
     It holds what the functions `voxel_hash_*` work on, and makes room as the set grows: buffers double, so that growth
     is amortized, and a view's memory stays where it is until `capacity` changes. `spslam.scene.SparseVolume` is this
     with embeddings and fusion weights beside it.
+
+    Coordinates are int32 or int64 [N, 3], or with more leading axes, [..., 3]; what is returned per row has the same
+    ones. `len(cells)` is V, and `(x, y, z) in cells` says whether that vertex exists.
 
     Args:
         capacity: vertices to make room for at first; rounded up to a power of two.
@@ -79,6 +85,17 @@ class VoxelHash:
     def __len__(self) -> int:
         return self.num_voxels
 
+    def __repr__(self) -> str:
+        limit = "" if self.max_voxels is None else f", max_voxels={self.max_voxels}"
+        extent = ""
+        if self.num_voxels:
+            low, high = (part.tolist() for part in torch.aminmax(self.voxel_coords, dim=0))
+            extent = f" from {tuple(low)} to {tuple(high)}"
+        return (
+            f"VoxelHash({self.num_voxels} voxels{extent}, capacity={self.capacity}{limit}, "
+            f"device='{self.hash_keys.device}')"
+        )
+
     @property
     def capacity(self) -> int:
         """Vertices there is room for; tables of as many rows stay valid until it changes."""
@@ -94,33 +111,102 @@ class VoxelHash:
         """int32 [V, 8], the ids of the corners of the cell above each vertex, all -1 where one is missing."""
         return self.corners_buffer[: self.num_voxels]
 
-    def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor:
+    @overload
+    def insert(self, voxel_coords: torch.Tensor, return_new: Literal[False] = False) -> torch.Tensor: ...
+
+    @overload
+    def insert(self, voxel_coords: torch.Tensor, return_new: Literal[True]) -> tuple[torch.Tensor, torch.Tensor]: ...
+
+    def insert(
+        self, voxel_coords: torch.Tensor, return_new: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, torch.Tensor]:
         """Enters the coordinates that are missing.
 
         Args:
-            voxel_coords: int32 [N, 3] in [-2^20, 2^20 - 1], repetitions allowed; N = 0 changes nothing.
+            voxel_coords: int32 or int64 [N, 3] in [-2^20, 2^20 - 1], repetitions allowed; N = 0 changes nothing.
+            return_new: whether to return as well which rows were missing.
 
         Returns:
-            voxel_ids int32 [N]. New ids start at `len(self)`, in the order of (x, y, z): the same on every device.
+            voxel_ids int32 [N]. New ids start at `len(self)`, in the order of (x, y, z): the same on every device. With
+            `return_new` also bool [N], True in every row of a vertex that did not exist before.
 
         Raises:
             ValueError, TypeError: another shape, dtype or device.
             VoxelLimitError: more than `max_voxels` would exist. The set is then as before.
             RuntimeError: a coordinate out of range. The set is then as before.
         """
-        check_tensor("VoxelHash.insert", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=self.hash_keys)
-        voxel_ids = self.find(voxel_coords)
-        missing = voxel_coords[voxel_ids < 0]
-        if missing.shape[0] == 0:
-            return voxel_ids
-        self._enter(absent_voxels("VoxelHash.insert", self.hash_keys, self.hash_values, missing))
-        return self.find(voxel_coords)
+        coords, leading = self._rows("VoxelHash.insert", voxel_coords)
+        voxel_ids = self._find(coords)
+        missing = voxel_ids < 0
+        absent = coords[missing]
+        if absent.shape[0]:
+            self._enter(absent_voxels("VoxelHash.insert", self.hash_keys, self.hash_values, absent))
+            voxel_ids = self._find(coords)
+        voxel_ids = unflat_rows(voxel_ids, leading)
+        return (voxel_ids, unflat_rows(missing, leading)) if return_new else voxel_ids
+
+    @public_op(name="VoxelHash.insert_points")
+    def insert_points(self, points: torch.Tensor, voxel_size: float, band: float = 0.0) -> torch.Tensor:
+        """Enters the vertices that a field around points needs: of every cell within `band` of a point along each axis.
+
+        Args:
+            points: float32 or float64 [N, 3], world, meters. Points that are not finite, or whose cells are out of
+                range, are left out.
+            voxel_size: edge of a voxel, meters.
+            band: meters; 0 enters the eight corners of the cells that the points lie in.
+
+        Returns:
+            The new ids, int32 [M] in order: `len(self)` before, and so on. Waits for CUDA.
+
+        Raises:
+            ValueError, TypeError: a wrong shape, dtype, device, `voxel_size`, or `band` (0 to 64 voxels).
+            VoxelLimitError: more than `max_voxels` would exist. The set is then as before.
+        """
+        name = "VoxelHash.insert_points"
+        check_tensor(name, "points", points, rows_shape(points, 3), FLOATING, like=self.hash_keys)
+        check(voxel_size > 0, name, "voxel_size", "be positive", voxel_size)
+        check(0 <= band <= LARGEST_REACH * voxel_size, name, "band", f"be 0 to {LARGEST_REACH} voxels", band)
+        before = self.num_voxels
+        self.insert(vertices_around(flat_rows(points.detach()), voxel_size, band))
+        return torch.arange(before, self.num_voxels, dtype=torch.int32, device=self.hash_keys.device)
+
+    def keep(self, mask: torch.Tensor) -> torch.Tensor:
+        """Keeps the vertices of a mask and removes the others. Ids close up: features become `features[kept]`.
+
+        Args:
+            mask: bool [V], by id.
+
+        Returns:
+            kept int64 [V'], the old ids of what is left, in order; the new id of each is its place.
+
+        Raises:
+            ValueError, TypeError: another shape, dtype or device.
+        """
+        check_tensor("VoxelHash.keep", "mask", mask, [self.num_voxels], torch.bool, like=self.hash_keys)
+        kept = mask.nonzero()[:, 0]
+        if kept.shape[0] < self.num_voxels:
+            self.build(self.voxel_coords[kept])
+        return kept
+
+    def remove(self, voxel_coords: torch.Tensor) -> torch.Tensor:
+        """Removes vertices, those that exist of the given ones; returns what `keep` returns.
+
+        Args:
+            voxel_coords: int32 or int64 [N, 3].
+
+        Raises:
+            ValueError, TypeError: another shape, dtype or device.
+        """
+        ids = self._find(self._rows("VoxelHash.remove", voxel_coords)[0])
+        mask = torch.ones(self.num_voxels, dtype=torch.bool, device=ids.device)
+        mask[ids[ids >= 0].long()] = False
+        return self.keep(mask)
 
     def build(self, voxel_coords: torch.Tensor) -> None:
         """Replaces the content, as on loading a map: row i of `voxel_coords` becomes id i.
 
         Args:
-            voxel_coords: int32 [V, 3] in [-2^20, 2^20 - 1], distinct; V = 0 empties the set.
+            voxel_coords: int32 or int64 [V, 3] in [-2^20, 2^20 - 1], distinct; V = 0 empties the set.
 
         Raises:
             ValueError: another shape or device, a coordinate out of range, or one that occurs twice.
@@ -129,7 +215,8 @@ class VoxelHash:
 
         On an error the set is as before.
         """
-        check_tensor("VoxelHash.build", "voxel_coords", voxel_coords, ["V", 3], torch.int32, like=self.hash_keys)
+        check_tensor("VoxelHash.build", "voxel_coords", voxel_coords, ["V", 3], INTEGERS, like=self.hash_keys)
+        voxel_coords = as_voxel_coords(voxel_coords)
         rows = voxel_coords.shape[0]
         self._check_limit(rows)
         table = new_voxel_hash(2 * max(self.capacity, _power_of_two(rows)), voxel_coords.device)
@@ -145,17 +232,30 @@ class VoxelHash:
         self.num_voxels = rows
         voxel_hash_update_corner_ids(self.hash_keys, self.hash_values, self.voxel_coords, self.corner_ids, 0)
 
-    def find(self, voxel_coords: torch.Tensor) -> torch.Tensor:
-        """Ids int32 [N] of coordinates int32 [N, 3], -1 where absent; see `voxel_hash_find`."""
-        check_tensor("VoxelHash.find", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=self.hash_keys)
-        return voxel_hash_find(self.hash_keys, self.hash_values, voxel_coords)
+    def to(self, device: torch.device | str) -> "VoxelHash":
+        """The set on a device: itself if it is there, else a copy with the same ids."""
+        device, here = torch.device(device), self.hash_keys.device
+        if device.type == here.type and device.index in (None, here.index):
+            return self
+        copy = VoxelHash(self.capacity, device, self.max_voxels)
+        copy.build(self.voxel_coords.to(device))
+        return copy
 
-    @public_op(name="VoxelHash.lookup")
-    def lookup(self, points: torch.Tensor, voxel_size: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Corner ids int32 [N, 8] and local coordinates [N, 3] of points [N, 3] (m); see `voxel_hash_lookup`."""
-        check_tensor("VoxelHash.lookup", "points", points, ["N", 3], FLOATING, like=self.hash_keys)
-        check(voxel_size > 0, "VoxelHash.lookup", "voxel_size", "be positive", voxel_size)
-        return voxel_hash_lookup(self.hash_keys, self.hash_values, self.corner_ids, points, voxel_size)
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """What the set is: `voxel_coords` int32 [V, 3], a copy, of which `load_state_dict` makes the table."""
+        return {"voxel_coords": self.voxel_coords.clone()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Makes the set what it was when `state_dict` was taken, ids included; see `build` for errors.
+
+        Raises:
+            ValueError: other entries than `voxel_coords`.
+        """
+        name = "VoxelHash.load_state_dict"
+        check(set(state) == {"voxel_coords"}, name, "state", "have voxel_coords alone", sorted(state))
+        coords = state["voxel_coords"]
+        check_tensor(name, "voxel_coords", coords, ["V", 3], INTEGERS)
+        self.build(coords.to(self.hash_keys.device))
 
     @public_op(name="VoxelHash.reserve")
     def reserve(self, rows: int) -> None:

@@ -9,14 +9,17 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._autograd import register_gradient
-from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._checks import FLOATING, check, check_tensor, flat_rows, unflat_rows
+from spslam.ops._dispatch import call, full_precision
 from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap, register_rows_vmap
+
+_COLORS = 3  # channels that the kernel renders itself; others are sums by its weights
 
 
 @public_op()
 def volume_render(
-    sdf: torch.Tensor, color: torch.Tensor, t: torch.Tensor, valid: torch.Tensor, truncation: float
+    sdf: torch.Tensor, color: torch.Tensor, t: torch.Tensor, valid: torch.Tensor | None, truncation: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Color and depth of rays as weighted sums over their samples (equations 5 and 6).
 
@@ -26,14 +29,14 @@ def volume_render(
     any weight renders as zeros.
 
     Args:
-        sdf: [R, S] float32 or float64, normalized.
-        color: [R, S, 3] of the same dtype.
+        sdf: [R, S] float32 or float64, normalized. There may be more than one axis of rays, [..., S].
+        color: [R, S, C] of the same dtype; any channels, not only 3 colors.
         t: [R, S] of the same dtype, depth of the samples, meters, in any order.
-        valid: bool [R, S], whether a sample lies inside the volume.
+        valid: bool [R, S], whether a sample lies inside the volume; None for all.
         truncation: truncation distance tr, meters.
 
     Returns:
-        color [R, 3], depth [R] in meters, weights [R, S]. All three are differentiable with respect to `sdf`, `color`
+        color [R, C], depth [R] in meters, weights [R, S]. All three are differentiable with respect to `sdf`, `color`
         and `t`, for a fixed selection of samples. R = 0 gives empty tensors, S = 0 zeros. NaN propagates within its own
         ray only.
 
@@ -48,12 +51,22 @@ def volume_render(
         tensor([1.])
     """
     name = "volume_render"
-    check_tensor(name, "sdf", sdf, ("R", "S"), FLOATING)
-    check_tensor(name, "color", color, (*sdf.shape, 3), sdf.dtype, like=sdf)
-    check_tensor(name, "t", t, tuple(sdf.shape), sdf.dtype, like=sdf)
-    check_tensor(name, "valid", valid, tuple(sdf.shape), torch.bool, like=sdf)
+    check_tensor(name, "sdf", sdf, ("R", "S") if getattr(sdf, "ndim", 0) < 3 else None, FLOATING)
+    shape = tuple(sdf.shape)
+    check_tensor(name, "color", color, (*shape, "C"), sdf.dtype, like=sdf)
+    check_tensor(name, "t", t, shape, sdf.dtype, like=sdf)
+    if valid is None:
+        valid = torch.ones(shape, dtype=torch.bool, device=sdf.device)
+    check_tensor(name, "valid", valid, shape, torch.bool, like=sdf)
     check(truncation > 0, name, "truncation", "be positive", truncation)
-    return torch.ops.spslam.volume_render(sdf, color, t, valid, truncation)
+    sdf, t, valid, values = flat_rows(sdf), flat_rows(t), flat_rows(valid), flat_rows(color, 2)
+    colored = values.shape[2] == _COLORS
+    rendered, depth, weights = call(name, sdf, values if colored else values[..., :0], t, valid, truncation)
+    if not colored:
+        with full_precision(weights):
+            rendered = (weights[:, None] @ values)[:, 0]
+    leading = shape[:-1]
+    return unflat_rows(rendered, leading), unflat_rows(depth, leading), unflat_rows(weights, leading)
 
 
 @public_op()
@@ -130,15 +143,26 @@ def rendering_losses(
     check_tensor(name, "valid", valid, (rays, samples), torch.bool, like=sdf)
     check_tensor(name, "rendered", rendered, (rays,), torch.bool, like=sdf)
     check(truncation > 0, name, "truncation", "be positive", truncation)
-    return torch.ops.spslam.rendering_losses(
-        color, depth, sdf, t, valid, rendered, target_color, target_depth, cosine, truncation, cosine_targets
+    return call(
+        "rendering_losses",
+        color,
+        depth,
+        sdf,
+        t,
+        valid,
+        rendered,
+        target_color,
+        target_depth,
+        cosine,
+        truncation,
+        cosine_targets,
     )
 
 
 @torch.library.register_fake("spslam::volume_render")
 def _(sdf, color, t, valid, truncation):
     rays, samples = sdf.shape
-    return sdf.new_empty(rays, 3), sdf.new_empty(rays), sdf.new_empty(rays, samples)
+    return sdf.new_empty(rays, color.shape[2]), sdf.new_empty(rays), sdf.new_empty(rays, samples)
 
 
 @torch.library.register_fake("spslam::volume_render_backward")
@@ -166,10 +190,10 @@ def _save_render(ctx, inputs, output):
 def _render_backward(ctx, grad_color, grad_depth, grad_weights):
     sdf, color, t, valid, weights = ctx.saved_tensors
     rays = sdf.shape[0]
-    grad_color = sdf.new_zeros(rays, 3) if grad_color is None else grad_color
+    grad_color = sdf.new_zeros(rays, color.shape[2]) if grad_color is None else grad_color
     grad_depth = sdf.new_zeros(rays) if grad_depth is None else grad_depth
-    gradients = torch.ops.spslam.volume_render_backward(
-        grad_color, grad_depth, grad_weights, sdf, color, t, valid, weights, ctx.truncation
+    gradients = call(
+        "volume_render_backward", grad_color, grad_depth, grad_weights, sdf, color, t, valid, weights, ctx.truncation
     )
     return *gradients, None, None
 
@@ -180,7 +204,7 @@ def _save_losses(ctx, inputs, output):
 
 
 def _losses_backward(ctx, grad):
-    gradients = torch.ops.spslam.rendering_losses_backward(grad, *ctx.saved_tensors, ctx.truncation, ctx.cosine_targets)
+    gradients = call("rendering_losses_backward", grad, *ctx.saved_tensors, ctx.truncation, ctx.cosine_targets)
     return *gradients, None, None, None, None, None, None, None
 
 

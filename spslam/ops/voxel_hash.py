@@ -9,6 +9,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._autograd import register_gradient
 from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._dispatch import call
 from spslam.ops._public import public_op
 from spslam.ops._vmap import register_rows_vmap
 
@@ -40,7 +41,7 @@ def new_voxel_hash(capacity: int, device: torch.device | str = "cpu") -> tuple[t
     return hash_keys, torch.zeros(capacity, dtype=torch.int32, device=device)
 
 
-def _check_table(function: str, hash_keys: torch.Tensor, hash_values: torch.Tensor) -> None:
+def check_table(function: str, hash_keys: torch.Tensor, hash_values: torch.Tensor) -> None:
     check_tensor(function, "hash_keys", hash_keys, ["capacity"], torch.int64)
     capacity = hash_keys.shape[0]
     check(
@@ -82,7 +83,7 @@ def absent_voxels(
     function: str, hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_coords: torch.Tensor
 ) -> torch.Tensor:
     """`voxel_hash_absent` on behalf of another function, which its errors name."""
-    _check_table(function, hash_keys, hash_values)
+    check_table(function, hash_keys, hash_values)
     check_tensor(function, "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=hash_keys)
     return torch.ops.spslam.voxel_hash_absent(hash_keys, hash_values, voxel_coords, function)
 
@@ -119,7 +120,7 @@ def voxel_hash_insert(
         >>> voxel_hash_find(hash_keys, hash_values, coords)
         tensor([1, 0, 1], dtype=torch.int32)
     """
-    _check_table("voxel_hash_insert", hash_keys, hash_values)
+    check_table("voxel_hash_insert", hash_keys, hash_values)
     check_tensor("voxel_hash_insert", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=hash_keys)
     check(first_id >= 0, "voxel_hash_insert", "first_id", "be at least 0", first_id)
     return torch.ops.spslam.voxel_hash_insert(hash_keys, hash_values, voxel_coords, first_id)
@@ -145,7 +146,7 @@ def voxel_hash_build_(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_
         >>> voxel_hash_find(hash_keys, hash_values, coords)
         tensor([0, 1], dtype=torch.int32)
     """
-    _check_table("voxel_hash_build_", hash_keys, hash_values)
+    check_table("voxel_hash_build_", hash_keys, hash_values)
     check_tensor("voxel_hash_build_", "voxel_coords", voxel_coords, ["V", 3], torch.int32, like=hash_keys)
     if voxel_coords.numel():
         low, high = (int(bound) for bound in torch.aminmax(voxel_coords))
@@ -174,7 +175,7 @@ def voxel_hash_find(hash_keys: torch.Tensor, hash_values: torch.Tensor, voxel_co
         >>> voxel_hash_find(*new_voxel_hash(4), torch.zeros(1, 3, dtype=torch.int32))
         tensor([-1], dtype=torch.int32)
     """
-    _check_table("voxel_hash_find", hash_keys, hash_values)
+    check_table("voxel_hash_find", hash_keys, hash_values)
     check_tensor("voxel_hash_find", "voxel_coords", voxel_coords, ["N", 3], torch.int32, like=hash_keys)
     return torch.ops.spslam.voxel_hash_find(hash_keys, hash_values, voxel_coords)
 
@@ -213,7 +214,7 @@ def voxel_hash_update_corner_ids(
         ([0, 4, 2, 6, 1, 5, 3, 7], [-1, -1, -1, -1, -1, -1, -1, -1])
     """
     name = "voxel_hash_update_corner_ids"
-    _check_table(name, hash_keys, hash_values)
+    check_table(name, hash_keys, hash_values)
     check_tensor(name, "voxel_coords", voxel_coords, ["V", 3], torch.int32, like=hash_keys)
     voxels = voxel_coords.shape[0]
     check_tensor(name, "corner_ids", corner_ids, [voxels, 8], torch.int32, like=hash_keys)
@@ -253,12 +254,12 @@ def voxel_hash_lookup(
         tensor([[0., 0., 0.]])
     """
     name = "voxel_hash_lookup"
-    _check_table(name, hash_keys, hash_values)
+    check_table(name, hash_keys, hash_values)
     check_tensor(name, "corner_ids", corner_ids, ["V", 8], torch.int32, like=hash_keys)
     check_tensor(name, "points", points, ["N", 3], FLOATING, like=hash_keys)
     check(voxel_size > 0, name, "voxel_size", "be positive", voxel_size)
     # The op returns them the other way round: opcheck sums up the outputs and cannot begin with integers.
-    local_coords, rows = torch.ops.spslam.voxel_hash_lookup(hash_keys, hash_values, corner_ids, points, voxel_size)
+    local_coords, rows = call("voxel_hash_lookup", hash_keys, hash_values, corner_ids, points, voxel_size)
     return rows, local_coords
 
 

@@ -127,9 +127,12 @@ def test_integers_fit_64_bits(name, wrong, generator):
         ),
         (
             lambda: ops.VoxelHash().insert(torch.zeros(1, 3)),
-            "VoxelHash.insert: voxel_coords must be int32, got float32",
+            "VoxelHash.insert: voxel_coords must be int32 or int64, got float32",
         ),
-        (lambda: ops.VoxelHash().find(torch.zeros(1, 3)), "VoxelHash.find: voxel_coords must be int32, got float32"),
+        (
+            lambda: ops.VoxelHash().find(torch.zeros(1, 3)),
+            "VoxelHash.find: voxel_coords must be int32 or int64, got float32",
+        ),
         (
             lambda: ops.VoxelHash().lookup(torch.zeros(1, 3), "1"),
             "VoxelHash.lookup: voxel_size must be a float, got str",

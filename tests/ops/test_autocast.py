@@ -51,6 +51,28 @@ def test_a_network_goes_on_from_a_layer(dtype, device, generator):
     assert layer.weight.grad.abs().sum() > 0
 
 
+def test_what_torch_computes_is_in_float32_too(device, generator):
+    """Networks without a kernel, other channels than three, and second derivatives inside of the region."""
+    x = torch.randn(20, 3, generator=generator).to(device).requires_grad_()
+    params = {
+        layers: ops.mlp_init_params(3, 16, 2, layers, generator=generator).to(device).requires_grad_()
+        for layers in (2, 3)
+    }
+    t = torch.rand(4, 9, generator=generator).sort(1).values.to(device)
+    values = torch.rand(4, 9, 5, generator=generator).to(device)
+
+    def run():
+        rendered = ops.volume_render((0.5 - t) * 10, values, t, None, 0.1)[0]
+        (slope,) = torch.autograd.grad(ops.mlp(x, params[2], 16, 2).tanh().sum(), [x], create_graph=True)
+        return [ops.mlp(x, params[3], 16, 2, layers=3), rendered, *torch.autograd.grad(slope.square().sum(), [x])]
+
+    want = run()
+    with torch.autocast(device.type, dtype=torch.bfloat16):
+        got = run()
+    assert [g.dtype for g in got] == [torch.float32] * 3
+    assert all(torch.equal(g, w) for g, w in zip(got, want, strict=True))
+
+
 def test_compiled_code_casts_too(generator):
     layer = torch.nn.Linear(6, 11)
     params = torch.randn(ops.mlp_num_params(11, 8, 2), generator=generator)

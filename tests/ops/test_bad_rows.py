@@ -27,11 +27,17 @@ ROWS = [
     ("trilinear_interpolate", "local_coords", NAN, [math.nan]),
     ("bilinear_interpolate", "uv", NAN, [math.nan]),
     ("tri_plane_interpolate", "points", NAN, [math.nan]),
+    ("interpolate_tri_planes", "points", NAN, [math.nan]),
+    ("interpolate_volumes", "points", NAN, [math.nan]),
     ("sample_along_rays", "depth", NO_DEPTH, [0]),
     ("unproject_pixels", "normals", NAN, [ANY, math.nan]),
     ("volume_render", "sdf", NAN, [math.nan, math.nan, math.nan]),
     ("volume_render", "color", NAN, [math.nan, ANY, ANY]),
     ("volume_render", "t", NAN, [ANY, math.nan, ANY]),
+    ("alpha_composite", "opacities", NAN, [math.nan, math.nan, math.nan, math.nan]),
+    ("alpha_composite", "lengths", NAN, [math.nan, math.nan, math.nan, math.nan]),
+    ("alpha_composite", "values", NAN, [math.nan, ANY, ANY, ANY]),
+    ("alpha_composite", "t", NAN, [ANY, math.nan, ANY, ANY]),
     ("mlp", "input", NAN, [math.nan]),
     ("normal_equations", "residuals", NAN, [ANY, math.nan, math.nan]),
     ("normal_equations", "jacobians", NAN, [math.nan, math.nan, ANY]),
@@ -47,7 +53,13 @@ ROWS = [
     ("frame_overlap", "depth_thumbnails", NOT_FINITE, [0]),
 ]
 # Clamped to the border, as what lies outside of an image or plane is.
-CLAMPED = [("bilinear_interpolate", "uv"), ("tri_plane_interpolate", "points"), ("query_color", "points")]
+CLAMPED = [
+    ("bilinear_interpolate", "uv"),
+    ("tri_plane_interpolate", "points"),
+    ("interpolate_tri_planes", "points"),
+    ("interpolate_volumes", "points"),
+    ("query_color", "points"),
+]
 # Ops of packed pixels: (op, path of the records).
 RECORDS = [
     ("render_step", ("rays", "pixels")),
@@ -73,6 +85,13 @@ ELSEWHERE = {
     "sample_frame_pixels": "test_pixel_sampling.test_pixels_are_those_of_numpy",
     "measure_noise_": "test_sensor_noise.test_pixels_without_depth_add_nothing",
     "marching_cubes": "test_marching_cubes.test_unknown_samples_open_the_surface_around_them",
+    "measure_planes": "test_tsdf.test_planes_are_unknown_without_depth",
+    "tsdf_touched_blocks": "test_tsdf.test_frames_that_are_not_finite_change_nothing",
+    "tsdf_integrate_": "test_tsdf.test_frames_that_are_not_finite_change_nothing",
+    "tsdf_query": "test_tsdf.test_query_interpolates_and_says_what_is_unknown",
+    "tsdf_ray_cast": "test_tsdf.test_frames_that_are_not_finite_change_nothing",
+    "align_depth_images": "test_depth_image_alignment.test_pairs_without_images_and_poses_that_are_not_finite_stay",
+    "compare_depth_images": "test_depth_image_alignment.test_pairs_without_images_and_poses_that_are_not_finite_stay",
     "projective_icp": "test_projective_icp.test_holes_and_strangers_take_no_part",
 }
 

@@ -107,12 +107,66 @@ def test_gradient_of_one_argument_alone(name, device, generator):
 
 
 @each_op
-def test_second_derivatives_are_refused(name, device, generator):
-    arguments, differentiable = _arguments(name, device, torch.float64, generator)
-    value = getattr(ops, name)(*arguments).square().sum()
-    (first,) = torch.autograd.grad(value, [arguments[differentiable[-1]]], create_graph=True)
-    with pytest.raises(NotImplementedError, match=f"{name}: second derivatives are not supported"):
-        first.sum().backward()
+def test_second_derivatives(name, device, generator):
+    arguments, _ = _arguments(name, device, torch.float64, generator, points=8, channels=2)
+    torch.autograd.gradgradcheck(getattr(ops, name), arguments, eps=1e-7, atol=1e-4)
+
+
+@each_op
+def test_gradient_of_an_eikonal_loss_equals_the_reference(name, device, generator):
+    """The gradient by the table of a loss on the gradient by coordinates, and a product with its Hessian."""
+    arguments, differentiable = _arguments(name, device, torch.float64, generator, channels=8)
+    table, coords = (arguments[i] for i in differentiable)
+    results = []
+    for function in (getattr(ops, name), getattr(reference.interpolation, name)):
+        (slope,) = torch.autograd.grad(function(*arguments).sin().sum(), [coords], create_graph=True)
+        loss = (slope.square().sum(1) - 1).square().mean()
+        first = torch.autograd.grad(loss, [table, coords], create_graph=True)
+        product = torch.autograd.grad(first[0].square().sum(), [table])
+        results.append([*first, *product])
+    for g, w in zip(*results, strict=True):
+        torch.testing.assert_close(g, w, rtol=1e-8, atol=1e-8 * w.abs().max().item())
+
+
+@each_op
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_smaller_tables_are_read_in_float32(name, dtype, device, generator):
+    arguments, differentiable = _arguments(name, device, torch.float32, generator)
+    table = differentiable[0]
+    arguments[table] = arguments[table].detach().to(dtype).requires_grad_()
+    value = getattr(ops, name)(*arguments)
+    want = getattr(ops, name)(*(a.float() if i == table else a for i, a in enumerate(arguments)))
+    assert value.dtype == torch.float32
+    assert torch.equal(value, want)
+    (grad,) = torch.autograd.grad(value.sum(), [arguments[table]])
+    assert grad.dtype == dtype
+    assert grad.abs().sum() > 0
+
+
+@each_op
+def test_leading_axes(name, device, generator):
+    arguments, differentiable = _arguments(name, device, torch.float32, generator, points=24)
+    want = getattr(ops, name)(*arguments)
+    rows = {1, 2} if name == "trilinear_interpolate" else {1}
+    got = getattr(ops, name)(*(a.unflatten(0, (2, 3, 4)) if i in rows else a for i, a in enumerate(arguments)))
+    assert torch.equal(got, want.unflatten(0, (2, 3, 4)))
+
+
+def test_ids_of_64_bits(device, generator):
+    embeddings, ids, local = (a.to(device) for a in _trilinear(generator, torch.float32))
+    want = ops.trilinear_interpolate(embeddings, ids, local)
+    assert torch.equal(ops.trilinear_interpolate(embeddings, ids.long(), local), want)
+    far = ids.long()
+    far[:, 0] += 2**32  # the same number in 32 bits
+    assert not ops.trilinear_interpolate(embeddings, far, local).any()
+
+
+def test_an_image_of_channels_first_is_refused():
+    for shape in ((3, 48, 640), (1, 240, 320), (4, 480, 640)):
+        with pytest.raises(ValueError, match=r"bilinear_interpolate: texels must be \[H, W, C\]: permute\(1, 2, 0\)"):
+            ops.bilinear_interpolate(torch.zeros(shape), torch.zeros(2, 2))
+    for shape in ((3, 640, 32), (1, 256, 64), (5, 48, 640)):
+        ops.bilinear_interpolate(torch.zeros(shape), torch.zeros(2, 2))
 
 
 @each_op
@@ -252,9 +306,14 @@ TRILINEAR, BILINEAR, PLANES = CASES
     ("name", "change", "error", "message"),
     [
         (TRILINEAR, {0: [1.0]}, TypeError, "embeddings must be a torch.Tensor, got list"),
-        (TRILINEAR, {0: lambda t: t.half()}, TypeError, "embeddings must be float32 or float64, got float16"),
+        (
+            TRILINEAR,
+            {0: lambda t: t.int()},
+            TypeError,
+            "embeddings must be float32 or float64 or float16 or bfloat16, got int32",
+        ),
         (TRILINEAR, {0: lambda t: t[0]}, ValueError, r"embeddings must have shape \[V, C\], got \[8\]"),
-        (TRILINEAR, {1: lambda t: t.long()}, TypeError, "corner_ids must be int32, got int64"),
+        (TRILINEAR, {1: lambda t: t.float()}, TypeError, "corner_ids must be int32 or int64, got float32"),
         (TRILINEAR, {1: lambda t: t[:, :7]}, ValueError, r"corner_ids must have shape \[N, 8\], got \[4, 7\]"),
         (TRILINEAR, {2: lambda t: t[:3]}, ValueError, r"local_coords must have shape \[4, 3\], got \[3, 3\]"),
         (TRILINEAR, {2: lambda t: t.double()}, TypeError, "local_coords must be float32, got float64"),

@@ -19,7 +19,32 @@ from tests.ops.cases import CASES, arguments
 
 each_op = pytest.mark.parametrize("name", CASES)
 # What takes no tensor to work on: their own tests are enough.
-WITHOUT_TENSORS = {"get_num_threads", "set_num_threads", "mlp_num_params", "new_gradient_sums", "new_voxel_hash"}
+WITHOUT_TENSORS = {
+    "get_num_threads",
+    "set_num_threads",
+    "mlp_init_params",
+    "mlp_num_params",
+    "mlp_params_from",
+    "new_gradient_sums",
+    "new_voxel_hash",
+}
+# Of torch's own operations alone: their own tests are enough.
+COMPOSED = {"mlp_to_sequential", "neus_alpha", "pack_rays", "tri_planes_from_chw", "volsdf_density"}
+# Tables that may be of float16 and bfloat16, and rows that may have more than one leading axis: (op, argument).
+SMALLER = {
+    ("trilinear_interpolate", "embeddings"),
+    ("bilinear_interpolate", "texels"),
+    ("tri_plane_interpolate", "texels"),
+    ("interpolate_tri_planes", "table"),
+    ("interpolate_volumes", "table"),
+}
+MORE_AXES = {
+    ("bilinear_interpolate", "uv"),
+    ("tri_plane_interpolate", "points"),
+    ("interpolate_tri_planes", "points"),
+    ("interpolate_volumes", "points"),
+    ("mlp", "input"),
+}
 CPU_ONLY = {"sample_frame_pixels", "encode_frame_"}
 # Integers that name rows or places. None may lead outside of a table, whatever its value.
 EXTREME_INTEGERS = (-(2**31), -1, 2**31 - 1)
@@ -82,7 +107,7 @@ def result_or_named_error(name, call):
 
 def test_every_op_is_tested():
     public = {name for name in ops.__all__ if inspect.isfunction(getattr(ops, name))}
-    assert public == set(CASES) | WITHOUT_TENSORS
+    assert public == set(CASES) | WITHOUT_TENSORS | COMPOSED
 
 
 @each_op
@@ -94,8 +119,9 @@ def test_case_is_valid(name, device, generator):
 def test_another_dtype_is_refused(name, device, generator):
     call = arguments(name, generator, device)
     for path in tensors(call):
-        with pytest.raises(TypeError, match=f"{name}: .*{path[-1]} must be .*, got bfloat16"):
-            run(name, changed(call, path, get(call, path).to(torch.bfloat16)))
+        other = torch.complex64 if (name, path[-1]) in SMALLER else torch.bfloat16
+        with pytest.raises(TypeError, match=f"{name}: .*{path[-1]} must be .*, got {str(other)[6:]}"):
+            run(name, changed(call, path, get(call, path).to(other)))
 
 
 @each_op
@@ -110,7 +136,8 @@ def test_what_is_no_tensor_is_refused(name, device, generator):
 def test_another_number_of_axes_is_refused(name, device, generator):
     call = arguments(name, generator, device)
     for path in tensors(call):
-        for other in (get(call, path)[None], get(call, path).flatten()[0]):
+        more_axes = [] if (name, path[-1]) in MORE_AXES else [get(call, path)[None]]
+        for other in (*more_axes, get(call, path).flatten()[0]):
             with pytest.raises(ValueError, match=f"{name}: .* must "):
                 run(name, changed(call, path, other))
 

@@ -53,6 +53,40 @@ def test_compiles_whole(name, device, generator):
     assert_same(results[1], results[0])
 
 
+@named(lambda case: case.differentiable)
+def test_exports(name, device, generator):
+    """torch.export gives a program that computes the same."""
+    call = arguments(name, generator, device)
+    keys = [key for key, value in call.items() if isinstance(value, torch.Tensor)]
+    rest = {key: value for key, value in call.items() if key not in keys}
+
+    class Program(torch.nn.Module):
+        def forward(self, *tensors):
+            return tuple(outputs(getattr(ops, name)(**rest, **dict(zip(keys, tensors, strict=True)))))
+
+    given = tuple(call[key] for key in keys)
+    exported = torch.export.export(Program(), given)
+    assert_same(list(exported.module()(*given)), list(Program()(*given)))
+
+
+@named(lambda case: case.differentiable)
+def test_gradients_by_torch_func(name, device, generator):
+    """torch.func.grad, and jacrev, which maps over the backward op, give what torch.autograd gives."""
+    call = arguments(name, generator, device, rows=6)
+    for key in CASES[name].differentiable:
+
+        def of_one(given, key=key):
+            return [o for o in outputs(getattr(ops, name)(**{**call, key: given})) if o.is_floating_point()][-1]
+
+        leaf = call[key].clone().requires_grad_()
+        out = of_one(leaf)
+        (want,) = torch.autograd.grad(out.sum(), [leaf], allow_unused=True, materialize_grads=True)
+        assert_same([torch.func.grad(lambda given, f=of_one: f(given).sum())(call[key])], [want])
+        jacobian = torch.func.jacrev(of_one)(call[key])
+        summed = jacobian.flatten(0, out.ndim - 1).sum(0) if out.ndim else jacobian
+        torch.testing.assert_close(summed, want, rtol=1e-4, atol=1e-4 * max(1.0, want.abs().max().item()))
+
+
 def test_compiled_code_runs(generator):
     """With torch's own compiler behind it, not only the tracer."""
     call = arguments("trilinear_interpolate", generator)

@@ -255,7 +255,7 @@ RENDER, LOSSES = CASES
     [
         (RENDER, 0, lambda t: t[0], ValueError, r"sdf must have shape \[R, S\], got \[5\]"),
         (RENDER, 0, lambda t: t.half(), TypeError, "sdf must be float32 or float64, got float16"),
-        (RENDER, 1, lambda t: t[..., :2], ValueError, r"color must have shape \[9, 5, 3\], got \[9, 5, 2\]"),
+        (RENDER, 1, lambda t: t[:, :2], ValueError, r"color must have shape \[9, 5, C\], got \[9, 2, 3\]"),
         (RENDER, 1, lambda t: t.double(), TypeError, "color must be float32, got float64"),
         (RENDER, 2, lambda t: t[:, 1:], ValueError, r"t must have shape \[9, 5\], got \[9, 4\]"),
         (RENDER, 2, lambda t: t.to("meta"), ValueError, "t must be on cpu, got meta"),

@@ -18,13 +18,14 @@ struct SampleTable {
   std::int64_t num_rays, num_samples;
 };
 
-// out_color [R, 3], out_depth [R], weights [R, S] that sum to 1 along a ray, or to 0 where it meets nothing.
+// out_color [R, 3], out_depth [R], weights [R, S] that sum to 1 along a ray, or to 0 where it meets nothing. Where
+// out_color is null there is no color: depth and weights alone.
 template <class Device, class T>
 void volume_render(Device device, const SampleTable<T>& samples, const T* color, T truncation, T* out_color,
                    T* out_depth, T* weights);
 
 // Gradients of the outputs, of which that of the weights may be null, to gradients of sdf, color and t. `weights` are
-// those of the forward function.
+// those of the forward function. Where grad_out_color is null there is no color.
 template <class Device, class T>
 void volume_render_backward(Device device, const SampleTable<T>& samples, const T* color, const T* weights,
                             T truncation, const T* grad_out_color, const T* grad_out_depth, const T* grad_weights,
