@@ -95,8 +95,9 @@ def _measure_triple(
 
 
 def _scene_settings(config: Config) -> SceneSettings:
-    names = ("voxel_size_m", "truncation_m", "plane_cell_m", "position_scale", "max_voxels")
-    return SceneSettings(**{name: getattr(config.scene, name) for name in names})
+    names = ("voxel_size_m", "plane_cell_m", "position_scale", "max_voxels")
+    same = {name: getattr(config.scene, name) for name in names}
+    return SceneSettings(truncation_m=config.scene.truncation, **same)
 
 
 def _with_noise(depth: np.ndarray, noise: float | str, focal_px: float, generator: np.random.Generator) -> np.ndarray:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from spslam.errors import OutputError
 from spslam.io import atomic_write
 from spslam.meshing.mesh import TriangleMesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 FORMATS = (".ply", ".glb", ".obj")
 
@@ -42,6 +45,8 @@ def save_mesh(mesh: TriangleMesh, path: str | os.PathLike) -> None:
 
 
 def _as_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
+    import trimesh
+
     # Without processing, which would merge vertices that are close and tear the surface.
     return trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=mesh.normals, vertex_colors=mesh.colors, process=False

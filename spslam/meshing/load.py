@@ -5,12 +5,16 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from spslam.errors import DatasetError, brief
+from spslam.notebook import mesh_html
 from spslam.reading import read_bytes
+
+if TYPE_CHECKING:
+    import trimesh
 
 READ_FORMATS = (".ply", ".obj", ".glb", ".stl", ".off")
 MAX_MESH_BYTES = 2 << 30
@@ -40,6 +44,10 @@ class Mesh:
     faces: np.ndarray
     colors: np.ndarray
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the mesh, to be turned around with the mouse."""
+        return mesh_html(self.vertices, self.faces, self.colors)
+
 
 def load_mesh(path: Path) -> Mesh:
     """Reads a mesh; what else a file holds (materials, textures, other files that it names) is left alone.
@@ -54,6 +62,8 @@ def load_mesh(path: Path) -> Mesh:
         DatasetError: no such file, another format, damaged, a count beyond what the file can hold, a face that names no
             vertex, or a coordinate that isn't finite or lies beyond `MAX_COORDINATE_M`. One line that names the file.
     """
+    import trimesh
+
     suffix = path.suffix.lower()
     if suffix not in READ_FORMATS:
         raise DatasetError(f"{path}: a mesh must be one of {', '.join(READ_FORMATS)}, got {suffix or 'no suffix'}")
@@ -95,6 +105,8 @@ def _check_ply_counts(content: bytes) -> None:
 
 def _as_one(loaded: trimesh.Geometry, file_bytes: int) -> trimesh.Trimesh:
     """The one mesh of what was loaded; a scene may name a mesh many times, but not more often than its file is long."""
+    import trimesh
+
     if isinstance(loaded, trimesh.Scene):
         nodes = (loaded.geometry[loaded.graph[node][1]] for node in loaded.graph.nodes_geometry)
         faces = sum(len(geometry.faces) for geometry in nodes if isinstance(geometry, trimesh.Trimesh))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+
+from spslam.notebook import mesh_html
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TriangleMesh:
     """Triangles with a color and a normal at each vertex; K vertices, L faces, both may be 0.
 
@@ -39,6 +40,19 @@ class TriangleMesh:
             if array.shape != shape or array.dtype != dtype:
                 wanted = f"{np.dtype(dtype).name} {list(shape)}"
                 raise ValueError(f"TriangleMesh: {name} must be {wanted}, got {array.dtype} {list(array.shape)}")
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the mesh as .ply, .glb or .obj; see `spslam.meshing.save_mesh`."""
+        from spslam.meshing.export import save_mesh
+
+        save_mesh(self, path)
+
+    def __repr__(self) -> str:
+        return f"TriangleMesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the mesh, to be turned around with the mouse."""
+        return mesh_html(self.vertices, self.faces, self.colors)
 
 
 def compact(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -76,6 +90,9 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
     """Label [L] of the connected component of each face; faces that share a vertex are connected."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     edges = np.concatenate((faces[:, :2], faces[:, 1:]))
     graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), (num_vertices, num_vertices))
     _, labels = connected_components(graph, directed=False)

@@ -89,6 +89,33 @@ def rasterize(
     return _rasterize(points, np.asarray(faces).reshape(-1, 3), camera, cull_back)
 
 
+def render_colors(
+    vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Renders the colors of a mesh's vertices as they are, without light.
+
+    Args:
+        vertices: [V, 3], meters, world axes.
+        faces: integers [L, 3].
+        colors: uint8 [V, 3] RGB of the vertices.
+        camera: intrinsics of the view.
+        T_world_camera: [4, 4], pose of the view.
+
+    Returns:
+        uint8 [H, W, 3] RGB, black for background, and float32 [H, W] depth in meters, 0 there. Deterministic.
+    """
+    points, faces = _to_camera(np.asarray(vertices), T_world_camera), np.asarray(faces).reshape(-1, 3)
+    raster = _rasterize(points, faces, camera, cull_back=False)
+    image = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
+    hit = raster.face_ids >= 0
+    shown = faces[raster.face_ids[hit]]
+    corners = points.astype(np.float32)[shown]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    weights = _barycentric(corners, (camera.ray_directions() * raster.depth[..., None])[hit], normals)
+    image[hit] = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[shown, :3].astype(np.float32)).round()
+    return image, raster.depth
+
+
 def _rasterize(points: np.ndarray, faces: np.ndarray, camera: Camera, cull_back: bool) -> Raster:
     corners, ids = _clip(points, _in_view(points, faces, camera))
     setup = _Setup.of(corners, ids, camera, cull_back)

@@ -1,0 +1,110 @@
+// A truncated signed distance field on sparse blocks of voxels: planes measured by a depth image, the blocks that they
+// touch, their integration, and lookup at points and along rays.
+//
+// Voxel (i, j, k) of block b lies at (8 b + (i, j, k)) voxel_size; it is element (8 i + j) 8 + k of the block's row.
+#pragma once
+
+#include <cstdint>
+
+#include "core/device.h"
+#include "spslam/prior_fusion.h"
+#include "spslam/types/camera.h"
+#include "spslam/types/voxel_table.h"
+
+namespace spslam {
+
+constexpr int kTsdfBlockSide = 8;
+constexpr int kTsdfBlockVoxels = kTsdfBlockSide * kTsdfBlockSide * kTsdfBlockSide;
+// Numbers of a measured plane: unit normal away from the camera (x, y, z, camera axes), distance (m) from the camera
+// and weight. Weight 0 says that nothing was measured.
+constexpr int kPlaneSize = 5;
+// Red, green and blue in 1/256, and their weight in 1/kColorWeightUnit.
+constexpr int kTsdfColorSize = 4;
+// Blocks that a pixel's surface may touch, as samples along its ray.
+constexpr int kTouchedPerPixel = 6;
+// Edge of the image tiles whose farthest surface is known, px.
+constexpr int kTsdfTileSide = 16;
+// First coordinate of rows that name no block.
+constexpr std::int32_t kNoBlock = INT32_MIN;
+
+// Variance of a depth z: floor + growth z^4, m^2.
+struct DepthNoise {
+  float floor, growth;
+};
+
+// Planes [height, width, kPlaneSize] measured by a frame, its colors [height, width, 3] or null, and pose [7].
+struct PlaneFrame {
+  const float* planes;
+  const std::uint8_t* colors;
+  const float* pose;
+  std::int32_t width, height;
+  Intrinsics camera;
+};
+
+// Arrays of `count` blocks: coordinates [count, 3], and [count, 512] distances (m) and weights, [count, 512, 4] colors.
+struct TsdfBlocks {
+  const std::int32_t* coords;
+  float* sdf;
+  float* weights;
+  std::uint16_t* colors;
+  std::int64_t count;
+  float voxel_size;
+};
+
+struct TsdfOptions {
+  float truncation;  // m
+  float max_weight;
+};
+
+// A field that is only read, and the weight from which a voxel counts as known.
+struct TsdfView {
+  VoxelTable table;
+  const float* sdf;
+  const float* weights;
+  const std::uint16_t* colors;
+  float voxel_size, min_weight;
+};
+
+// The plane around each pixel of a depth image.
+template <class Device>
+void measure_planes(Device device, const DepthImage& image, const DepthNoise& noise, float* planes);
+
+// Coordinates [touched_rows(frame, step), 3] of the blocks within the truncation of the planes of every step-th pixel,
+// with repetitions; kNoBlock where there is none.
+inline std::int64_t touched_rows(const PlaneFrame& frame, std::int32_t step) {
+  const std::int64_t columns = (frame.width + step - 1) / step, rows = (frame.height + step - 1) / step;
+  return kTouchedPerPixel * columns * rows;
+}
+template <class Device>
+void tsdf_touched_blocks(Device device, const PlaneFrame& frame, float voxel_size, float truncation, std::int32_t step,
+                         std::int32_t* coords);
+
+// Adds a frame to all blocks that it sees.
+inline std::int64_t tsdf_integrate_workspace_bytes(const PlaneFrame& frame) {
+  const std::int64_t columns = (frame.width + kTsdfTileSide - 1) / kTsdfTileSide;
+  const std::int64_t rows = (frame.height + kTsdfTileSide - 1) / kTsdfTileSide;
+  return columns * rows * static_cast<std::int64_t>(sizeof(float));
+}
+template <class Device>
+void tsdf_integrate(Device device, const TsdfBlocks& blocks, const PlaneFrame& frame, const TsdfOptions& options,
+                    void* workspace);
+
+// Trilinear distance [n] (m) and color [n, 3] in [0, 1] at world points; known[n] where all eight voxels around are.
+template <class Device>
+void tsdf_query(Device device, const TsdfView& view, const float* points, std::int64_t n, float* sdf, float* colors,
+                bool* known);
+
+struct RayCastCamera {
+  const float* pose;
+  std::int32_t width, height;
+  Intrinsics camera;
+  float near, far;  // depth, m
+};
+
+// Depth [height, width] (m, 0 without surface), unit normals in world axes [height, width, 3] and colors of the first
+// surface on each pixel's ray that is seen from its front.
+template <class Device>
+void tsdf_ray_cast(Device device, const TsdfView& view, const RayCastCamera& camera, float* depth, float* normals,
+                   float* colors);
+
+}  // namespace spslam

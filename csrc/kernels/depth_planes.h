@@ -1,0 +1,163 @@
+// The plane that a depth image measured around a pixel: a least-squares fit of inverse depth, which is linear in the
+// image where the surface is flat, over the 5x5 pixels around it that lie on the same surface. Without branches, so
+// that a compiler can vectorize over pixels.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/macros.h"
+#include "core/vec.h"
+#include "spslam/tsdf.h"
+
+namespace spslam {
+
+constexpr int kPlaneRadius = 2;
+constexpr int kPlaneWindow = 2 * kPlaneRadius + 1;
+// A pixel whose inverse depth differs from the plane through the middle by more than this share, and by more than so
+// many deviations of the noise, is of another surface.
+constexpr float kPlaneGate = 0.015f, kPlaneGateDeviations = 4.0f;
+// Steepest plane, as the tangent of the angle of incidence; what is steeper is an edge.
+constexpr float kSteepest = 15.0f;
+// Weight of the window's pixels that lie on the surface, as a share of the whole window's: with less, the pixel is of
+// an edge or mixes two surfaces, and says nothing; from kFullSupport on depth is the plane's, in between it goes over
+// from the pixel's own.
+constexpr float kLeastSupport = 0.2f, kFullSupport = 0.5f;
+// From this share on the weight does not grow any more.
+constexpr float kFullWeightSupport = 0.67f;
+// Cosine between ray and normal below which a measurement says nothing.
+constexpr float kLeastCosine = 0.06f;
+// Squared distance of the window's pixels from their plane, in variances of the noise, from which on they show the
+// shape of the surface rather than noise, so that depth is the pixel's own.
+constexpr float kShapeVariances = 2.0f;
+// m: what surface and poses add to the noise of depth.
+constexpr float kPoseVariance = 0.003f * 0.003f;
+// px^2, a weak prior for a plane that faces the camera where the window is too narrow for a slope.
+constexpr float kSlopePrior = 0.005f;
+
+// Sums of weighted monomials over the window; q is the difference to the middle's inverse depth.
+struct PlaneSums {
+  float one, u, v, uu, uv, vv, q, qu, qv, qq;
+};
+constexpr int kPlaneSums = 10;
+
+// The middle of a window: its inverse depth, a first guess of the slopes (1/m per px), and one over the gate.
+struct PlaneMiddle {
+  float q, by_u, by_v, inverse_gate;
+};
+
+// Of a pixel at an offset in the window.
+SPS_INLINE float plane_window_weight(int du, int dv) {
+  return 1.0f / (1.0f + 0.15f * static_cast<float>(du * du + dv * dv));
+}
+
+SPS_INLINE float whole_plane_window() {
+  float whole = 0.0f;
+  for (int dv = -kPlaneRadius; dv <= kPlaneRadius; ++dv) {
+    for (int du = -kPlaneRadius; du <= kPlaneRadius; ++du) whole += plane_window_weight(du, dv);
+  }
+  return whole;
+}
+
+// 1/m; 0 where depth is unknown.
+SPS_INLINE float inverse_depth(float depth) {
+  constexpr float kNearest = 1e-3f, kFarthest = 1e6f;
+  return (depth > kNearest) & (depth < kFarthest) ? 1.0f / depth : 0.0f;
+}
+
+SPS_INLINE float depth_noise_variance(const DepthNoise& noise, float depth) {
+  const float squared = depth * depth;
+  return noise.floor + noise.growth * squared * squared;
+}
+
+// Slope along one axis: the smaller one of the differences to both neighbors, as an edge lies on one side at most.
+SPS_INLINE float one_sided_slope(float before, float middle, float after) {
+  const float backward = middle - before, forward = after - middle;
+  const bool take_backward = (before > 0.0f) & ((after <= 0.0f) | (std::fabs(backward) < std::fabs(forward)));
+  return take_backward ? backward : after > 0.0f ? forward : 0.0f;
+}
+
+SPS_INLINE PlaneMiddle plane_middle(const DepthNoise& noise, const Intrinsics& camera, float q, float by_u,
+                                    float by_v) {
+  const float safe = q > 0.0f ? q : 1.0f;
+  const float deviation = std::sqrt(depth_noise_variance(noise, 1.0f / safe)) * safe;
+  const float wide = kPlaneGateDeviations * deviation;
+  const float steepest_u = kSteepest * safe / camera.fx, steepest_v = kSteepest * safe / camera.fy;
+  const bool surface_u = std::fabs(by_u) < steepest_u, surface_v = std::fabs(by_v) < steepest_v;
+  return {q, surface_u ? by_u : 0.0f, surface_v ? by_v : 0.0f, 1.0f / ((kPlaneGate + wide) * safe)};
+}
+
+// Adds a pixel of the window, weighted by Tukey's biweight of its distance from the plane through the middle.
+SPS_INLINE void add_plane_sample(float q, const PlaneMiddle& middle, int du, int dv, float window_weight,
+                                 PlaneSums& sums) {
+  const float u = static_cast<float>(du), v = static_cast<float>(dv);
+  const float difference = q - middle.q;
+  const float share = (difference - middle.by_u * u - middle.by_v * v) * middle.inverse_gate;
+  const float closeness = 1.0f - share * share;
+  const float weight = (closeness > 0.0f) & (q > 0.0f) ? closeness * closeness * window_weight : 0.0f;
+  sums.one += weight;
+  sums.u += weight * u;
+  sums.v += weight * v;
+  sums.uu += weight * (u * u);
+  sums.uv += weight * (u * v);
+  sums.vv += weight * (v * v);
+  sums.q += weight * difference;
+  sums.qu += weight * difference * u;
+  sums.qv += weight * difference * v;
+  sums.qq += weight * difference * difference;
+}
+
+struct MeasuredPlane {
+  Vec3<float> normal;
+  float distance, weight;
+};
+
+// The plane of a pixel (u, v) from its window's sums; all 0 where there is none.
+SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera, const DepthNoise& noise, float u,
+                                   float v, float center, float whole_window) {
+  const float scale = s.one > 0.0f ? 1.0f / s.one : 0.0f;
+  const float mu = s.u * scale, mv = s.v * scale, mq = s.q * scale;
+  const float uu = s.uu * scale - mu * mu + kSlopePrior, vv = s.vv * scale - mv * mv + kSlopePrior;
+  const float uv = s.uv * scale - mu * mv, qu = s.qu * scale - mq * mu, qv = s.qv * scale - mq * mv;
+  const float inverse_determinant = 1.0f / (uu * vv - uv * uv);
+  const float by_u = (qu * vv - qv * uv) * inverse_determinant, by_v = (qv * uu - qu * uv) * inverse_determinant;
+  const float support = s.one / whole_window;
+  const float over = (support - kLeastSupport) / (kFullSupport - kLeastSupport);
+  // How far the window is from flat, and the pixel from the plane, in variances of inverse depth.
+  const float safe = center > 0.0f ? center : 1.0f;
+  const float noise_variance = depth_noise_variance(noise, 1.0f / safe) * (safe * safe) * (safe * safe);
+  const float moved = mq - by_u * mu - by_v * mv;
+  const float spread = s.qq * scale - mq * mq - by_u * qu - by_v * qv;
+  const float own = 0.5f * moved * moved;
+  const float shape = (spread > own ? spread : own) / (kShapeVariances * noise_variance + 1e-20f);
+  const float flat = 1.0f / (1.0f + shape * shape);
+  const float share = (over < 0.0f ? 0.0f : over < 1.0f ? over : 1.0f) * flat;
+  const float q = center + share * moved;
+  // The plane is m . x = 1 in camera axes.
+  const float x = (u - camera.cx) / camera.fx, y = (v - camera.cy) / camera.fy;
+  const float mx = by_u * camera.fx, my = by_v * camera.fy, mz = q - mx * x - my * y;
+  const float distance = 1.0f / std::sqrt(mx * mx + my * my + mz * mz);
+  const float cosine = q * distance / std::sqrt(x * x + y * y + 1.0f);
+  const bool known = (center > 0.0f) & (q > 0.0f) & (support > kLeastSupport) & (cosine > kLeastCosine);
+  const float variance = depth_noise_variance(noise, 1.0f / (known ? q : 1.0f));
+  const float certainty = kPoseVariance / (kPoseVariance + variance);
+  const float body = support * (1.0f / kFullWeightSupport);
+  const float weight = certainty * cosine * (body < 1.0f ? body : 1.0f);
+  return {{known ? mx * distance : 0.0f, known ? my * distance : 0.0f, known ? mz * distance : 0.0f},
+          known ? distance : 0.0f,
+          known ? weight : 0.0f};
+}
+
+SPS_INLINE MeasuredPlane load_plane(const float* in) {
+  return {{in[0], in[1], in[2]}, in[3], in[4]};
+}
+
+SPS_INLINE void store_plane(const MeasuredPlane& plane, float* out) {
+  out[0] = plane.normal.x;
+  out[1] = plane.normal.y;
+  out[2] = plane.normal.z;
+  out[3] = plane.distance;
+  out[4] = plane.weight;
+}
+
+}  // namespace spslam

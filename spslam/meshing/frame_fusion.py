@@ -1,0 +1,162 @@
+"""Fuses the frames of a sequence, at given poses, into a signed distance field on sparse blocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.prefetch import prefetch
+from spslam.errors import DatasetError, SpslamError
+from spslam.geometry import matrix_to_pose7
+from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
+from spslam.meshing.sdf_sampling import near_surface
+from spslam.ops.tsdf_volume import BLOCK_BYTES, TRUNCATION_VOXELS
+from spslam.scene import Scene
+
+# Where the blocks do not fit into the memory allowed, all frames are fused again with voxels that much larger.
+COARSENING = 1.5
+_MOST_ATTEMPTS = 12
+# Truncation in deviations of the noise of near depth, and at most; a phone's LiDAR, smoothed at edges, needs so many.
+NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
+_WORKERS, _AHEAD = 2, 4
+
+
+@dataclass(frozen=True)
+class FusionOptions:
+    """How frames are fused.
+
+    Attributes:
+        voxel_size_m: edge length of a voxel, m.
+        max_memory_mb: of the voxels; larger voxels are taken where they would need more.
+        noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
+    """
+
+    voxel_size_m: float
+    max_memory_mb: int
+    noise: tuple[float, float]
+
+    def truncation_m(self, voxel_size_m: float) -> float:
+        """Three voxels, or more where all depth is noisy: what lies farther off must not be taken for free space."""
+        wide = min(NOISE_DEVIATIONS * math.sqrt(self.noise[0]), MOST_TRUNCATION_M)
+        return max(TRUNCATION_VOXELS * voxel_size_m, wide)
+
+    @property
+    def max_blocks(self) -> int:
+        """The blocks that fit into the memory."""
+        return max(self.max_memory_mb * 2**20 // BLOCK_BYTES, 1)
+
+
+@dataclass(frozen=True)
+class PosedFrames:
+    """The frames of a dataset that have a pose.
+
+    Attributes:
+        dataset: where they are read from.
+        indices: int64 [F] of the frames in the dataset.
+        poses: float64 [F, 4, 4] T_world_camera, finite.
+        noise: of their depth, see `FusionOptions`; None is that of the fusion.
+    """
+
+    dataset: RgbdDataset
+    indices: np.ndarray
+    poses: np.ndarray
+    noise: tuple[float, float] | None = None
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, position: int) -> RgbdFrame:
+        return self.dataset[int(self.indices[position])]
+
+    def read(self) -> Iterator[tuple[RgbdFrame, np.ndarray]]:
+        """Frames and poses in order, read ahead by threads; frames that can't be read are left out."""
+        with prefetch(self, _WORKERS, _AHEAD) as frames:
+            for frame, pose in zip(frames, self.poses, strict=True):
+                if not isinstance(frame, DatasetError):
+                    yield frame, pose
+
+
+def fuse_frames(
+    frames: PosedFrames | Sequence[PosedFrames],
+    options: FusionOptions,
+    scene: Scene | None = None,
+    device: torch.device | str = "cpu",
+) -> ops.TsdfVolume:
+    """Fuses all frames into a new volume.
+
+    Args:
+        frames: to be fused, in order; of one dataset or of several in one world.
+        options: how.
+        scene: a map of the same frames. Blocks are then also made around its surface, so that the frames carve what is
+            free of it.
+        device: where the volume is.
+
+    Returns:
+        The volume. Its voxel size is the one wanted or, where `max_memory_mb` does not hold that many, a larger one.
+        The same frames and options give the same bytes.
+
+    Raises:
+        SpslamError: voxels of over a hundred times the size would not fit either.
+    """
+    parts = [frames] if isinstance(frames, PosedFrames) else frames
+    voxel_size_m = options.voxel_size_m
+    for _ in range(_MOST_ATTEMPTS):
+        truncation_m = options.truncation_m(voxel_size_m)
+        volume = ops.TsdfVolume(voxel_size_m, truncation_m, options.max_blocks, device)
+        try:
+            if scene is not None:
+                volume.add_blocks(blocks_of_scene(scene, volume))
+            for part in parts:
+                for frame, pose in part.read():
+                    _integrate(volume, frame, pose, part.dataset, part.noise or options.noise)
+            return volume
+        except ops.VoxelLimitError:
+            del volume
+            voxel_size_m *= COARSENING
+    raise SpslamError(
+        f"the frames' surface must fit into {options.max_memory_mb} MB with voxels of {voxel_size_m:.3g} m, but does "
+        "not; mesh.max_memory_mb allows more"
+    )
+
+
+def blocks_of_scene(scene: Scene, volume: ops.TsdfVolume) -> torch.Tensor:
+    """Coordinates int32 [N, 3] of the volume's blocks that a map's surface may pass through, with repetitions."""
+    cells = surface_cells(scene)
+    size_m = scene.volume.voxel_size_m
+    steps = max(round(size_m / (ops.tsdf.BLOCK_SIDE * volume.voxel_size)), 1)
+    offsets = torch.cartesian_prod(*[torch.linspace(0, 1, steps + 1, device=cells.device)] * 3)
+    block_m = ops.tsdf.BLOCK_SIDE * volume.voxel_size
+    blocks = [cells.new_zeros(0, 3)]
+    for chunk in cells.split(max(CHUNK_POINTS // len(offsets), 1)):
+        points = (chunk[:, None] + offsets).reshape(-1, 3) * size_m
+        blocks.append((points / block_m).floor().to(torch.int32))
+    return torch.cat(blocks).to(volume.sdf.device)
+
+
+def surface_cells(scene: Scene) -> torch.Tensor:
+    """int32 [M, 3], the complete cells of a map that its surface may pass through."""
+    volume, truncation_m = scene.volume, scene.settings.truncation_m
+
+    def sdf(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        values, known = scene.sdf(points)
+        return values * truncation_m, known
+
+    cells = volume.voxel_coords[volume.corner_ids[:, 0] >= 0]
+    return near_surface(cells, volume.voxel_size_m, sdf, MAX_SLOPE, CHUNK_POINTS)
+
+
+def _integrate(
+    volume: ops.TsdfVolume, frame: RgbdFrame, pose: np.ndarray, dataset: RgbdDataset, noise: tuple[float, float]
+) -> None:
+    camera, device = dataset.camera, volume.sdf.device
+    intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+    depth = torch.from_numpy(np.ascontiguousarray(frame.depth)).to(device)
+    color = torch.from_numpy(np.ascontiguousarray(frame.color)).to(device)
+    pose7 = torch.from_numpy(matrix_to_pose7(pose)).to(device, torch.float32)
+    volume.integrate(depth, pose7, intrinsics, color, noise)

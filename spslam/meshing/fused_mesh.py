@@ -1,0 +1,122 @@
+"""The mesh of a fused signed distance field, with a map filling in where no frame measured anything.
+
+Both are sampled on one lattice of voxels, so the surface is extracted once and has no seam. Next to measured voxels the
+map is moved to agree with them: the difference, averaged over its cells, is added to it and fades within a cell.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.meshing.cleaning import face_support, front_facing_in_view, in_large_component
+from spslam.meshing.extract import CHUNK_POINTS, MIN_PART_M2, MIN_SUPPORT
+from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
+from spslam.meshing.scene_filling import fill_with_scene
+from spslam.ops.tsdf_volume import march_blocks
+from spslam.scene import Scene
+
+# A voxel is known from this weight on: that of a hundredth of a frame whose depth is certain, which is one from afar.
+MIN_WEIGHT = 0.005
+# And from this share of the largest weight nearby.
+MIN_SHARE = 0.01
+# A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.
+_LATTICE = 1e-3
+
+
+def extract_fused_mesh(
+    volume: ops.TsdfVolume,
+    scene: Scene | None = None,
+    camera: Camera | None = None,
+    poses: np.ndarray | None = None,
+    min_part_m2: float = MIN_PART_M2,
+) -> TriangleMesh:
+    """Extracts the colored mesh of a fused volume, and of a map where nothing was fused.
+
+    Args:
+        volume: fused frames. Not changed.
+        scene: a map of the same frames in the same world; None leaves holes where nothing was measured.
+        camera: intrinsics of the views at `poses`.
+        poses: float [F, 4, 4] T_world_camera. Surface of the map that no view sees from the front is left out.
+        min_part_m2: connected components with a smaller area, m^2, are removed.
+
+    Returns:
+        The mesh; empty for an empty volume. The same input gives the same mesh.
+
+    Raises:
+        ValueError: one of `camera` and `poses` is missing.
+    """
+    if (camera is None) != (poses is None):
+        raise ValueError("extract_fused_mesh: camera and poses must be given together, got one of them")
+    known = volume.weights >= volume.least_weights(MIN_WEIGHT, MIN_SHARE)[:, None]
+    values = torch.where(known, volume.sdf, torch.nan)
+    if scene is not None:
+        values = fill_with_scene(volume, values, scene)
+    points, faces = march_blocks(volume.block_coords, values, volume.voxel_size)
+    vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
+    normals = vertex_normals(vertices, kept)
+    if scene is not None:
+        measured = _measured_vertices(volume, known, points)
+        kept = kept[_supported(scene, points, faces, measured, normals, (camera, poses))]
+    kept = kept[in_large_component(vertices, kept, min_part_m2)]
+    kept, used = compact(kept, len(vertices))
+    colors = _colors(volume, scene, points[torch.from_numpy(used).to(points.device)])
+    return TriangleMesh(vertices[used], kept, colors, normals[used])
+
+
+def _measured_vertices(volume: ops.TsdfVolume, known: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Bool [K]: whether the two voxels that a vertex lies between were measured."""
+    flat = known.reshape(-1)
+    measured = [flat[:0]]
+    for chunk in points.split(CHUNK_POINTS):
+        voxels = (chunk / volume.voxel_size).double()
+        # A coordinate along which a vertex lies on the lattice must not be rounded to the voxel beside it.
+        ends = ((voxels + _LATTICE).floor(), (voxels - _LATTICE).ceil())
+        rows = [_voxel_rows(volume, end.to(torch.int32)) for end in ends]
+        measured.append(torch.stack([(row >= 0) & flat[row.clamp(min=0)] for row in rows]).all(0))
+    return torch.cat(measured)
+
+
+def _voxel_rows(volume: ops.TsdfVolume, voxels: torch.Tensor) -> torch.Tensor:
+    """int64 [N], where voxels int32 [N, 3] are in the flattened arrays; -1 for none."""
+    side = ops.tsdf.BLOCK_SIDE
+    blocks = torch.div(voxels, side, rounding_mode="floor")
+    local = (voxels - blocks * side).long()
+    rows = volume.blocks.find(blocks).long()
+    place = (local[:, 0] * side + local[:, 1]) * side + local[:, 2]
+    return torch.where(rows >= 0, rows * ops.tsdf.BLOCK_VOXELS + place, -1)
+
+
+def _supported(
+    scene: Scene,
+    points: torch.Tensor,
+    faces: torch.Tensor,
+    measured: torch.Tensor,
+    normals: np.ndarray,
+    views: tuple[Camera | None, np.ndarray | None],
+) -> np.ndarray:
+    """Bool [L]: faces whose vertices were all measured, and those of the map that `extract_mesh` would keep."""
+    keep = measured[faces].all(1)
+    rest = torch.nonzero(~keep)[:, 0]
+    support = face_support(scene.volume, points, faces[rest], CHUNK_POINTS) >= MIN_SUPPORT
+    kept, others = keep.cpu().numpy(), rest.cpu().numpy()
+    good = support.cpu().numpy()
+    camera, poses = views
+    if camera is not None and poses is not None and len(poses):
+        good &= front_facing_in_view(points.cpu().numpy(), normals, faces.cpu().numpy()[others], camera, poses)
+    kept[others[good]] = True
+    return kept
+
+
+def _colors(volume: ops.TsdfVolume, scene: Scene | None, points: torch.Tensor) -> np.ndarray:
+    """RGB uint8 [N, 3] at points: the fused ones and, where there are none, the map's."""
+    colors = [np.zeros((0, 3), dtype=np.uint8)]
+    for chunk in points.split(CHUNK_POINTS):
+        _, rgb, known = volume.query(chunk, min_weight=MIN_WEIGHT)
+        known &= (rgb > 0).any(1)
+        if scene is not None and not bool(known.all()):
+            rgb = torch.where(known[:, None], rgb, scene.color(chunk))
+        colors.append((rgb * 255).round().clamp(0, 255).to(torch.uint8).cpu().numpy())
+    return np.concatenate(colors)

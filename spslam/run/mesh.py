@@ -1,0 +1,129 @@
+"""The mesh of a run: fused from its frames at their final poses, or extracted from the map alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from spslam.camera import Camera
+from spslam.datasets.base import RgbdDataset
+from spslam.errors import OutputError
+from spslam.evaluation.run_output import match_times
+from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
+from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
+from spslam.meshing.fused_mesh import extract_fused_mesh
+from spslam.ops.depth_planes import DEFAULT_NOISE
+from spslam.options import MeshOptions
+from spslam.scene import Scene
+from spslam.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class EarlierFrames:
+    """A recording that a map is of beside the run's own.
+
+    Attributes:
+        trajectory: in the map's world.
+        dataset: its frames, or a dataset that contains them; None where they can't be read again.
+        noise: of depth, as of `MeshJob`.
+    """
+
+    trajectory: Trajectory
+    dataset: RgbdDataset | None
+    noise: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class MeshJob:
+    """What a mesh is made of.
+
+    Attributes:
+        scene: the map.
+        trajectory: of the run.
+        camera: intrinsics of the frames; None leaves surface in that no view sees, of a mesh from the map alone.
+        options: of the mesh.
+        noise: of depth, see `ops.measure_planes`; where it was not measured, None.
+        earlier: recordings that the map is of beside the run's.
+    """
+
+    scene: Scene
+    trajectory: Trajectory
+    camera: Camera | None
+    options: MeshOptions
+    noise: tuple[float, float] | None = None
+    earlier: Sequence[EarlierFrames] = ()
+
+
+def measured_noise(metrics: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The depth noise that a run measured, from its metrics.json; None where it says nothing.
+
+    Args:
+        metrics: content of metrics.json.
+    """
+    floor, growth = metrics.get("depth_noise_floor_m2"), metrics.get("depth_noise_growth_m2")
+    if not isinstance(floor, float) or not isinstance(growth, float) or not (0 <= floor < 1 and 0 <= growth < 1):
+        return None
+    return floor, growth
+
+
+def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[TriangleMesh, dict[str, Any]]:
+    """Makes the mesh of a run and writes it.
+
+    Args:
+        path: of the mesh.
+        job: what it is made of.
+        dataset: the run's frames, or a dataset that contains them; not read for a mesh from the map alone.
+
+    Returns:
+        The mesh, and what metrics.json says of it.
+
+    Raises:
+        OutputError: a mesh is to be fused and no frame of the run is in the dataset, or the file can't be written.
+        SpslamError: the surface does not fit into `mesh.max_memory_mb` at any voxel size.
+    """
+    started = time.perf_counter()
+    trajectories = [*(each.trajectory for each in job.earlier), job.trajectory]
+    tracked = np.concatenate([each.poses[~each.lost] for each in trajectories])
+    figures: dict[str, Any] = {"mesh_source": "neural" if dataset is None else job.options.source}
+    if figures["mesh_source"] == "neural" or dataset is None:
+        resolution_m = job.options.resolution_m
+        mesh = extract_mesh(job.scene, resolution_m, job.camera, None if job.camera is None else tracked)
+    else:
+        frames = [*_earlier_frames(job.earlier), posed_frames(dataset, job.trajectory)]
+        fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, job.noise or DEFAULT_NOISE)
+        volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
+        mesh = extract_fused_mesh(volume, job.scene, dataset.camera, tracked)
+        resolution_m = volume.voxel_size
+        figures |= {"mesh_frames": sum(len(part) for part in frames), "mesh_mb": volume.nbytes / 2**20}
+    save_mesh(mesh, path)
+    return mesh, {**figures, "mesh_resolution_m": resolution_m, "mesh_s": time.perf_counter() - started}
+
+
+def _earlier_frames(earlier: Sequence[EarlierFrames]) -> list[PosedFrames]:
+    known = [(each, each.dataset) for each in earlier if each.dataset is not None and not each.trajectory.lost.all()]
+    return [replace(posed_frames(dataset, each.trajectory), noise=each.noise) for each, dataset in known]
+
+
+def posed_frames(dataset: RgbdDataset, trajectory: Trajectory) -> PosedFrames:
+    """The dataset's frames that a trajectory has a pose for.
+
+    Raises:
+        OutputError: there is none.
+    """
+    indices = match_times(dataset.timestamps(), trajectory.timestamps)
+    rows = np.flatnonzero((indices >= 0) & ~trajectory.lost)
+    if not len(rows):
+        raise OutputError(f"{dataset.name}: has none of the run's frames to fuse; --source neural needs no frames")
+    return PosedFrames(dataset, indices[rows], trajectory.poses[rows])
+
+
+def noise_of_model(model: torch.Tensor) -> tuple[float, float]:
+    """Floor and growth of the depth variance, of `SensorNoise.model`."""
+    floor, growth = model[:2].tolist()
+    return floor, growth

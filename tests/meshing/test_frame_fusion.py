@@ -1,0 +1,121 @@
+"""Meshes fused from frames: against a place that is known exactly, within a budget, and with a map filling in."""
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from spslam.datasets.base import RgbdFrame
+from spslam.datasets.generated import GeneratedDataset
+from spslam.errors import DatasetError, SpslamError
+from spslam.geometry import matrix_to_pose7
+from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
+from spslam.meshing.fused_mesh import extract_fused_mesh
+from spslam.ops.tsdf_volume import march_blocks
+from tests.meshing.test_extract_mesh import CAMERA, _looking, _scene, _slab
+
+EXACT = (1e-8, 0.0)
+VOXEL_M = 0.02
+
+
+@pytest.fixture(scope="module")
+def room():
+    dataset = GeneratedDataset(frames=6, width=160, height=120)
+    return PosedFrames(dataset, np.arange(6), dataset.poses())
+
+
+def fused(frames, voxel_size_m=VOXEL_M, memory_mb=500, **more):
+    return fuse_frames(frames, FusionOptions(voxel_size_m, memory_mb, EXACT), **more)
+
+
+def test_the_mesh_lies_on_the_surface(room):
+    mesh = extract_fused_mesh(fused(room))
+    assert len(mesh.faces) > 20_000
+    distance = room.dataset.surface.distance(mesh.vertices.astype(np.float64))
+    assert np.mean(distance) < 0.004 and np.mean(distance < 0.01) > 0.95
+    assert (mesh.colors.std(0) > 5).all()
+
+
+def test_the_same_frames_give_the_same_mesh(room):
+    one, two = (extract_fused_mesh(fused(room)) for _ in range(2))
+    assert all(np.array_equal(getattr(one, name), getattr(two, name)) for name in vars(one))
+
+
+def test_larger_voxels_where_memory_is_short(room):
+    wanted = fused(room)
+    needed_mb = len(wanted) * (512 * 16 + 100) / 2**20
+    volume = fused(room, memory_mb=max(int(0.7 * needed_mb), 1))
+    assert volume.voxel_size == pytest.approx(VOXEL_M * 1.5)
+    assert len(volume) <= 0.7 * len(wanted)
+    with pytest.raises(SpslamError, match="mesh.max_memory_mb allows more"):
+        fuse_frames(_Far(), FusionOptions(0.01, 1, EXACT))
+
+
+class _Far(PosedFrames):
+    """Surface too large for one megabyte of voxels of any size that is tried."""
+
+    def __init__(self):
+        dataset = GeneratedDataset(frames=1, width=160, height=120)
+        object.__setattr__(self, "dataset", dataset)
+
+    def read(self):
+        frame = self.dataset[0]
+        # Of 9 m and of 9 km at once.
+        depth = np.where(np.indices(frame.depth.shape).sum(0) // 8 % 2, 9e3, 5e3).astype(np.float32)
+        yield RgbdFrame(0, 0.0, frame.color, depth), np.eye(4)
+
+
+def test_frames_that_cannot_be_read_are_left_out(room):
+    class Broken(GeneratedDataset):
+        def read(self, index):
+            if index == 2:
+                raise DatasetError("frame 2 is broken")
+            return super().read(index)
+
+    broken = PosedFrames(Broken(frames=6, width=160, height=120), room.indices, room.poses)
+    kept = np.array([0, 1, 3, 4, 5])
+    without = PosedFrames(room.dataset, kept, room.poses[kept])
+    assert torch.equal(fused(broken).sdf, fused(without).sdf)
+
+
+def test_the_map_fills_what_no_frame_measured(device):
+    """A slab's map of 1 x 1 m; a frame has measured the left half of its upper side, 4 mm above the map's."""
+    scene = _scene(_slab, (0.5, 0.5, 0.03), device)
+    pose = _looking((0.0, 0.05, 1.2), (0, 0, 0))
+    volume = ops.TsdfVolume(0.01, device=device)
+    rays = CAMERA.ray_directions() @ pose[:3, :3].T
+    depth = ((0.034 - pose[2, 3]) / rays[..., 2]).astype(np.float32)
+    points = pose[:3, 3] + rays * depth[..., None]
+    depth[(points[..., 0] > 0) | (np.abs(points[..., :2]).max(-1) > 0.45)] = 0
+    pose7 = torch.from_numpy(matrix_to_pose7(pose)).float().to(device)
+    intrinsics = ops.Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+    volume.add_blocks(_all_blocks(device))
+    volume.integrate(torch.from_numpy(depth).to(device), pose7, intrinsics, noise=EXACT)
+    mesh = extract_fused_mesh(volume, scene, CAMERA, pose[None], min_part_m2=0)
+    x, y, z = mesh.vertices.T
+    upper = (z > 0) & (np.abs(y) < 0.3)
+    left, right = z[upper & (x > -0.3) & (x < -0.05)], z[upper & (x > 0.1) & (x < 0.3)]
+    assert np.abs(np.median(left) - 0.034) < 1e-3 and np.abs(np.median(right) - 0.03) < 2e-3
+    seam = upper & (np.abs(x) < 0.05)
+    assert seam.sum() > 100 and (z[seam] > 0.028).all() and (z[seam] < 0.036).all()
+    # One surface: every edge near the seam has two faces.
+    faces = mesh.faces[seam[mesh.faces].all(1)]
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    inner = (np.abs(mesh.vertices[edges][:, :, 0]) < 0.03).all(1) & (np.abs(mesh.vertices[edges][:, :, 1]) < 0.2).all(1)
+    _, counts = np.unique(edges[inner], axis=0, return_counts=True)
+    assert (counts == 2).all()
+
+
+def _all_blocks(device):
+    axis = torch.arange(-7, 7, dtype=torch.int32, device=device)
+    low = torch.arange(-2, 2, dtype=torch.int32, device=device)
+    return torch.cartesian_prod(axis, axis, low)
+
+
+def test_an_empty_volume_gives_an_empty_mesh():
+    mesh = extract_fused_mesh(ops.TsdfVolume(0.02))
+    assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3)
+    vertices, faces = march_blocks(torch.zeros(0, 3, dtype=torch.int32), torch.zeros(0, 512), 0.02)
+    assert len(vertices) == len(faces) == 0
+    with pytest.raises(ValueError, match="camera and poses must be given together"):
+        extract_fused_mesh(ops.TsdfVolume(0.02), camera=CAMERA)
