@@ -31,10 +31,15 @@ struct DepthKeyframe {
   Pose<float> pose;
 };
 
+// The image in a row, of a frame at a pose.
+SPS_INLINE DepthKeyframe keyframe_image(const DepthKeyframes& keyframes, std::int64_t row, const Pose<float>& pose) {
+  const std::int64_t first = row * keyframes.height * keyframes.width;
+  return {keyframes.images + first, keyframes.intensities ? keyframes.intensities + first : nullptr, pose};
+}
+
 SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& keyframes, int k) {
-  const std::int64_t first = keyframes.image_rows[k] * keyframes.height * keyframes.width;
-  return {keyframes.images + first, keyframes.intensities ? keyframes.intensities + first : nullptr,
-          load_pose(keyframes.poses + kPoseSize * keyframes.pose_rows[k])};
+  return keyframe_image(keyframes, keyframes.image_rows[k],
+                        load_pose(keyframes.poses + kPoseSize * keyframes.pose_rows[k]));
 }
 
 // How many take part in an iteration.
