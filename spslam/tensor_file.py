@@ -16,7 +16,7 @@ import torch
 from spslam.errors import OutputError, SpslamError, brief
 from spslam.io import atomic_write
 from spslam.reading import parse_json
-from spslam.tensor_schema import Layout, TensorSchema
+from spslam.tensor_rules import Layout, TensorSchema
 
 # A single metadata key: safetensors does not keep the order of several.
 _HEADER = "spslam"
@@ -98,7 +98,9 @@ def load_header(path: str | Path, kind: TensorFile) -> dict[str, Any]:
     return header
 
 
-def load_tensors(path: str | Path, kind: TensorFile, sizes: Mapping[str, int]) -> dict[str, torch.Tensor]:
+def load_tensors(
+    path: str | Path, kind: TensorFile, sizes: Mapping[str, int], prefix: str = ""
+) -> dict[str, torch.Tensor]:
     """Reads the tensors of a file whose header was read by `load_header`, and checks them.
 
     Names, dtypes and shapes are checked before any tensor is read, then all values.
@@ -107,6 +109,7 @@ def load_tensors(path: str | Path, kind: TensorFile, sizes: Mapping[str, int]) -
         path: the file.
         kind: what it must be.
         sizes: those of the schema that are known beforehand, by name.
+        prefix: what the names in the file begin with, beside those of the schema.
 
     Returns:
         The schema's tensors by name, views of the file's memory: copy what must outlast a change of the file.
@@ -117,9 +120,10 @@ def load_tensors(path: str | Path, kind: TensorFile, sizes: Mapping[str, int]) -
     """
     path, rules = Path(path), kind.schema.rules
     with _faults_of(path, kind), safetensors.safe_open(path, framework="pt") as file:
-        layouts = {name: _layout(file.get_slice(name)) for name in file.keys() if name in rules}  # noqa: SIM118 - no dict
+        inside = {name.removeprefix(prefix): name for name in file.keys() if name.startswith(prefix)}  # noqa: SIM118 - no dict
+        layouts = {name: _layout(file.get_slice(inside[name])) for name in inside if name in rules}
         kind.schema.check_layouts(layouts, sizes)
-        tensors = {name: file.get_tensor(name) for name in layouts}
+        tensors = {name: file.get_tensor(inside[name]) for name in layouts}
         kind.schema.check(tensors, sizes)
     return tensors
 

@@ -1,4 +1,4 @@
-"""What the tensors of a map, a checkpoint, a prior and a pretraining state must be.
+"""What the tensors of a map, its keyframes, a checkpoint, a prior and a pretraining state must be.
 
 One table for each kind of file: dtype, shape and range of every tensor, and how tensors depend on each other. A file is
 held against its table before a kernel sees anything of it, so kernels may index with what they are given.
@@ -6,99 +6,24 @@ held against its table before a kernel sees anything of it, so kernels may index
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from spslam.errors import SpslamError
+from spslam.tensor_rules import Relation, Sizes, TensorRule, TensorSchema, check_values
 
 # Coordinates of vertices are packed with 21 bits per axis, see `spslam.ops.voxel_hash`.
 _VOXEL_MIN, _VOXEL_MAX = -(2**20), 2**20 - 1
 # Origins and sizes of planes are int32 in the kernels; their sums must be too.
 _MOST_TEXELS_FROM_ORIGIN = 2**30
+_EDGE_KINDS = 4  # of `spslam.slam.graph.edges`
 _PLANES, _PLANE_NUMBERS = 3, 5  # first row, origin u, origin v, size u, size v
+_MOST_CAMERA_PX = 2**15  # of an image's width or height, as far as keyframes go
 # Adam on quaternions leaves them this close to unit length.
 _UNIT_TOLERANCE = 1e-2
-
-Sizes = dict[str, int]
-Layout = tuple[torch.dtype, tuple[int, ...]]
-Relation = Callable[[Mapping[str, Tensor], Sizes], None]
-
-
-@dataclass(frozen=True)
-class TensorRule:
-    """What one tensor must be. Floating-point values must always be finite.
-
-    Attributes:
-        dtype: of its values.
-        shape: of each axis the size, or the name of a size: a name stands for the same number in the whole file.
-        low: least value; None for any.
-        high: largest value; None for any.
-        optional: whether the file may lack it.
-    """
-
-    dtype: torch.dtype
-    shape: tuple[int | str, ...]
-    low: float | None = None
-    high: float | None = None
-    optional: bool = False
-
-
-@dataclass(frozen=True)
-class TensorSchema:
-    """The tensors of one kind of file.
-
-    Attributes:
-        rules: by name of the tensor. Other tensors in a file are ignored.
-        relations: called with the tensors and the sizes, after all rules hold; raise SpslamError.
-        pairs: names of optional tensors of which a file must have both or neither.
-    """
-
-    rules: Mapping[str, TensorRule]
-    relations: tuple[Relation, ...] = ()
-    pairs: tuple[tuple[str, str], ...] = field(default=())
-
-    def check_layouts(self, layouts: Mapping[str, Layout], sizes: Mapping[str, int]) -> Sizes:
-        """Checks names, dtypes and shapes, which a file's header tells before any tensor is read.
-
-        Args:
-            layouts: dtype and shape by name.
-            sizes: those that are known beforehand, by name.
-
-        Returns:
-            All sizes, by name.
-
-        Raises:
-            SpslamError: names the first tensor at fault.
-        """
-        known = dict(sizes)
-        for name, rule in self.rules.items():
-            if name in layouts:
-                _check_layout(name, layouts[name], rule, known)
-            elif not rule.optional:
-                raise SpslamError(f"tensor {name} is missing")
-        for one, other in self.pairs:
-            if (one in layouts) != (other in layouts):
-                raise SpslamError(f"tensors {one} and {other} must both be there, got one of them")
-        return known
-
-    def check(self, tensors: Mapping[str, Tensor], sizes: Mapping[str, int]) -> None:
-        """Checks everything; raises SpslamError, which names the first tensor at fault.
-
-        Args:
-            tensors: by name, on any device.
-            sizes: those that are known beforehand, by name.
-        """
-        layouts = {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()}
-        known = self.check_layouts(layouts, sizes)
-        for name, rule in self.rules.items():
-            if name in tensors:
-                _check_values(name, tensors[name], rule)
-        for relation in self.relations:
-            relation(tensors, known)
 
 
 def check_plane_layout(layout: Sequence[int], rows: int) -> None:
@@ -128,39 +53,6 @@ def check_plane_layout(layout: Sequence[int], rows: int) -> None:
         raise ValueError(f"texels must have the {first} rows of the layout, got {rows}")
 
 
-def _check_layout(name: str, layout: Layout, rule: TensorRule, sizes: Sizes) -> None:
-    dtype, shape = layout
-    fits = dtype == rule.dtype and len(shape) == len(rule.shape)
-    for actual, wanted in zip(shape, rule.shape, strict=False):
-        fits &= actual == (sizes.setdefault(wanted, actual) if isinstance(wanted, str) else wanted)
-    if not fits:
-        wanted = ", ".join(str(sizes.get(size, size) if isinstance(size, str) else size) for size in rule.shape)
-        raise SpslamError(f"tensor {name} must be {_name(rule.dtype)} [{wanted}], got {_name(dtype)} {list(shape)}")
-
-
-def _name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
-
-
-def _check_values(name: str, tensor: Tensor, rule: TensorRule) -> None:
-    if tensor.numel() == 0:
-        return
-    if rule.dtype == torch.bool:
-        # Any byte can stand in a file, and kernels take one above 1 for neither true nor false.
-        if int(tensor.view(torch.uint8).max()) > 1:
-            raise SpslamError(f"tensor {name} must be 0 or 1, got {int(tensor.view(torch.uint8).max())}")
-        return
-    if not rule.dtype.is_floating_point and rule.low is None and rule.high is None:
-        return
-    low, high = (bound.item() for bound in torch.aminmax(tensor))
-    if not (math.isfinite(low) and math.isfinite(high)):
-        raise SpslamError(f"tensor {name} must be finite, got NaN or infinity")
-    if rule.low is not None and low < rule.low:
-        raise SpslamError(f"tensor {name} must be at least {rule.low:g}, got {low:g}")
-    if rule.high is not None and high > rule.high:
-        raise SpslamError(f"tensor {name} must be at most {rule.high:g}, got {high:g}")
-
-
 def _check_planes(prefix: str) -> Relation:
     def check(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
         try:
@@ -184,7 +76,7 @@ def _check_pixels(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
         if words.numel() and int(words.max()) >= sizes[axis]:
             raise SpslamError(f"tensor pixels.records must lie in the image, got a pixel beyond its {axis}")
     depth = records[..., 1].contiguous().view(torch.float32)
-    _check_values("pixels.records (depth)", depth, TensorRule(torch.float32, (), low=0))
+    check_values("pixels.records (depth)", depth, TensorRule(torch.float32, (), low=0))
 
 
 def _check_depth_keyframes(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
@@ -194,6 +86,82 @@ def _check_depth_keyframes(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
             raise SpslamError("tensor depth_keyframes.images is missing")
     elif len(frames) and int(frames.max()) >= sizes["frames"]:
         raise SpslamError(f"tensor depth_keyframes.frames must be below {sizes['frames']}, got {int(frames.max())}")
+
+
+def _check_features(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
+    """Counts cover the features; frames ascend and exist."""
+    frames, counts = tensors["features.frames"], tensors["features.counts"]
+    if int(counts.sum()) != sizes["features_kept"] or bool((counts > sizes["features_kept"]).any()):
+        raise SpslamError(f"tensor features.counts must sum to {sizes['features_kept']}, got {int(counts.sum())}")
+    if len(frames) and (int(frames[-1]) >= sizes["frames"] or bool((frames[1:] <= frames[:-1]).any())):
+        raise SpslamError(f"tensor features.frames must ascend and be below {sizes['frames']}")
+
+
+def _check_graph(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
+    """The keyframes are sound, and no more of them are under way than there are."""
+    if "graph.frames" not in tensors:
+        return
+    count = sizes["keyframes"]
+    _check_keyframes(tensors, sizes, "graph.")
+    _check_ends("graph.waiting_ends", tensors, count)
+    if sizes["anchors"]:
+        frame, reference = tensors["graph.anchors"].amax(0).tolist()
+        if frame >= sizes["frames"] or reference >= count:
+            raise SpslamError(f"tensor graph.anchors must name frames and keyframes below {count}")
+    done, _ = tensors["graph.numbers"].tolist()
+    if not 0 <= done <= count or max(sizes["keyframes_at_start"], sizes["keyframes_moved"]) > count:
+        raise SpslamError(f"tensors graph.numbers, graph.start and graph.target must be of {count} keyframes at most")
+    for name in ("waiting_measured", "waiting_correction", "start", "target", "anchor_poses"):
+        _check_rigid(f"graph.{name}", tensors[f"graph.{name}"])
+
+
+def _check_keyframes(tensors: Mapping[str, Tensor], sizes: Sizes, prefix: str) -> None:
+    """Keyframes ascend and exist, have the images of their cameras, and edges join them."""
+    frames, count = tensors[f"{prefix}frames"], sizes["keyframes"]
+    if count and (int(frames[-1]) >= sizes["frames"] or bool((frames[1:] <= frames[:-1]).any())):
+        raise SpslamError(f"tensor {prefix}frames must ascend and be below {sizes['frames']}")
+    cameras, numbers = tensors[f"{prefix}cameras"], tensors[f"{prefix}camera"]
+    whole = cameras[:, [0, 1, 2, 8]]
+    if bool((whole != whole.round()).any() | (whole < 1).any() | (whole > _MOST_CAMERA_PX).any()):
+        raise SpslamError(f"tensor {prefix}cameras must hold steps and sizes from 1 to {_MOST_CAMERA_PX}")
+    if bool((cameras[:, [3, 4, 7, 9]] <= 0).any()):
+        raise SpslamError(f"tensor {prefix}cameras must hold focal lengths, depths and jumps above 0")
+    if count and int(numbers.max()) >= sizes["cameras"]:
+        raise SpslamError(f"tensor {prefix}camera must name cameras below {sizes['cameras']}")
+    pixels = int((cameras[numbers, 1] * cameras[numbers, 2]).sum())
+    if pixels != sizes["keyframe_pixels"]:
+        raise SpslamError(f"tensor {prefix}depth must have the {pixels} pixels of the keyframes' cameras")
+    _check_ends(f"{prefix}edge_ends", tensors, count)
+    if sizes["tried_pairs"] and int(tensors[f"{prefix}tried"].max()) >= count:
+        raise SpslamError(f"tensor {prefix}tried must name keyframes below {count}")
+    for name in ("links", "edge_measured"):
+        _check_rigid(prefix + name, tensors[prefix + name])
+
+
+def _check_ends(name: str, tensors: Mapping[str, Tensor], keyframes: int) -> None:
+    ends = tensors[name]
+    if len(ends) and (int(ends[:, 0].max()) >= _EDGE_KINDS or int(ends[:, 1:].max()) >= keyframes):
+        raise SpslamError(f"tensor {name} must name one of {_EDGE_KINDS} kinds and keyframes below {keyframes}")
+
+
+def _check_archive(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
+    """Keyframes and records are sound, and the recordings have as many frames as there are."""
+    _check_keyframes(tensors, sizes, "")
+    _check_rigid("frames.poses", tensors["frames.poses"])
+    depth = tensors["records"][..., 1].contiguous().view(torch.float32)
+    check_values("records (depth)", depth, TensorRule(torch.float32, (), low=0))
+    total = int(tensors["recordings"].sum())
+    if total != sizes["frames"]:
+        raise SpslamError(f"tensor recordings must sum to {sizes['frames']}, got {total}")
+
+
+def _check_rigid(name: str, matrices: Tensor) -> None:
+    """Raises SpslamError where a matrix [N, 4, 4] is no rotation and translation."""
+    rotations = matrices[:, :3, :3]
+    expected = torch.eye(4, dtype=matrices.dtype, device=matrices.device)
+    off = (rotations @ rotations.transpose(1, 2) - expected[:3, :3]).abs()
+    if len(matrices) and not (bool((off < _UNIT_TOLERANCE).all()) and bool((matrices[:, 3] == expected[3]).all())):
+        raise SpslamError(f"tensor {name} must hold rigid transforms")
 
 
 def _check_moments(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
@@ -215,6 +183,45 @@ def _map_rules(prefix: str) -> dict[str, TensorRule]:
         "color_decoder": TensorRule(torch.float32, ("color_parameters",)),
     }
     return {prefix + name: rule for name, rule in rules.items()}
+
+
+def _graph_rules(prefix: str) -> dict[str, TensorRule]:
+    """The keyframe graph, which is there as a whole or not at all."""
+    rules = {
+        **_keyframe_rules(),
+        "anchors": TensorRule(torch.int64, ("anchors", 2), low=0),
+        "anchor_poses": TensorRule(torch.float64, ("anchors", 4, 4)),
+        **_edge_rules("waiting"),
+        "waiting_correction": TensorRule(torch.float64, ("waitings", 4, 4)),
+        "start": TensorRule(torch.float64, ("keyframes_at_start", 4, 4)),
+        "target": TensorRule(torch.float64, ("keyframes_moved", 4, 4)),
+        "numbers": TensorRule(torch.int64, (2,), low=-1),
+    }
+    return {prefix + name: replace(rule, optional=True) for name, rule in rules.items()}
+
+
+def _keyframe_rules() -> dict[str, TensorRule]:
+    """Keyframes of any number of cameras, and the edges between them."""
+    return {
+        "frames": TensorRule(torch.int64, ("keyframes",), low=0),
+        "camera": TensorRule(torch.int64, ("keyframes",), low=0),
+        "cameras": TensorRule(torch.float64, ("cameras", 10)),
+        "depth": TensorRule(torch.uint16, ("keyframe_pixels",)),
+        "intensity": TensorRule(torch.uint8, ("keyframe_pixels",)),
+        "links": TensorRule(torch.float64, ("keyframes", 4, 4)),
+        "relocalized": TensorRule(torch.bool, ("keyframes",)),
+        **_edge_rules("edge"),
+        "tried": TensorRule(torch.int64, ("tried_pairs", 2), low=0),
+        "noise": TensorRule(torch.float32, ("cameras", 4), low=0),
+    }
+
+
+def _edge_rules(name: str) -> dict[str, TensorRule]:
+    return {
+        f"{name}_ends": TensorRule(torch.int64, (f"{name}s", 3), low=0),
+        f"{name}_measured": TensorRule(torch.float64, (f"{name}s", 4, 4)),
+        f"{name}_information": TensorRule(torch.float64, (f"{name}s", 6, 6)),
+    }
 
 
 def _moment_rules(names: Iterable[tuple[str, tuple[int | str, ...]]]) -> dict[str, TensorRule]:
@@ -250,8 +257,15 @@ CHECKPOINT = TensorSchema(
         "frames.depth_thumbnails": TensorRule(torch.float16, ("frames", "thumbnail_rows", "thumbnail_columns"), low=0),
         "pixels.records": TensorRule(torch.int32, ("frames", "pixels", 3)),
         "pixels.has_pixels": TensorRule(torch.bool, ("frames",)),
+        "unjoined.rows": TensorRule(torch.int64, ("unjoined",), low=0),
+        "unjoined.poses": TensorRule(torch.float32, ("unjoined", 7)),
+        "unjoined.counts": TensorRule(torch.int64, ("segments",), low=0),
         "noise.model": TensorRule(torch.float32, (4,), low=0),
         "noise.counts": TensorRule(torch.int32, (2, 32, 128), low=0),
+        "features.frames": TensorRule(torch.int64, ("feature_frames",), low=0),
+        "features.counts": TensorRule(torch.int64, ("feature_frames",), low=0),
+        "features.descriptors": TensorRule(torch.uint8, ("features_kept", 32)),
+        "features.points": TensorRule(torch.float32, ("features_kept", 3)),
         "depth_keyframes.images": TensorRule(
             torch.uint16, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
         ),
@@ -259,14 +273,37 @@ CHECKPOINT = TensorSchema(
             torch.uint8, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
         ),
         "depth_keyframes.frames": TensorRule(torch.int64, ("depth_images",), low=-1, optional=True),
+        **_graph_rules("graph."),
         **_moment_rules(_MOMENTS),
     },
-    (_check_planes("scene."), _check_unit_quaternions, _check_pixels, _check_depth_keyframes, _check_moments),
+    (
+        _check_planes("scene."),
+        _check_unit_quaternions,
+        _check_pixels,
+        _check_depth_keyframes,
+        _check_features,
+        _check_graph,
+        _check_moments,
+    ),
     (
         ("depth_keyframes.images", "depth_keyframes.intensities"),
         ("depth_keyframes.images", "depth_keyframes.frames"),
+        *(("graph.frames", name) for name in _graph_rules("graph.")),
         *((f"moments.{name}.first", f"moments.{name}.second") for name, _ in _MOMENTS),
     ),
+)
+
+# Nothing is known beforehand.
+KEYFRAMES = TensorSchema(
+    {
+        **_keyframe_rules(),
+        "records": TensorRule(torch.int32, ("keyframes", "pixels", 3)),
+        "recordings": TensorRule(torch.int64, ("recordings",), low=0),
+        "frames.poses": TensorRule(torch.float64, ("frames", 4, 4)),
+        "frames.timestamps": TensorRule(torch.float64, ("frames",)),
+        "frames.lost": TensorRule(torch.bool, ("frames",)),
+    },
+    (_check_archive,),
 )
 
 # Known beforehand: encoder_parameters, geometry_parameters.

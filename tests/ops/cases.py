@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam import ops
-from tests.ops import scene_cases
+from tests.ops import scene_cases, tsdf_cases
 from tests.ops.case_inputs import CAMERA, KEY, LAYOUT, SAMPLES, VOXEL, normal, on_device, random_coords, uniform
 from tests.ops.scenes import TRUNCATION
 
@@ -91,6 +91,20 @@ def _tri_plane(generator, device, n):
     return on_device(device, dict(texels=normal(generator, 83, 32), points=points, cell_size=VOXEL, layout=LAYOUT))
 
 
+def _tri_plane_levels(generator, device, n):
+    grid = ops.TriPlaneLevels.from_sizes([(-0.2, -0.2, -0.2), (0.3, 0.3, 0.3)], [(3, 4, 5), (6, 7, 8)])
+    table = normal(generator, grid.num_rows, 4)
+    return on_device(device, dict(table=table, points=0.6 * uniform(generator, n, 3) - 0.25, grid=grid))
+
+
+def _volume_levels(generator, device, n):
+    bounds = [(-0.2, -0.2, -0.2), (0.3, 0.3, 0.3)]
+    grid = ops.VolumeLevels.from_sizes(bounds, [(3, 4, 5), (6, 7, 8)], max_level_rows=64)
+    points = 0.6 * uniform(generator, n, 3) - 0.25
+    table = normal(generator, grid.num_rows, 2)
+    return on_device(device, dict(table=table, points=points, grid=grid, concatenate=True))
+
+
 def _uniform_draw(generator, device, n):
     return dict(KEY, count=n, device=device)
 
@@ -132,6 +146,12 @@ def _losses(generator, device, n):
         cosine=uniform(generator, n),
     )
     return on_device(device, samples | targets | dict(truncation=TRUNCATION, cosine_targets=True))
+
+
+def _composite(generator, device, n):
+    t = 1 + uniform(generator, n, SAMPLES).sort(1).values
+    densities = dict(opacities=20 * uniform(generator, n, SAMPLES), lengths=0.05 * uniform(generator, n, SAMPLES))
+    return on_device(device, densities | dict(values=uniform(generator, n, SAMPLES, 4), t=t, stop=1e-4))
 
 
 def _mlp(generator, device, n):
@@ -218,12 +238,17 @@ CASES = {
     "trilinear_interpolate": Case(_trilinear, ("embeddings", "local_coords"), rows=("corner_ids", "local_coords")),
     "bilinear_interpolate": Case(_bilinear, ("texels", "uv"), rows=("uv",)),
     "tri_plane_interpolate": Case(_tri_plane, ("texels", "points"), rows=("points",)),
+    "interpolate_tri_planes": Case(_tri_plane_levels, ("table", "points"), rows=("points",)),
+    "interpolate_volumes": Case(_volume_levels, ("table", "points"), rows=("points",)),
     "philox_uniform": Case(_uniform_draw),
     "sample_indices": Case(_index_draw),
     "sample_along_rays": Case(_along_rays, rows=("depth",)),
     "sample_frame_pixels": Case(_frame_pixels),
     "unproject_pixels": Case(_unproject),
     "volume_render": Case(_render, ("sdf", "color", "t"), rows=("sdf", "color", "t", "valid")),
+    "alpha_composite": Case(
+        _composite, ("opacities", "values", "t", "lengths"), rows=("opacities", "values", "t", "lengths")
+    ),
     "rendering_losses": Case(
         _losses,
         ("color", "depth", "sdf", "t"),
@@ -239,6 +264,11 @@ CASES = {
     "fuse_prior_": Case(_fuse),
     "random_embeddings": Case(_random_embeddings, rows=("voxel_coords",)),
     "marching_cubes": Case(_marching_cubes),
+    "measure_planes": Case(tsdf_cases.planes),
+    "tsdf_touched_blocks": Case(tsdf_cases.touched_blocks),
+    "tsdf_integrate_": Case(tsdf_cases.integrate),
+    "tsdf_query": Case(tsdf_cases.query),
+    "tsdf_ray_cast": Case(tsdf_cases.ray_cast),
     "query_sdf": Case(scene_cases.scene_points),
     "query_sdf_gradient": Case(scene_cases.scene_points),
     "query_color": Case(scene_cases.scene_points),
@@ -246,6 +276,8 @@ CASES = {
     "track_gauss_newton": Case(scene_cases.track),
     "measure_noise_": Case(scene_cases.measure_noise),
     "gauss_newton_poses": Case(scene_cases.frame_equations),
+    "align_depth_images": Case(scene_cases.align_images),
+    "compare_depth_images": Case(scene_cases.compare_images),
     "track_adam": Case(scene_cases.track_adam),
     "optimize_map_": Case(scene_cases.optimize_map),
     "predict_pose": Case(scene_cases.predict),

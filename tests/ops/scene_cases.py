@@ -60,6 +60,32 @@ def track(generator, device, n):
     )
 
 
+def _image_pairs(generator, device, n):
+    depth = (10000 + 500 * uniform(generator, 3, 12, 16)).to(torch.int32).to(torch.uint16)
+    pixels, normals = pixel_records(generator, 2, 40), torch.nn.functional.normalize(normal(generator, 2, 40, 3), dim=2)
+    camera = ops.Intrinsics(15.0, 15.0, 7.5, 5.5)
+    numbers = torch.tensor([3, 5], device=device)
+    pairs = torch.stack([torch.arange(n) % 2, torch.arange(n) % 3], 1)
+    intensities = (255 * uniform(generator, 3, 12, 16)).to(torch.uint8).to(device)
+    return dict(
+        sources=ops.DrawnPixels(pixels.to(device), normals.to(device), numbers, INTRINSICS),
+        targets=ops.DepthImages(depth.to(device), 1e-4, camera, intensities),
+        pairs=pairs.to(device),
+        poses=POSE.expand(n, 7).contiguous().to(device),
+        noise=torch.tensor([1e-6, 1e-5, 1e-4, 0.1], device=device),
+    )
+
+
+def align_images(generator, device, n):
+    key = {name: KEY[name] for name in ("seed", "stream")}
+    options = ops.AlignmentOptions(num_pixels=16, iterations=2, kernel_start=0.08, kernel_end=0.02, damping=1e-4, **key)
+    return _image_pairs(generator, device, n) | dict(options=options)
+
+
+def compare_images(generator, device, n):
+    return _image_pairs(generator, device, n) | dict(tolerance=0.05)
+
+
 def measure_noise(generator, device, n):
     images = (2000 + 100 * uniform(generator, 2, 12, 16)).to(torch.int32)
     intensities = (255 * uniform(generator, 2, 12, 16)).to(torch.uint8).to(device)
