@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from spslam.cli.arguments import add_config, overrides
+from spslam.cli.arguments import add_config, choose_config, overrides
 from spslam.config import load_config
 from spslam.datasets.inspection import Inspection
 
@@ -17,7 +17,7 @@ def execute(args: argparse.Namespace) -> None:
     from spslam.datasets import open_dataset, sequence_options
     from spslam.datasets.inspection import inspect_dataset
 
-    config = load_config(args.config, None, overrides(args))
+    config = load_config(choose_config(args), None, overrides(args))
     for number, options in enumerate(sequence_options(config.dataset)):
         if number:
             print()
@@ -45,6 +45,9 @@ def _rows(found: Inspection) -> list[tuple[str, str]]:
         depth = found.depth
         rows.append(("depth", f"{depth.near_m:.2f} to {depth.far_m:.2f} m (1 to 99 %), median {depth.median_m:.2f} m"))
         rows.append(("no depth", f"{depth.holes:.1%} of the pixels, {depth.most_holes:.1%} in the worst frame"))
+    if found.focal_error is not None:
+        off, sigma = (100 * value for value in found.focal_error)
+        rows.append(("focal length", f"{off:+.1f} % +- {sigma:.1f} % off, by how color moves against depth"))
     return [*rows, *_pose_rows(found)]
 
 

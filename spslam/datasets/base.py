@@ -6,11 +6,13 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.datasets.frame_arrays import UNNUMBERED, checked_arrays
 from spslam.datasets.solids import SolidScene
 from spslam.errors import DatasetError
 
@@ -18,12 +20,15 @@ from spslam.errors import DatasetError
 MAX_FRAMES = 1 << 19
 
 
-@dataclass
+@dataclass(repr=False)
 class RgbdFrame:
     """One color image with its depth image, both of the same view and size.
 
+    `RgbdFrame.from_arrays` makes one of arrays of your own, and checks them.
+
     Attributes:
-        index: the frame's number in the dataset it was read from, counted from 0.
+        index: the frame's number in the dataset it was read from, counted from 0; -1 for one that `SlamSystem` is to
+            number itself.
         timestamp: s.
         color: uint8 [H, W, 3], RGB.
         depth: float32 [H, W], m along the optical axis; 0 where nothing was measured.
@@ -37,6 +42,44 @@ class RgbdFrame:
     depth: np.ndarray
     pose: np.ndarray | None = None
 
+    @classmethod
+    def from_arrays(cls, color: Any, depth: Any, timestamp: float, *, depth_scale: float | None = None) -> RgbdFrame:
+        """A frame of arrays from any camera or program, converted and checked.
+
+        Args:
+            color: uint8 [H, W, 3], RGB. OpenCV's images are BGR: `color[..., ::-1]`, or `cv2.cvtColor`.
+            depth: [H, W] along the optical axis, of the same view as `color`: floating-point meters, or whole numbers
+                with `depth_scale`. 0, negative numbers, NaN and infinity stand for "not measured".
+            timestamp: s; of one clock for all frames.
+            depth_scale: units of `depth` per meter, 1000 for millimeters. Required for whole numbers.
+
+        Returns:
+            The frame, which the system numbers when it comes; depth is a copy, color is not.
+
+        Raises:
+            TypeError: another dtype.
+            ValueError: another shape, images of different sizes, depth that cannot be in meters (its median is below
+                1 cm or above 100 m), or a time that is not in seconds.
+
+        Example:
+            >>> millimeters = np.full((480, 640), 1500, dtype=np.uint16)
+            >>> color = np.zeros((480, 640, 3), dtype=np.uint8)
+            >>> RgbdFrame.from_arrays(color, millimeters, 0.0, depth_scale=1000)
+            RgbdFrame(640x480, t=0.000 s, depth in 100 % of the pixels, median 1.50 m)
+        """
+        color, depth, timestamp = checked_arrays(color, depth, timestamp, depth_scale)
+        return cls(UNNUMBERED, timestamp, color, depth)
+
+    def __repr__(self) -> str:
+        known = self.depth[::8, ::8] > 0 if self.depth.ndim == 2 else np.zeros(1, dtype=bool)
+        number = "" if self.index == UNNUMBERED else f"{self.index}, "
+        depth = "no depth"
+        if known.any():
+            median = float(np.median(self.depth[::8, ::8][known]))
+            depth = f"depth in {100 * known.mean():.0f} % of the pixels, median {median:.2f} m"
+        size = "x".join(str(length) for length in self.color.shape[1::-1])
+        return f"RgbdFrame({number}{size}, t={self.timestamp:.3f} s, {depth})"
+
 
 class RgbdDataset(ABC):
     """A sequence of frames of one camera, read one at a time and from any thread.
@@ -49,12 +92,15 @@ class RgbdDataset(ABC):
         camera: of all frames.
         depth_range: nearest and farthest depth (m); depth outside comes as 0.
         border_px: depth within so many pixels of the image's border comes as 0.
+        is_registered: whether depth is meant to be registered to color; where it is known not to be, checks of the data
+            do not expect it.
     """
 
     name: str
     camera: Camera
     depth_range: tuple[float, float] = (0.0, float("inf"))
     border_px: int = 0
+    is_registered: bool = True
 
     @abstractmethod
     def __len__(self) -> int:
@@ -88,7 +134,7 @@ class RgbdDataset(ABC):
         frame = self.read(index)
         self._check_sizes(frame)
         _clear_depth_outside(frame.depth, *self.depth_range)
-        _clear_border(frame.depth, self.border_px)
+        clear_border(frame.depth, self.border_px)
         return frame
 
     def __iter__(self) -> Iterator[RgbdFrame]:
@@ -138,6 +184,7 @@ class Subset(RgbdDataset):
         self.camera = dataset.camera
         self.depth_range = dataset.depth_range
         self.border_px = dataset.border_px
+        self.is_registered = dataset.is_registered
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -171,7 +218,8 @@ def _clear_depth_outside(depth: np.ndarray, nearest: float, farthest: float) -> 
         cv2.threshold(depth, farthest, 0, cv2.THRESH_TOZERO_INV, dst=depth)
 
 
-def _clear_border(depth: np.ndarray, width: int) -> None:
+def clear_border(depth: np.ndarray, width: int) -> None:
+    """Sets depth within `width` pixels of the border to 0, unknown, in place."""
     if width > 0:
         depth[:width] = depth[-width:] = 0
         depth[:, :width] = depth[:, -width:] = 0

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.images import read_color, read_depth, resized_color
+from spslam.datasets.lens import Rectification
 from spslam.datasets.text import read_pose, read_pose_table
 from spslam.errors import DatasetError
 
@@ -36,34 +36,6 @@ class FramePaths:
     fault: str | None = None
 
 
-@dataclass(frozen=True)
-class Undistortion:
-    """Pixel maps that turn a distorted image into a pinhole camera's.
-
-    Attributes:
-        map_x: int16 [H, W, 2], see `cv2.remap`.
-        map_y: uint16 [H, W].
-    """
-
-    map_x: np.ndarray
-    map_y: np.ndarray
-
-    @classmethod
-    def of(cls, camera: Camera, coefficients: Sequence[float]) -> Undistortion:
-        """The maps of a camera, which stays the same.
-
-        Args:
-            camera: of the images.
-            coefficients: OpenCV's distortion coefficients (k1, k2, p1, p2, k3).
-        """
-        matrix, size = camera.matrix(), (camera.width, camera.height)
-        return cls(*cv2.initUndistortRectifyMap(matrix, np.asarray(coefficients), None, matrix, size, cv2.CV_16SC2))
-
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """The image without distortion, by linear interpolation; pixels from outside repeat the border."""
-        return cv2.remap(image, self.map_x, self.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
 @dataclass
 class FileDataset(RgbdDataset):
     """Frames in image files.
@@ -75,6 +47,7 @@ class FileDataset(RgbdDataset):
         invalid_depth: see `spslam.datasets.images.read_depth`.
         undistortion: applied to each color image.
         resize_color: bring each color image, of whatever size, to its depth image's size.
+        is_registered: see `RgbdDataset`.
     """
 
     name: str
@@ -83,10 +56,11 @@ class FileDataset(RgbdDataset):
     gt_poses: np.ndarray | None
     units_per_meter: float | None
     invalid_depth: Sequence[int] = ()
-    undistortion: Undistortion | None = None
+    undistortion: Rectification | None = None
     resize_color: bool = False
     depth_range: tuple[float, float] = field(default=(0.0, float("inf")))
     border_px: int = 0
+    is_registered: bool = True
 
     def __post_init__(self) -> None:
         if self.gt_poses is not None and not np.isfinite(self.gt_poses).any():
@@ -109,7 +83,7 @@ class FileDataset(RgbdDataset):
         color = read_color(paths.color, None if self.resize_color else size)
         depth = read_depth(paths.depth, self.units_per_meter, self.invalid_depth, size)
         if self.undistortion is not None:
-            color = self.undistortion(color)
+            color = self.undistortion.color(color)
         if self.resize_color:
             color = resized_color(color, depth.shape[1], depth.shape[0])
         return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index))

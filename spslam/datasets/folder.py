@@ -1,31 +1,36 @@
 """A user's own recording: a folder of color images, a folder of depth images and the intrinsics.
 
-`color/` (or `rgb/`, `images/`) and `depth/`, paired by name (the part before the suffix) or, where the names
-differ, by natural order if there are as many of each. Intrinsics in one of `intrinsics.txt`,
-`camera-intrinsics.txt` (3x3 or 4x4 matrix, or fx fy cx cy), `intrinsics.json` or `camera.json` (`fx, fy, cx,
-cy` and optionally `width, height, depth_scale`). Depth is a 16-bit PNG or TIFF, or floating-point TIFF or npy, with
-`depth_scale` units per meter: if nothing says otherwise 1000 for integers and 1 for floating point. Poses aren't
-needed; `poses.txt`, with 16 numbers per frame (4x4 camera to world, OpenCV axes), is read if it is there.
+`color/` (or `rgb/`, `image/`, `images/`) and `depth/`, paired by name (the part before the suffix) or, where the names
+differ, by natural order if there are as many of each. Cameras are read from the files of
+`spslam.datasets.calibration_files`: their distortion is undone, and color and depth of two cameras are registered.
+Depth is a 16-bit PNG or TIFF, or floating-point TIFF or npy, with `depth_scale` units per meter: if nothing says
+otherwise 1000 for integers and 1 for floating point. `confidence/`, 8-bit images of the names of the depth images, is
+heeded if it is there. Poses aren't needed; `poses.txt`, with 16 numbers per frame (4x4 color camera to world, OpenCV
+axes), is read if it is there, and so is `times.txt`, one time (s) per frame.
 """
 
 from __future__ import annotations
 
-import itertools
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from spslam.camera import Camera
+from spslam.datasets.base import RgbdDataset
+from spslam.datasets.calibration_files import read_calibration
 from spslam.datasets.files import FileDataset, FramePaths, attach_pose_table, paired, require_folder
-from spslam.datasets.images import DEPTH_SCALE_RULE, Size, first_size, is_depth_scale, read_depth
-from spslam.datasets.text import camera_from_matrix, read_intrinsics_matrix, read_json
-from spslam.errors import DatasetError, brief
+from spslam.datasets.image_files import ColorFiles, DepthFiles, first_depth_size
+from spslam.datasets.images import DEPTH_SCALE_RULE, first_size, is_depth_scale, read_depth
+from spslam.datasets.recording import Calibration, Recording, View
+from spslam.datasets.text import read_numbers
+from spslam.errors import DatasetError
 
-COLOR_FOLDERS = ("color", "rgb", "images")
+COLOR_FOLDERS = ("color", "rgb", "image", "images")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
-INTRINSICS_FILES = ("intrinsics.txt", "camera-intrinsics.txt", "intrinsics.json", "camera.json")
+CONFIDENCE_FOLDER, TIMES_FILE = "confidence", "times.txt"
 FRAMES_PER_SECOND = 30.0
 # The median depth of an indoor recording; outside it the scale is wrong, not the room.
 PLAUSIBLE_MEDIAN_M = (0.1, 20.0)
@@ -34,38 +39,121 @@ _COMMON_SCALES = (1.0, 1000.0, 5000.0, 6553.5, 10000.0)
 _FRAMES_TRIED_FOR_SCALE = 5
 
 
-def open_folder(folder: Path, depth_scale: float | None = None) -> FileDataset:
+def open_folder(
+    folder: Path, depth_scale: float | None = None, min_confidence: int = 0, view: View = "depth"
+) -> RgbdDataset:
     """Opens a recording in the layout above.
 
     Args:
         folder: the recording.
         depth_scale: depth units per meter; overrides the one in the JSON file.
+        min_confidence: depth of lower confidence comes as 0.
+        view: see `Recording`; has no effect on images of one camera and one size.
 
     Raises:
-        DatasetError: a missing folder or intrinsics, intrinsics of another shape or image size, images that can't be
-            paired, or a depth scale that puts the median depth outside 0.1 to 20 m.
+        DatasetError: a missing folder or intrinsics, intrinsics of another shape or image size, a camera that is not
+            fully described, images that can't be paired, times that don't ascend, or a depth scale that puts the median
+            depth outside 0.1 to 20 m.
     """
-    colors = _list_images(_color_folder(require_folder(folder)), COLOR_SUFFIXES)
-    depths = _list_images(folder / "depth", DEPTH_SUFFIXES)
-    frames = _pair(folder, colors, depths)
-    width, height = first_size(colors)
-    camera, stored_scale = _read_intrinsics(folder, width, height)
+    colors = list_images(_color_folder(require_folder(folder)), COLOR_SUFFIXES)
+    depths = list_images(folder / "depth", DEPTH_SUFFIXES)
+    frames = with_times(_pair(folder, colors, depths), folder / TIMES_FILE)
+    size, depth_size = first_size(colors), first_depth_size(depths)
+    calibration, stored_scale = read_calibration(folder, size, depth_size)
     scale = stored_scale if depth_scale is None else depth_scale
     if scale is not None and not is_depth_scale(scale):
         raise DatasetError(f"{folder}: depth_scale must be {DEPTH_SCALE_RULE}, got {scale}")
-    _check_scale(frames, scale, (width, height))
+    check_scale([frame.depth for frame in frames if frame.fault is None], scale)
     frames, poses = attach_pose_table(dict(enumerate(frames)), folder / "poses.txt")
-    return FileDataset(f"folder/{folder.name}", camera, frames, poses, scale)
+    confidence = _confidence_files(folder / CONFIDENCE_FOLDER, frames) if min_confidence > 0 else None
+    name = f"folder/{folder.name}"
+    if confidence is None and _is_one_camera(calibration):
+        return FileDataset(name, calibration.color.camera, frames, poses, scale)
+    return file_recording(name, frames, calibration, poses, scale, confidence, min_confidence, view)
+
+
+def file_recording(
+    name: str,
+    frames: Sequence[FramePaths],
+    calibration: Calibration,
+    poses: np.ndarray | None,
+    units_per_meter: float | None,
+    confidence: Sequence[Path | None] | None,
+    min_confidence: int,
+    view: View,
+) -> Recording:
+    """A recording whose images are files, paired already; see `Recording` and `DepthFiles`."""
+    seconds = np.array([frame.timestamp for frame in frames])
+    color, depth = calibration.color.camera, calibration.depth.camera
+    pairs = np.repeat(np.arange(len(frames))[:, None], 2, axis=1)
+    return Recording(
+        name,
+        ColorFiles([frame.color for frame in frames], seconds, (color.width, color.height)),
+        DepthFiles(
+            [frame.depth for frame in frames],
+            seconds,
+            (depth.width, depth.height),
+            units_per_meter,
+            confidence=confidence,
+            min_confidence=min_confidence,
+        ),
+        pairs,
+        calibration,
+        poses,
+        view=view,
+        faults={number: frame.fault for number, frame in enumerate(frames) if frame.fault is not None},
+    )
+
+
+def with_times(frames: list[FramePaths], path: Path) -> list[FramePaths]:
+    """Frames with the times of a file, one per frame, s; as they are where there is no such file.
+
+    A last frame without a time is left out where frames are numbered as `spslam.live.FolderRecorder` does it: it was
+    being written when the recording was killed.
+
+    Raises:
+        DatasetError: another count of times than of frames, or times that don't ascend.
+    """
+    if not path.is_file():
+        return frames
+    times = read_numbers(path)
+    if len(times) == len(frames) - 1 > 0 and _counts_from_zero(frames):
+        frames = frames[:-1]
+    if len(times) != len(frames):
+        raise DatasetError(f"{path}: must have one time (s) for each of {len(frames)} frames, got {len(times)}")
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DatasetError(f"{path}: times must be finite and ascend")
+    return [replace(frame, timestamp=float(time)) for frame, time in zip(frames, times, strict=True)]
+
+
+def _counts_from_zero(frames: Sequence[FramePaths]) -> bool:
+    """Whether frames are named 000000, 000001, ..., so that a name tells its row in a file of all frames."""
+    return all(frame.depth.stem == f"{number:06d}" for number, frame in enumerate(frames))
+
+
+def _is_one_camera(calibration: Calibration) -> bool:
+    """Whether there is nothing to put right."""
+    color, depth = calibration.color, calibration.depth
+    return color == depth and not color.is_distorted and np.array_equal(calibration.color_from_depth, np.eye(4))
+
+
+def _confidence_files(folder: Path, frames: Sequence[FramePaths]) -> list[Path | None] | None:
+    """The confidence map of each frame's depth image; None where the recording has none."""
+    if not folder.is_dir():
+        return None
+    found = {path.stem: path for path in list_images(folder, (".png",))}
+    return [found.get(frame.depth.stem) for frame in frames]
 
 
 def _color_folder(folder: Path) -> Path:
     for name in COLOR_FOLDERS:
         if (folder / name).is_dir():
             return folder / name
-    raise DatasetError(f"{folder}: must contain a folder color (or rgb, or images) beside depth, got none")
+    raise DatasetError(f"{folder}: must contain a folder color (or rgb, image, images) beside depth, got none")
 
 
-def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The images of a folder in natural order; raises DatasetError where there are none."""
     paths = [
         path for path in require_folder(folder).iterdir() if path.suffix.lower() in suffixes and path.name[0] != "."
     ]
@@ -91,56 +179,35 @@ def _pair(folder: Path, colors: list[Path], depths: list[Path]) -> list[FramePat
     )
 
 
-def _read_intrinsics(folder: Path, width: int, height: int) -> tuple[Camera, float | None]:
-    for name in INTRINSICS_FILES:
-        path = folder / name
-        if path.is_file():
-            if path.suffix == ".json":
-                return _read_json_intrinsics(path, width, height)
-            return read_intrinsics_matrix(path, width, height), None
-    raise DatasetError(f"{folder}: must contain the intrinsics in one of {', '.join(INTRINSICS_FILES)}, got none")
+def check_scale(paths: Sequence[Path], scale: float | None) -> None:
+    """Raises DatasetError where a depth scale puts the median depth of images out of all bounds.
 
-
-def _read_json_intrinsics(path: Path, width: int, height: int) -> tuple[Camera, float | None]:
-    values = read_json(path)
-    for name in ("fx", "fy", "cx", "cy"):
-        if not _is_number(values.get(name)):
-            raise DatasetError(f"{path}: must contain numbers fx, fy, cx, cy, got {name}: {brief(values.get(name))}")
-    for name, actual in (("width", width), ("height", height)):
-        if name in values and values[name] != actual:
-            raise DatasetError(f"{path}: {name} must be the images' {actual}, got {brief(values[name])}")
-    scale = values.get("depth_scale")
-    if scale is not None and not is_depth_scale(scale):
-        raise DatasetError(f"{path}: depth_scale must be {DEPTH_SCALE_RULE}, got {brief(scale)}")
-    matrix = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]])
-    return camera_from_matrix(matrix, width, height, str(path)), scale
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _check_scale(frames: list[FramePaths], scale: float | None, size: Size) -> None:
-    usable = (frame.depth for frame in frames if frame.fault is None)
-    for path in itertools.islice(usable, _FRAMES_TRIED_FOR_SCALE):
+    A few are looked at, spread over the recording, until one is plausible: a hand before the lens is near, too.
+    """
+    first_fault = None
+    for path in paths[:: -(-len(paths) // _FRAMES_TRIED_FOR_SCALE) or 1]:
         try:
-            depth = read_depth(path, scale, size=size)
-            stored = read_depth(path, 1.0, size=size)
+            depth = read_depth(path, scale)
+            stored = read_depth(path, 1.0)
         except DatasetError:
             continue
         measured = depth[depth > 0]
         if measured.size:
-            _check_median(path, float(np.median(measured)), float(np.median(stored[stored > 0])))
-            return
+            fault = _median_fault(path, float(np.median(measured)), float(np.median(stored[stored > 0])))
+            if fault is None:
+                return
+            first_fault = first_fault or fault
+    if first_fault is not None:
+        raise DatasetError(first_fault)
 
 
-def _check_median(path: Path, median: float, stored_median: float) -> None:
+def _median_fault(path: Path, median: float, stored_median: float) -> str | None:
     low, high = PLAUSIBLE_MEDIAN_M
     if low <= median <= high:
-        return
+        return None
     fitting = [f"{scale:g}" for scale in _COMMON_SCALES if 0.3 <= stored_median / scale <= 10]
     suggestion = f"; depth_scale {' or '.join(fitting)} would fit" if fitting else ""
-    raise DatasetError(
+    return (
         f"{path}: median depth must be within {low:g} and {high:g} m, "
         f"got {median:.4g} m with depth_scale {stored_median / median:.4g}{suggestion}"
     )

@@ -81,3 +81,21 @@ def frozen_depth_before(dataset: RgbdDataset, start: int) -> FrozenDepth:
         if not signature.depth:
             break
     return FrozenDepth(first)
+
+
+def frozen_frames(dataset: RgbdDataset, indices: np.ndarray) -> list[int]:
+    """Frames whose depth image is that of the frame before, but not their color image.
+
+    Args:
+        dataset: to read from; frames that can't be read are left out.
+        indices: of the frames before those that are looked at.
+    """
+    frozen = []
+    for index in indices[indices + 1 < len(dataset)]:
+        check = FrozenDepth()
+        try:
+            if any([check.check(FrameSignature.of(dataset[int(i)])) for i in (index, index + 1)]):
+                frozen.append(int(index) + 1)
+        except DatasetError:
+            continue
+    return frozen

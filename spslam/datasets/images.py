@@ -82,12 +82,43 @@ def read_depth(
         stored = _load_array(path, size)
     else:
         stored = _decode(_image_bytes(path), str(path), size, cv2.IMREAD_UNCHANGED)
-    if stored.ndim != 2 or stored.dtype not in _DEPTH_TYPES:
-        channels = 1 if stored.ndim == 2 else stored.shape[-1]
+    return _checked_depth(stored, str(path), units_per_meter, invalid)
+
+
+def decode_depth(
+    content: bytes, name: str, units_per_meter: float | None, size: Size | None = None, invalid: Sequence[int] = ()
+) -> np.ndarray:
+    """As `read_depth`, from an image file's bytes.
+
+    Args:
+        content: of the file.
+        name: what errors name.
+        units_per_meter: see `read_depth`.
+        size: see `read_depth`.
+        invalid: see `read_depth`.
+    """
+    return _checked_depth(_decode(content, name, size, cv2.IMREAD_UNCHANGED), name, units_per_meter, invalid)
+
+
+def read_confidence(path: Path, size: Size) -> np.ndarray:
+    """Reads a confidence map.
+
+    Args:
+        path: an image with one channel of 8 bits; 0 is the lowest confidence.
+        size: (width, height) that it must have.
+
+    Returns:
+        uint8 [H, W].
+
+    Raises:
+        DatasetError: as `read_color`, or several channels, or more bits.
+    """
+    stored = _decode(_image_bytes(path), str(path), size, cv2.IMREAD_UNCHANGED)
+    if stored.ndim != 2 or stored.dtype != np.uint8:
         raise DatasetError(
-            f"{path}: depth must be 16-bit or floating-point with one channel, got {stored.dtype} with {channels}"
+            f"{path}: confidence must be 8-bit with one channel, got {stored.dtype} {list(stored.shape)}"
         )
-    return depth_in_meters(stored, units_per_meter, invalid)
+    return stored
 
 
 def depth_in_meters(stored: np.ndarray, units_per_meter: float | None, invalid: Sequence[int] = ()) -> np.ndarray:
@@ -158,6 +189,15 @@ def resized_color(color: np.ndarray, width: int, height: int) -> np.ndarray:
         return color
     shrinks = color.shape[0] >= height and color.shape[1] >= width
     return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def _checked_depth(stored: np.ndarray, name: str, units_per_meter: float | None, invalid: Sequence[int]) -> np.ndarray:
+    if stored.ndim != 2 or stored.dtype not in _DEPTH_TYPES:
+        channels = 1 if stored.ndim == 2 else stored.shape[-1]
+        raise DatasetError(
+            f"{name}: depth must be 16-bit or floating-point with one channel, got {stored.dtype} with {channels}"
+        )
+    return depth_in_meters(stored, units_per_meter, invalid)
 
 
 def _decode(content: bytes, name: str, size: Size | None, flags: int) -> np.ndarray:

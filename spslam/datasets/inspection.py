@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.frozen_depth import FrameSignature, FrozenDepth
+from spslam.datasets.frozen_depth import frozen_frames
+from spslam.datasets.plausibility import Finding, Judgment, check_stretch, folded
 from spslam.datasets.reprojection import (
     Agreement,
     DepthPair,
@@ -17,18 +18,19 @@ from spslam.datasets.reprojection import (
     explain_disagreement,
     measure_agreement,
 )
+from spslam.datasets.thinning import thinned, thinned_camera
 from spslam.errors import DatasetError
 from spslam.geometry import inverse, rotation_angle
 
-# Indoors; a median outside it means another unit.
-_PLAUSIBLE_MEDIAN_M = (0.1, 20.0)
+# Where the recording is looked at, as shares of its length, and how many views there.
+_STRETCHES = (0.0, 0.4, 0.75)
+_VIEWS_PER_STRETCH = 48
 _MANY_HOLES = 0.5
 # A hand-held camera at 30 Hz moves less from frame to frame, and so does one at 10 Hz seldom.
 _JUMP_M = 0.3
 _JUMP_DEG = 20.0
 _GOOD_AGREEMENT = 0.02
-# Of a larger depth image only every n-th row and column is kept, so that many of them fit into memory.
-_MAX_PIXELS_KEPT = 1 << 19
+_NAMES_AND_NUMBERS = re.compile(r"\S*[\d/]\S*")
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,10 @@ class Inspection:
         frames_per_second: from the median step between timestamps; NaN where unknown.
         depth: None where no frame has depth.
         poses: None where none is known.
-        problems: what looks wrong, in words.
+        findings: what a look at a few stretches says of intrinsics, scale, pairing and order.
+        focal_error: share by which the focal length looks too large by how color moves against depth, and its standard
+            deviation; None where that can't be told.
+        problems: all that looks wrong, in words.
     """
 
     name: str
@@ -97,6 +102,8 @@ class Inspection:
     frames_per_second: float
     depth: DepthStatistics | None
     poses: PoseStatistics | None
+    findings: list[Finding] = field(default_factory=list)
+    focal_error: tuple[float, float] | None = None
     problems: list[str] = field(default_factory=list)
 
 
@@ -124,64 +131,54 @@ def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> 
         _depth_statistics(depths),
         poses,
     )
-    frozen = _frozen_frames(dataset, indices[:: max(1, len(indices) // pairs)])
+    judgments = _judge_stretches(dataset, frames)
+    found.findings = folded(finding for judgment in judgments for finding in judgment.findings)
+    found.focal_error = _focal_error(judgments)
+    frozen = frozen_frames(dataset, indices[:: max(1, len(indices) // pairs)])
     found.problems = [
         *_depth_problems(found),
-        *_frozen_problems(frozen),
+        *map(str, found.findings),
+        *_frozen_problems(frozen, found.findings),
         *_pose_problems(found, problem),
-        *_time_problems(dataset.timestamps()),
+        *_time_problems(dataset.timestamps(), found.findings),
     ]
     return found
+
+
+def _judge_stretches(dataset: RgbdDataset, frames: int) -> list[Judgment]:
+    """Judgments of stretches that do not overlap; `frames` limits the views of each."""
+    views = min(_VIEWS_PER_STRETCH, frames)
+    starts = sorted({int(share * len(dataset)) for share in _STRETCHES})
+    if len(dataset) < 4 * views:
+        starts = starts[:1]
+    return [check_stretch(dataset, start, views) for start in starts]
+
+
+def _focal_error(judgments: list[Judgment]) -> tuple[float, float] | None:
+    """By all stretches together."""
+    estimates = [judgment.estimate for judgment in judgments if judgment.estimate is not None]
+    if not estimates:
+        return None
+    weights = np.array([1 / estimate.sigma[0] ** 2 for estimate in estimates])
+    focal = float(np.sum(weights * [estimate.focal for estimate in estimates]) / weights.sum())
+    return float(np.expm1(-focal)), float(1 / np.sqrt(weights.sum()))
 
 
 def _read_depths(dataset: RgbdDataset, indices: np.ndarray) -> tuple[list[np.ndarray], list[str]]:
     depths, unreadable = [], []
     for index in indices:
         try:
-            depths.append(_thinned(dataset[int(index)].depth))
+            depths.append(thinned(dataset[int(index)].depth))
         except DatasetError as error:
             unreadable.append(str(error))
     return depths, unreadable
 
 
-def _frozen_frames(dataset: RgbdDataset, indices: np.ndarray) -> list[int]:
-    """Frames behind the given ones whose depth image is that of the frame before, but not their color."""
-    frozen = []
-    for index in indices[indices + 1 < len(dataset)]:
-        check = FrozenDepth()
-        try:
-            if any([check.check(FrameSignature.of(dataset[int(i)])) for i in (index, index + 1)]):
-                frozen.append(int(index) + 1)
-        except DatasetError:
-            continue
-    return frozen
-
-
-def _frozen_problems(frozen: list[int]) -> list[str]:
-    if not frozen:
+def _frozen_problems(frozen: list[int], findings: list[Finding]) -> list[str]:
+    if not frozen or any(finding.kind.startswith("frozen") for finding in findings):
         return []
     listed = ", ".join(map(str, frozen[:5])) + (", ..." if len(frozen) > 5 else "")
     return [f"depth is frozen: the same image as in the frame before, but another color image, in frame {listed}"]
-
-
-def _thinning(height: int, width: int) -> int:
-    """Every how many rows and columns are kept."""
-    return math.ceil(math.sqrt(height * width / _MAX_PIXELS_KEPT))
-
-
-def _thinned(depth: np.ndarray) -> np.ndarray:
-    """The rows and columns that are kept; a copy where that is not all, so that the whole image can go."""
-    step = _thinning(*depth.shape)
-    return depth if step == 1 else depth[::step, ::step].copy()
-
-
-def _thinned_camera(camera: Camera) -> Camera:
-    """The camera of thinned images: pixel (i, j) is pixel (n i, n j) of the whole one."""
-    step = _thinning(camera.height, camera.width)
-    if step == 1:
-        return camera
-    width, height = -(-camera.width // step), -(-camera.height // step)
-    return Camera(width, height, camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step)
 
 
 def _frames_per_second(timestamps: np.ndarray) -> float:
@@ -209,7 +206,7 @@ def _inspect_poses(dataset: RgbdDataset, pairs: int) -> tuple[PoseStatistics | N
     steps_deg = np.degrees(rotation_angle(motion[:, :3, :3]))
     jumps = both[(steps_cm > 100 * _JUMP_M) | (steps_deg > _JUMP_DEG)]
     views = _read_pairs(dataset, choose_pairs(poses, pairs))
-    camera = _thinned_camera(dataset.camera)
+    camera = thinned_camera(dataset.camera)
     agreement = measure_agreement(camera, views, poses)
     statistics = PoseStatistics(
         int(known.sum()), *_median_and_max(steps_cm), *_median_and_max(steps_deg), jumps.tolist(), agreement
@@ -221,7 +218,7 @@ def _read_pairs(dataset: RgbdDataset, pairs: list[tuple[int, int]]) -> list[Dept
     views = []
     for a, b in pairs:
         try:
-            views.append(DepthPair(a, b, _thinned(dataset[a].depth), _thinned(dataset[b].depth)))
+            views.append(DepthPair(a, b, thinned(dataset[a].depth), thinned(dataset[b].depth)))
         except DatasetError:
             continue
     return views
@@ -232,15 +229,21 @@ def _median_and_max(values: np.ndarray) -> tuple[float, float]:
 
 
 def _depth_problems(found: Inspection) -> list[str]:
-    problems = [f"unreadable: {message}" for message in found.unreadable]
+    problems = _folded_lines([f"unreadable: {message}" for message in found.unreadable])
     if found.depth is None:
-        return [*problems, "no depth at all in the frames looked at"]
-    low, high = _PLAUSIBLE_MEDIAN_M
-    if not low <= found.depth.median_m <= high:
-        problems.append(f"median depth of {found.depth.median_m:.3g} m: the depth scale looks wrong")
+        known = any(finding.kind in ("depth", "scale") for finding in found.findings)
+        return problems if known else [*problems, "no depth at all in the frames looked at"]
     if found.depth.holes > _MANY_HOLES:
         problems.append(f"{found.depth.holes:.0%} of the pixels have no depth")
     return problems
+
+
+def _folded_lines(lines: list[str]) -> list[str]:
+    """Lines that differ in names and numbers only as one, with their number."""
+    alike: dict[str, list[str]] = {}
+    for line in lines:
+        alike.setdefault(_NAMES_AND_NUMBERS.sub("#", line), []).append(line)
+    return [same[0] + (f" (and {len(same) - 1} more like it)" if same[1:] else "") for same in alike.values()]
 
 
 def _pose_problems(found: Inspection, explanation: str | None) -> list[str]:
@@ -266,12 +269,12 @@ def _pose_problems(found: Inspection, explanation: str | None) -> list[str]:
     return problems
 
 
-def _time_problems(timestamps: np.ndarray) -> list[str]:
+def _time_problems(timestamps: np.ndarray, findings: list[Finding]) -> list[str]:
     steps = np.diff(timestamps)
     if not len(steps):
         return ["only one frame"]
     problems = []
-    if np.any(steps <= 0):
+    if np.any(steps <= 0) and not any(finding.kind == "times" for finding in findings):
         problems.append(f"timestamps don't ascend after frame {int(np.argmax(steps <= 0))}")
     gaps = np.flatnonzero(steps > 10 * max(np.median(steps), 1e-9))
     if len(gaps):

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 _NO_HIT = np.float32(np.inf)
 _CYLINDER_SECTIONS = 96
@@ -134,7 +137,9 @@ class Box(Primitive):
         return points
 
     def local_mesh(self) -> trimesh.Trimesh:
-        return trimesh.creation.box(extents=self.size)
+        from trimesh.creation import box
+
+        return box(extents=self.size)
 
     def local_interval(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         intervals = [_slab(origin[axis], directions[axis], self.half_size[axis]) for axis in range(3)]
@@ -168,7 +173,9 @@ class Sphere(Primitive):
         return self.radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
     def local_mesh(self) -> trimesh.Trimesh:
-        return trimesh.creation.icosphere(subdivisions=_SPHERE_SUBDIVISIONS, radius=self.radius)
+        from trimesh.creation import icosphere
+
+        return icosphere(subdivisions=_SPHERE_SUBDIVISIONS, radius=self.radius)
 
     def local_interval(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return _round_interval(origin, directions, self.radius)
@@ -211,7 +218,9 @@ class Cylinder(Primitive):
         return np.stack((radius * np.cos(angle), radius * np.sin(angle), z), axis=1)
 
     def local_mesh(self) -> trimesh.Trimesh:
-        return trimesh.creation.cylinder(radius=self.radius, height=self.height, sections=_CYLINDER_SECTIONS)
+        from trimesh.creation import cylinder
+
+        return cylinder(radius=self.radius, height=self.height, sections=_CYLINDER_SECTIONS)
 
     def local_interval(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         enter_side, leave_side = _round_interval(origin[:2], directions[:2], self.radius)

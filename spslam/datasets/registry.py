@@ -8,15 +8,24 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from spslam.datasets.arkitscenes import open_arkitscenes
+from spslam.datasets.azure_kinect import open_azure_kinect
 from spslam.datasets.base import RgbdDataset, Subset
 from spslam.datasets.folder import open_folder
 from spslam.datasets.generated import GeneratedDataset
+from spslam.datasets.icl_nuim import open_icl_nuim
+from spslam.datasets.open3d_recording import open_open3d
 from spslam.datasets.places import Capture, PlacesDataset
+from spslam.datasets.record3d import open_record3d
 from spslam.datasets.replica import open_replica
+from spslam.datasets.rosbag import RosOptions, open_realsense, open_rosbag
 from spslam.datasets.scannet import open_scannet
+from spslam.datasets.scannetpp import open_scannetpp
 from spslam.datasets.seven_scenes import SPLITS, list_sequences, open_seven_scenes
+from spslam.datasets.stray_scanner import open_stray_scanner
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
-from spslam.datasets.tum import open_tum
+from spslam.datasets.tum import open_bonn, open_tum
+from spslam.datasets.video_recording import open_video_recording
 from spslam.errors import DatasetError
 from spslam.options import DatasetOptions
 
@@ -28,17 +37,22 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
         config: any object with the attribute `type` (one of `dataset_types()`) and, each optional or None: `path`,
             `stride` (every n-th frame), `min_depth_m`, `max_depth_m` (depth outside comes as 0), `border_px` (so does
             depth this close to the image's border), and the options of the kind: `sequence` (7scenes), `depth_variant`
-            (synthetic_rgbd), `depth_scale` (folder), `frames`, `width`, `height`, `noise`, `seed` (generated), and
+            (synthetic_rgbd), `depth_scale`, `min_confidence`, `pair_tolerance_s` and `register_to` (recordings of one's
+            own), the fields of `RosOptions` (rosbag), `frames`, `width`, `height`, `noise`, `seed` (generated), and
             the arguments of `PlacesDataset` and its `Capture` (places).
-        data_dir: the data's folder; overrides `config.path`. Not needed by `generated` and `places`.
+        data_dir: the data's folder or file; overrides `config.path`. Not needed by `generated` and `places`.
 
     Raises:
         DatasetError: an unknown type, no folder given, or whatever is wrong with the data.
     """
-    opener = _OPENERS.get(config.type)
-    if opener is None:
+    if config.type in _RENDERED:
+        dataset = _RENDERED[config.type](config)
+    elif config.type in _OPENERS:
+        dataset = _OPENERS[config.type](
+            config, _path(config, _option(config, "path") if data_dir is None else data_dir)
+        )
+    else:
         raise DatasetError(f"dataset.type must be one of {', '.join(dataset_types())}, got {config.type}")
-    dataset = opener(config, _option(config, "path") if data_dir is None else data_dir)
     dataset.depth_range = (_option(config, "min_depth_m", 0.0), _option(config, "max_depth_m", float("inf")))
     dataset.border_px = _option(config, "border_px", 0)
     stride = _option(config, "stride", 1)
@@ -93,53 +107,70 @@ def sequence_options(options: DatasetOptions) -> list[DatasetOptions]:
 
 def dataset_types() -> list[str]:
     """Names that `dataset.type` may have."""
-    return list(_OPENERS)
+    return [*_OPENERS, *_RENDERED]
 
 
-def _open_seven_scenes(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    return open_seven_scenes(_folder(config, path), _option(config, "sequence"))
+def _open_seven_scenes(config: Any, path: Path) -> RgbdDataset:
+    return open_seven_scenes(path, _option(config, "sequence"))
 
 
-def _open_synthetic_rgbd(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    return open_synthetic_rgbd(_folder(config, path), _option(config, "depth_variant"))
+def _open_synthetic_rgbd(config: Any, path: Path) -> RgbdDataset:
+    return open_synthetic_rgbd(path, _option(config, "depth_variant"))
 
 
-def _open_tum(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    return open_tum(_folder(config, path))
+def _open_rosbag(config: Any, path: Path) -> RgbdDataset:
+    return open_rosbag(path, _ros_options(config))
 
 
-def _open_replica(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    return open_replica(_folder(config, path))
+def _open_realsense(config: Any, path: Path) -> RgbdDataset:
+    return open_realsense(path, _ros_options(config))
 
 
-def _open_scannet(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    return open_scannet(_folder(config, path))
+def _ros_options(config: Any) -> RosOptions:
+    given = _given(config, [field.name for field in fields(RosOptions)])
+    return RosOptions(**given, **_given_as(config, view="register_to"))
 
 
-def _open_folder(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
-    return open_folder(_folder(config, path), _option(config, "depth_scale"))
+def _open_with(opener: Callable[..., RgbdDataset], *names: str, **renamed: str) -> _Opener:
+    """An opener that takes options by their names, or by those of its own."""
+
+    def open_path(config: Any, path: Path) -> RgbdDataset:
+        return opener(path, **_given(config, names), **_given_as(config, **renamed))
+
+    return open_path
 
 
-def _open_generated(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+def _open_generated(config: Any) -> RgbdDataset:
     return GeneratedDataset(**_given(config, ("frames", "width", "height", "noise", "seed")))
 
 
-def _open_places(config: Any, path: str | os.PathLike | None) -> RgbdDataset:
+def _open_places(config: Any) -> RgbdDataset:
     capture = Capture(**_given(config, [field.name for field in fields(Capture)]))
     names = ("place", "motion", "sensor", "frames", "seed", "texture")
     return PlacesDataset(**_given(config, names), capture=capture)
 
 
-_OPENERS: dict[str, Callable[[Any, str | os.PathLike | None], RgbdDataset]] = {
+_Opener = Callable[[Any, Path], RgbdDataset]
+_OPENERS: dict[str, _Opener] = {
     "7scenes": _open_seven_scenes,
     "synthetic_rgbd": _open_synthetic_rgbd,
-    "tum": _open_tum,
-    "replica": _open_replica,
-    "scannet": _open_scannet,
-    "folder": _open_folder,
-    "generated": _open_generated,
-    "places": _open_places,
+    "tum": _open_with(open_tum),
+    "replica": _open_with(open_replica),
+    "scannet": _open_with(open_scannet),
+    "folder": _open_with(open_folder, "depth_scale", "min_confidence", view="register_to"),
+    "rosbag": _open_rosbag,
+    "realsense": _open_realsense,
+    "azure_kinect": _open_with(open_azure_kinect, tolerance_s="pair_tolerance_s", view="register_to"),
+    "stray_scanner": _open_with(open_stray_scanner, "min_confidence", view="register_to"),
+    "record3d": _open_with(open_record3d, "min_confidence", view="register_to"),
+    "scannetpp": _open_with(open_scannetpp, view="register_to"),
+    "arkitscenes": _open_with(open_arkitscenes, "min_confidence", tolerance_s="pair_tolerance_s", view="register_to"),
+    "open3d": _open_with(open_open3d, "depth_scale", view="register_to"),
+    "video": _open_with(open_video_recording, "depth_scale", tolerance_s="pair_tolerance_s", view="register_to"),
+    "bonn": _open_with(open_bonn),
+    "icl_nuim": _open_with(open_icl_nuim),
 }
+_RENDERED: dict[str, Callable[[Any], RgbdDataset]] = {"generated": _open_generated, "places": _open_places}
 
 
 def _given(config: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -147,7 +178,13 @@ def _given(config: Any, names: Sequence[str]) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _folder(config: Any, path: str | os.PathLike | None) -> Path:
+def _given_as(config: Any, **renamed: str) -> dict[str, Any]:
+    """The options that are given, under the names of an opener's arguments."""
+    given = _given(config, list(renamed.values()))
+    return {name: given[option] for name, option in renamed.items() if option in given}
+
+
+def _path(config: Any, path: str | os.PathLike | None) -> Path:
     if path is None or str(path) == "":
         raise DatasetError(f"dataset.path must name the folder of the {config.type} data (--data), got none")
     return Path(path)

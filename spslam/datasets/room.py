@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 
 from spslam.camera import Camera
 from spslam.datasets.furniture import ROOM_SIZE, Material, Piece, furnish, make_material
@@ -72,8 +71,10 @@ class Room(SolidScene):
         return vertices, faces
 
     def _visible_triangles(self, solid: Primitive, longest_edge_m: float) -> tuple[np.ndarray, np.ndarray]:
+        from trimesh.remesh import subdivide_to_size
+
         surface = solid.local_mesh()
-        points, triangles = trimesh.remesh.subdivide_to_size(surface.vertices, surface.faces, longest_edge_m)
+        points, triangles = subdivide_to_size(surface.vertices, surface.faces, longest_edge_m)
         points = solid.to_world(points)
         visible = triangles[~self._is_hidden(points[triangles].mean(axis=1), _SAGITTA_M)]
         used, renumbered = np.unique(visible, return_inverse=True)

@@ -56,7 +56,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
         lambda number: sequence_folder / f"frame-{number:06d}.pose.txt",
     )
     name = f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}"
-    return FileDataset(name, camera, frames, poses, units_per_meter=1000.0, invalid_depth=(65535,))
+    return FileDataset(name, camera, frames, poses, units_per_meter=1000.0, invalid_depth=(65535,), is_registered=False)
 
 
 def list_sequences(scene: Path, split: str | None = None) -> list[str]:

@@ -17,6 +17,8 @@ from spslam.reading import MAX_JSON_BYTES, parse_json, read_lines, read_text
 # 7-Scenes' rotations are off by up to about 1e-3; a matrix this far from a rotation is no pose at all.
 ROTATION_TOLERANCE = 0.1
 _LAST_ROW_TOLERANCE = 1e-6
+# No camera's focal length lies outside; with any, ratios of two cameras would overflow.
+_FOCAL_RANGE_PX = (0.1, 1e6)
 
 
 def read_numbers(path: Path) -> np.ndarray:
@@ -56,6 +58,37 @@ def read_rows(path: Path, columns: int) -> Iterator[list[str]]:
         if len(words) < columns:
             raise DatasetError(f"{path}, line {number}: must have {columns} columns, got {brief(line)!r}")
         yield words
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a file whose first line names them.
+
+    Args:
+        path: words separated by commas or spaces; the names in any case.
+
+    Returns:
+        float64 [N] per name.
+
+    Raises:
+        DatasetError: no such file, no row, a row of another length, or something else than numbers in it.
+    """
+    rows = read_rows(path, columns=1)
+    names = [name.lower() for name in next(rows, [])]
+    numbers = array("d")
+    for row in rows:
+        try:
+            values = [float(word) for word in row]
+        except ValueError as error:
+            raise DatasetError(f"{path}: must contain numbers below its first line: {brief(str(error))}") from None
+        if len(values) != len(names):
+            raise DatasetError(
+                f"{path}: rows must have {len(names)} columns as the first, got {brief(' '.join(row))!r}"
+            )
+        numbers.extend(values)
+    if not names or not numbers:
+        raise DatasetError(f"{path}: must have a line of names and rows of numbers, got none")
+    table = np.array(numbers, dtype=np.float64).reshape(-1, len(names))
+    return {name: table[:, column] for column, name in enumerate(names)}
 
 
 def read_pose(path: Path) -> np.ndarray:
@@ -168,7 +201,7 @@ def read_intrinsics_matrix(path: Path, width: int, height: int) -> Camera:
 
 
 def camera_from_matrix(matrix: np.ndarray, width: int, height: int, name: str) -> Camera:
-    """A camera whose principal point lies in the image.
+    """A camera that images may be of: its focal lengths are plausible, and its principal point lies in the image.
 
     Args:
         matrix: intrinsics [3, 3] or [4, 4].
@@ -177,12 +210,18 @@ def camera_from_matrix(matrix: np.ndarray, width: int, height: int, name: str) -
         name: what the error begins with.
 
     Raises:
-        DatasetError: no intrinsics of a pinhole camera, or the principal point lies outside the image.
+        DatasetError: no intrinsics of a pinhole camera, a focal length outside 0.1 to 1,000,000 px, or a principal
+            point outside the image.
     """
     try:
         camera = Camera.from_matrix(matrix, width, height)
     except ValueError as error:
         raise DatasetError(f"{name}: {error}") from error
+    least, most = _FOCAL_RANGE_PX
+    if not (least <= camera.fx <= most and least <= camera.fy <= most):
+        raise DatasetError(
+            f"{name}: focal lengths must be from {least:g} to {most:g} px, got {camera.fx:g} and {camera.fy:g}"
+        )
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise DatasetError(
             f"{name}: principal point must lie in the image of {width}x{height}, got ({camera.cx:g}, {camera.cy:g})"

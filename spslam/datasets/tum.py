@@ -21,11 +21,13 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import MAX_FRAMES
-from spslam.datasets.files import FileDataset, FramePaths, Undistortion, require_folder
+from spslam.datasets.files import FileDataset, FramePaths, require_folder
 from spslam.datasets.images import first_size
+from spslam.datasets.lens import Lens, Rectification
+from spslam.datasets.pairing import associate, interpolate_trajectory, sorted_trajectory
 from spslam.datasets.text import camera_from_matrix, read_numbers, read_rows
 from spslam.errors import DatasetError, brief
-from spslam.geometry import interpolate_pose
+from spslam.geometry import orthonormalize, pose_from
 from spslam.trajectory import Trajectory
 
 UNITS_PER_METER = 5000.0
@@ -33,8 +35,6 @@ UNITS_PER_METER = 5000.0
 MAX_PAIR_DIFFERENCE_S = 0.02
 # Motion capture runs at 100 Hz or more; across a longer gap between two of its poses nothing is made up.
 MAX_GROUND_TRUTH_GAP_S = 0.1
-# A depth camera at 200 Hz has 8 images within that time.
-_MAX_CANDIDATES = 16
 CALIBRATION_FILE = "calibration.txt"
 
 
@@ -51,12 +51,49 @@ _CALIBRATIONS = {
     "freiburg1": _Calibration((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": _Calibration((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": _Calibration((535.4, 539.2, 320.1, 247.6), (0.0, 0.0, 0.0, 0.0, 0.0)),
+    # https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset
+    "bonn": _Calibration(
+        (542.822841, 542.57687, 315.59352, 237.756098), (0.039903, -0.099343, -0.00073, -0.000144, 0.0)
+    ),
     # What the authors advise where the camera isn't known: ROS's default, no distortion.
     "default": _Calibration((525.0, 525.0, 319.5, 239.5), (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
 
 
-def open_tum(folder: Path) -> FileDataset:
+# The rotation between Bonn's axes and the camera's, and from the markers on the camera to the camera: T_ros and T_m of
+# the authors' script for comparing with their model of the room (https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset).
+_BONN_AXES = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_BONN_MARKERS = np.array(
+    [
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+        [0, 0, 0, 1],
+    ]
+)
+
+
+def open_bonn(folder: Path) -> FileDataset:
+    """Opens a sequence of the Bonn RGB-D Dynamic Dataset (Palazzolo et al. 2019), whose layout is TUM's.
+
+    The ground truth is that of markers on the camera in other axes; it is brought to the camera as the authors do.
+    Their matrix for that is not quite a rotation, so the nearest rotation is taken.
+
+    Args:
+        folder: see `open_tum`.
+
+    Raises:
+        DatasetError: see `open_tum`.
+    """
+    dataset = open_tum(folder, "bonn")
+    if dataset.gt_poses is not None:
+        markers = pose_from(orthonormalize(_BONN_MARKERS[:3, :3]), _BONN_MARKERS[:3, 3])
+        dataset.gt_poses = _BONN_AXES @ dataset.gt_poses @ _BONN_AXES @ markers
+    dataset.name = f"bonn/{folder.name}"
+    return dataset
+
+
+def open_tum(folder: Path, calibration: str | None = None) -> FileDataset:
     """Opens a sequence of the TUM RGB-D layout.
 
     The camera is that of `calibration.txt` in the folder (fx fy cx cy, then up to five distortion coefficients), else
@@ -67,6 +104,7 @@ def open_tum(folder: Path) -> FileDataset:
 
     Args:
         folder: the sequence.
+        calibration: whose camera it is if there is no `calibration.txt`; by the folder's name if None.
 
     Raises:
         DatasetError: a missing folder or list, a malformed line, no pair at all, unreadable calibration.
@@ -83,77 +121,15 @@ def open_tum(folder: Path) -> FileDataset:
             f"({len(colors)} in rgb.txt, {len(depths)} in depth.txt)"
         )
     frames = [FramePaths(folder / colors[c][1], folder / depths[d][1], colors[c][0]) for c, d in pairs]
-    camera, distortion = _find_calibration(folder, *first_size(frame.color for frame in frames))
+    camera, distortion = _find_calibration(folder, calibration, *first_size(frame.color for frame in frames))
     return FileDataset(
         f"tum/{folder.name}",
         camera,
         frames,
         _interpolated_ground_truth(folder / "groundtruth.txt", np.array([frame.timestamp for frame in frames])),
         UNITS_PER_METER,
-        undistortion=Undistortion.of(camera, distortion) if any(distortion) else None,
+        undistortion=Rectification.of(Lens(camera, "brown", distortion)) if any(distortion) else None,
     )
-
-
-def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> np.ndarray:
-    """Pairs the nearest times of two lists; each time is in one pair at most.
-
-    The closest pairs are taken first, as by the dataset's `associate.py`.
-
-    Args:
-        times_a: [A], ascending.
-        times_b: [B], ascending.
-        max_difference: pairs are less than this apart.
-
-    Returns:
-        Pairs (i, j), int64 [P, 2], ascending.
-
-    Raises:
-        ValueError: times are so close to each other that there are over 16 candidates for a pair on average.
-    """
-    first = np.searchsorted(times_b, times_a - max_difference)
-    last = np.searchsorted(times_b, times_a + max_difference)
-    count = int((last - first).sum())
-    if count > _MAX_CANDIDATES * len(times_a):
-        raise ValueError(f"must have at most {_MAX_CANDIDATES} images within {max_difference} s of each, got {count}")
-    i = np.repeat(np.arange(len(times_a)), last - first)
-    j = np.arange(count) - np.repeat(np.cumsum(last - first) - last, last - first)
-    difference = np.abs(times_a[i] - times_b[j])
-    near = np.lexsort((j, i, difference))
-    near = near[difference[near] < max_difference]
-    used_a: set[int] = set()
-    used_b: set[int] = set()
-    pairs = []
-    for pair in zip(i[near].tolist(), j[near].tolist(), strict=True):
-        if pair[0] not in used_a and pair[1] not in used_b:
-            used_a.add(pair[0])
-            used_b.add(pair[1])
-            pairs.append(pair)
-    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
-
-
-def interpolate_trajectory(trajectory: Trajectory, times: np.ndarray, max_gap: float) -> np.ndarray:
-    """Interpolates a trajectory.
-
-    Args:
-        trajectory: its timestamps must be strictly ascending.
-        times: [F], s.
-        max_gap: between two poses further apart than this (s) nothing is interpolated.
-
-    Returns:
-        float64 [F, 4, 4], NaN outside the trajectory and in its gaps.
-    """
-    poses = np.full((len(times), 4, 4), np.nan)
-    if len(trajectory) == 0:
-        return poses
-    after = np.clip(np.searchsorted(trajectory.timestamps, times), 1, max(len(trajectory) - 1, 1))
-    after = np.minimum(after, len(trajectory) - 1)
-    before = np.maximum(after - 1, 0)
-    start, end = trajectory.timestamps[before], trajectory.timestamps[after]
-    fraction = np.where(end > start, (times - start) / np.where(end > start, end - start, 1), 0)
-    exact = (times == start) | (times == end)
-    known = (times >= start) & (times <= end) & ((end - start <= max_gap) | exact)
-    poses[known] = interpolate_pose(trajectory.poses[before[known]], trajectory.poses[after[known]], fraction[known])
-    return poses
 
 
 def _read_list(path: Path) -> list[tuple[float, str]]:
@@ -177,7 +153,7 @@ def _times(entries: list[tuple[float, str]]) -> np.ndarray:
     return np.array([timestamp for timestamp, _ in entries])
 
 
-def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tuple[float, ...]]:
+def _find_calibration(folder: Path, name: str | None, width: int, height: int) -> tuple[Camera, tuple[float, ...]]:
     path = folder / CALIBRATION_FILE
     if path.is_file():
         numbers = read_numbers(path)
@@ -193,7 +169,7 @@ def _find_calibration(folder: Path, width: int, height: int) -> tuple[Camera, tu
             np.r_[numbers[4:], np.zeros(9 - numbers.size)]
         )
     named = re.search(r"(?:freiburg|fr)([123])(?!\d)", folder.resolve().name)
-    calibration = _CALIBRATIONS[f"freiburg{named.group(1)}" if named else "default"]
+    calibration = _CALIBRATIONS[name or (f"freiburg{named.group(1)}" if named else "default")]
     return Camera(640, 480, *calibration.intrinsics).resized(width, height), calibration.distortion
 
 
@@ -201,5 +177,5 @@ def _interpolated_ground_truth(path: Path, times: np.ndarray) -> np.ndarray | No
     if not path.is_file():
         return None
     ground_truth = Trajectory.load_tum(path, skip_unknown=True)
-    timestamps, first = np.unique(ground_truth.timestamps, return_index=True)
-    return interpolate_trajectory(Trajectory(timestamps, ground_truth.poses[first]), times, MAX_GROUND_TRUTH_GAP_S)
+    ordered = sorted_trajectory(ground_truth.timestamps, ground_truth.poses)
+    return interpolate_trajectory(ordered, times, MAX_GROUND_TRUTH_GAP_S)

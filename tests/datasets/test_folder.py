@@ -132,6 +132,13 @@ def test_plausibility_skips_empty_and_broken_images(tmp_path):
         open_folder(folder, depth_scale=1.0)
 
 
+def test_a_hand_before_the_lens_at_first_is_no_wrong_scale(tmp_path):
+    folder = write_folder(tmp_path, count=12)
+    for number in range(4):
+        write_depth(folder / "depth" / f"{number}.png", np.full((HEIGHT, WIDTH), 0.06))
+    assert len(open_folder(folder)) == 12
+
+
 def test_floating_point_depth_is_in_meters(tmp_path):
     folder = write_folder(tmp_path, count=1)
     (folder / "depth" / "0.png").unlink()

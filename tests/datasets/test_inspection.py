@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spslam.camera import Camera
-from spslam.datasets import inspection
+from spslam.datasets import thinning
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.inspection import inspect_dataset
 from spslam.datasets.replica import open_replica
@@ -85,7 +85,7 @@ def test_frozen_depth_is_reported():
 
 def test_large_images_are_thinned_without_another_finding(monkeypatch):
     whole = inspect_dataset(BoxRoom())
-    monkeypatch.setattr(inspection, "_MAX_PIXELS_KEPT", CAMERA.width * CAMERA.height // 4)
+    monkeypatch.setattr(thinning, "_MAX_PIXELS_KEPT", CAMERA.width * CAMERA.height // 4)
     thinned = inspect_dataset(BoxRoom())
     assert thinned.problems == whole.problems == []
     assert thinned.depth.median_m == pytest.approx(whole.depth.median_m, rel=0.05)

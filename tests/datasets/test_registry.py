@@ -7,6 +7,7 @@ from spslam.config import load_config
 from spslam.datasets import dataset_types, open_dataset, open_sequence, sequence_options
 from spslam.datasets.base import Subset
 from spslam.errors import DatasetError
+from spslam.options import DATASET_TYPES
 from tests.datasets.layouts import (
     depth_meters,
     write_folder,
@@ -85,8 +86,10 @@ def test_one_section_of_options_a_sequence(tmp_path):
 
 
 def test_errors():
-    files = ["7scenes", "synthetic_rgbd", "tum", "replica", "scannet", "folder"]
+    files = ["7scenes", "synthetic_rgbd", "tum", "replica", "scannet", "folder", "rosbag", "realsense", "azure_kinect"]
+    files += ["stray_scanner", "record3d", "scannetpp", "arkitscenes", "open3d", "video", "bonn", "icl_nuim"]
     assert dataset_types() == [*files, "generated", "places"]
+    assert set(dataset_types()) == set(DATASET_TYPES)
     with pytest.raises(DatasetError, match="dataset.type must be one of 7scenes, .*, generated, places, got kitti"):
         open_dataset(SimpleNamespace(type="kitti"))
     with pytest.raises(DatasetError, match="dataset.path must name the folder of the tum data"):

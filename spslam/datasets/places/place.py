@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-import trimesh
 
 from spslam.camera import Camera
 from spslam.datasets.places.builder import Builder
@@ -67,10 +66,12 @@ class Place(SolidScene):
         Args:
             longest_edge_m: triangles are divided until no edge is longer.
         """
+        from trimesh.remesh import subdivide_to_size
+
         vertices, faces, first = [], [], 0
         for number, solid in enumerate([self._shell, *self._solids]):
             surface = solid.local_mesh()
-            points, triangles = trimesh.remesh.subdivide_to_size(surface.vertices, surface.faces, longest_edge_m)
+            points, triangles = subdivide_to_size(surface.vertices, surface.faces, longest_edge_m)
             points = solid.to_world(points)
             triangles = triangles[~self._are_covered(points, triangles, number - 1)]
             vertices.append(points)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 _STEP_M = 0.02
 _KNOT_M = 0.08
@@ -64,6 +63,8 @@ class Route:
         self._winding = _winding(yaw)
         flat_yaw = yaw - self._winding * effort[:-1] / self.effort_m
         values = np.concatenate((curve, flat_yaw[:, None], pitch[:, None]), axis=1)
+        from scipy.interpolate import CubicSpline
+
         self._spline = CubicSpline(effort[knots], values[knots % len(curve)], bc_type="periodic")
 
     def at(self, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

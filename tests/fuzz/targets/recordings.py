@@ -1,4 +1,4 @@
-"""Recordings: `.sens` files, and the lists, poses, intrinsics and images of every layout of folders."""
+"""Recordings: `.sens` files, bags, archives, and the lists, poses, intrinsics and images of every layout of folders."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from random import Random
 from types import SimpleNamespace
 from typing import Any
 
+from spslam.camera import Camera
 from spslam.datasets.inspection import inspect_dataset
+from spslam.datasets.lens import Lens
 from spslam.datasets.registry import open_dataset, open_sequence
 from spslam.datasets.scannet import open_scannet
 from spslam.errors import DatasetError
-from tests.datasets import layouts
+from tests.datasets import layouts, recordings, ros_bags
 from tests.fuzz.formats import Format
 from tests.fuzz.mutations import any_integer, mutate_bytes, mutate_text, to_bytes
 from tests.fuzz.structures import mutate_json
 
 FRAMES = 4
-TEXTS = (".txt", ".json")
+TEXTS = (".txt", ".json", ".csv", ".log", ".traj", ".pincam", ".freiburg", "metadata")
 
 
 class Sens(Format):
@@ -121,6 +123,59 @@ class Layout(Format):
         inspect_dataset(open_dataset(self._options), frames=3, pairs=2)
 
 
+class OneFile(Format):
+    """A recording that is one file: its bytes, of one or more good examples."""
+
+    def __init__(self, name: str, kind: str, suffix: str, *writers) -> None:
+        self.name, self._suffix = name, suffix
+        self._options = SimpleNamespace(type=kind)
+        self._writers = writers
+        self._examples: list[bytes] = []
+
+    def prepare(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            for number, write in enumerate(self._writers):
+                self._examples.append(write(Path(folder) / str(number)).read_bytes())
+
+    def write(self, random: Random, folder: Path) -> None:
+        content = mutate_bytes(random, random.choice(self._examples), self._examples)
+        (folder / f"recording{self._suffix}").write_bytes(content)
+
+    def read(self, folder: Path) -> None:
+        self._options.path = str(folder / f"recording{self._suffix}")
+        _read_all(open_sequence(self._options))
+
+
+def _ros1(compression: str | None):
+    def write(folder: Path) -> Path:
+        make = ros_bags.Messages(False)
+        return ros_bags.write_ros1(folder / "a.bag", ros_bags.camera_messages(make, _frames()), make, compression)
+
+    return write
+
+
+def _realsense(folder: Path) -> Path:
+    make = ros_bags.Messages(False)
+    return ros_bags.write_ros1(folder / "a.bag", ros_bags.realsense_messages(make, _frames()), make)
+
+
+def _mcap(folder: Path) -> Path:
+    make = ros_bags.Messages(True)
+    return ros_bags.write_mcap(folder / "a.mcap", ros_bags.camera_messages(make, _frames(), "compressed"), make)
+
+
+def _db3(folder: Path) -> Path:
+    make = ros_bags.Messages(True)
+    folder.mkdir()
+    return next(ros_bags.write_ros2(folder / "a", ros_bags.camera_messages(make, _frames()), make).glob("*.db3"))
+
+
+def _frames() -> ros_bags.Frames:
+    lens = Lens(Camera(layouts.WIDTH, layouts.HEIGHT, 30, 31, 15.5, 11.5))
+    color, depth = ([draw(i) for i in range(FRAMES)] for draw in (layouts.color_image, layouts.depth_meters))
+    return ros_bags.Frames(color, depth, lens, lens, poses=layouts.poses(FRAMES))
+
+
 def _json(content: bytes) -> Any:
     """The value of a JSON text; another one where it was spoiled before."""
     try:
@@ -133,7 +188,8 @@ def _renamed(random: Random, name: str) -> str:
     head, _, last = name.rpartition("/")
     stem, _, suffix = last.partition(".")
     new = random.choice(("", "\u00b2", "\u0662", "9" * 25, "0" * 10 + stem, stem + " ", "." + stem, "-1", "1e5"))
-    return f"{head}/{new}.{random.choice((suffix, suffix.upper(), 'png', 'npy'))}".lstrip("/")
+    last = f"{new}.{random.choice((suffix, suffix.upper(), 'png', 'npy'))}"
+    return f"{head}/{last if last.strip('.') else 'none'}".lstrip("/")
 
 
 def _read_all(dataset) -> None:
@@ -156,4 +212,16 @@ FORMATS = (
     Layout("synthetic_rgbd", layouts.write_synthetic_rgbd),
     Layout("scannet", layouts.write_scannet),
     Layout("folder", layouts.write_folder),
+    Layout("stray_scanner", recordings.write_stray_scanner, min_confidence=1),
+    Layout("record3d", recordings.write_record3d_folder, min_confidence=1),
+    Layout("scannetpp", recordings.write_scannetpp),
+    Layout("arkitscenes", recordings.write_arkitscenes, min_confidence=1),
+    Layout("open3d", recordings.write_open3d),
+    Layout("icl_nuim", recordings.write_icl_nuim),
+    Layout("video", recordings.write_video_recording),
+    OneFile("r3d", "record3d", ".r3d", recordings.write_record3d),
+    OneFile("ros1", "rosbag", ".bag", _ros1(None), _ros1("LZ4")),
+    OneFile("realsense", "realsense", ".bag", _realsense),
+    OneFile("mcap", "rosbag", ".mcap", _mcap),
+    OneFile("db3", "rosbag", ".db3", _db3),
 )

@@ -1,0 +1,234 @@
+"""Bringing the color image to the depth camera's view, or the depth image to the color camera's.
+
+Both cameras are pinhole cameras here (`spslam.datasets.lens`). They differ in size, intrinsics and place, so what one
+of them sees can be hidden from the other. Whether it is, a depth buffer of the color camera tells: of all points that
+fall into a cell of it the nearest counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.datasets.images import resized_color
+from spslam.datasets.lens import sample_depth
+from spslam.geometry import inverse
+
+# A point is hidden if the color camera has a surface in front of it that is nearer by this share: more than depth
+# changes from pixel to pixel on any one surface, and less than what separates two.
+_HIDDEN_SHARE = 0.05
+# Farther depth is none that a sensor measures, and would overflow.
+_FARTHEST_M = 1e6
+_NEIGHBORS = np.ones((3, 3), dtype=np.uint8)
+_SAME_VIEW_PX = 0.5
+
+
+def is_same_view(color: Camera, depth: Camera, color_from_depth: np.ndarray) -> bool:
+    """Whether two cameras differ in the number of pixels only, by up to half a pixel of the depth image.
+
+    Args:
+        color: the color camera.
+        depth: the depth camera.
+        color_from_depth: [4, 4], points of the depth camera to points of the color camera.
+    """
+    if not np.allclose(color_from_depth, np.eye(4), atol=1e-9):
+        return False
+    resized = color.resized(depth.width, depth.height)
+    corners = np.array([[0, 0], [depth.width - 1, depth.height - 1]])
+    rays = (corners - (depth.cx, depth.cy)) / (depth.fx, depth.fy)
+    seen = rays * (resized.fx, resized.fy) + (resized.cx, resized.cy)
+    return bool(np.abs(seen - corners).max() <= _SAME_VIEW_PX)
+
+
+class _Projection:
+    """Where points at given depths on one camera's rays lie in another camera's image.
+
+    With the rays' directions d, and R and t that lead to the other camera, a point is z R d + t, so its pixel is a
+    quotient of two linear functions of z, whose coefficients are known beforehand.
+
+    Args:
+        source: the camera whose rays they are.
+        target: the camera of the image.
+        target_from_source: [4, 4].
+    """
+
+    def __init__(self, source: Camera, target: Camera, target_from_source: np.ndarray) -> None:
+        rotation, offset = target_from_source[:3, :3], target_from_source[:3, 3]
+        matrix = target.matrix()
+        slopes = source.ray_directions().reshape(-1, 3).astype(np.float64) @ (matrix @ rotation).T
+        self._slopes = np.ascontiguousarray(slopes.T.astype(np.float32))
+        self._offsets = (matrix @ offset).astype(np.float32)
+
+    def depth(self, z: np.ndarray) -> np.ndarray:
+        """Depth in the target camera, float32 [N], of depth z [N] in the source camera."""
+        return z * self._slopes[2] + self._offsets[2]
+
+    def pixels(self, z: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """u and v, float32 [N], of depth z [N], whose depth in the target camera is known; -9 behind that camera."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.float32(1) / depth
+            u, v = ((z * self._slopes[axis] + self._offsets[axis]) * share for axis in (0, 1))
+        behind = depth <= 0
+        u[behind] = v[behind] = -9
+        return u, v
+
+
+class _DepthBuffer:
+    """Nearest depth of the color camera's view, in cells about as large as the depth camera's pixels."""
+
+    def __init__(self, color: Camera, depth: Camera) -> None:
+        share = min(1.0, depth.fx / color.fx)
+        self.width = max(round(share * color.width), 1)
+        self.height = max(round(share * color.height), 1)
+        self._scale = np.float32(self.width / color.width), np.float32(self.height / color.height)
+
+    def fill(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nearest depth of each cell, float32 [h, w], infinite where none; and the cell of each point, -1 outside.
+
+        Args:
+            u: [N], columns of the color image, px.
+            v: [N], rows.
+            z: [N], m, from the color camera; 0 for points that don't count.
+        """
+        half = np.float32(0.5)
+        column = ((u + half) * self._scale[0]).astype(np.int32)
+        row = ((v + half) * self._scale[1]).astype(np.int32)
+        inside = (u > -half) & (v > -half) & (column < self.width) & (row < self.height)
+        cell = np.where(inside, row * self.width + column, -1)
+        counts = np.flatnonzero(inside & (z > 0))
+        nearest = np.full(self.height * self.width, np.inf, dtype=np.float32)
+        np.minimum.at(nearest, cell[counts], z[counts])
+        return nearest.reshape(self.height, self.width), cell
+
+
+class ColorToDepth:
+    """Gives each pixel of the depth image its color; depth stays as it was measured.
+
+    Depth that the color camera does not see, because something nearer hides it or because it lies outside its image,
+    comes as 0: it has no color. Pixels without depth get the color of what lies there at the image's median depth.
+
+    Args:
+        color: the color camera.
+        depth: the depth camera.
+        color_from_depth: float64 [4, 4], points of the depth camera to points of the color camera, m.
+        unseen: bool [Hc, Wc], pixels of the color image without content, such as lens distortion leaves; None for none.
+    """
+
+    def __init__(
+        self, color: Camera, depth: Camera, color_from_depth: np.ndarray, unseen: np.ndarray | None = None
+    ) -> None:
+        self.camera = depth
+        # Of a finer color image several pixels are averaged to one of the depth image.
+        ratio = max(int(min(color.fx / depth.fx, color.fy / depth.fy) + 0.5), 1)
+        self._size = max(color.width // ratio, 1), max(color.height // ratio, 1)
+        self._projection = _Projection(depth, color.resized(*self._size), color_from_depth)
+        self._unseen: np.ndarray | None = None
+        if unseen is not None:
+            self._unseen = cv2.resize(unseen.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
+        is_elsewhere = bool(color_from_depth[:3, 3].any())
+        self._buffer = _DepthBuffer(color.resized(*self._size), depth) if is_elsewhere else None
+
+    def __call__(self, color: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Both images in the depth camera's view.
+
+        Args:
+            color: uint8 [Hc, Wc, 3].
+            depth: float32 [H, W], m, 0 where nothing was measured.
+
+        Returns:
+            uint8 [H, W, 3], and float32 [H, W].
+        """
+        width, height = self._size
+        measured = depth.reshape(-1) > 0
+        typical = np.float32(np.median(depth[depth > 0])) if measured.any() else np.float32(1)
+        z = np.where(measured, depth.reshape(-1), typical)
+        seen = self._projection.depth(z)
+        u, v = self._projection.pixels(z, seen)
+        shows = measured & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        if self._buffer is not None:
+            nearest, cell = self._buffer.fill(u, v, np.where(measured, seen, np.float32(0)))
+            # A surface of the cells beside counts too: its own may be a gap between its points.
+            front = cv2.erode(nearest, _NEIGHBORS).reshape(-1)
+            shows &= seen * np.float32(1 - _HIDDEN_SHARE) <= front[cell]
+        shape = depth.shape
+        u, v, shows = u.reshape(shape), v.reshape(shape), shows.reshape(shape)
+        if self._unseen is not None:
+            shows &= cv2.remap(self._unseen, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) == 0
+        image = resized_color(color, width, height)
+        image = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return image, np.where(shows, depth, np.float32(0))
+
+
+class DepthToColor:
+    """Gives each pixel of the color image its depth; color stays as it was taken.
+
+    Of several surfaces on the ray of a color pixel the nearest counts. Where the color image is the finer one, depth is
+    interpolated on surfaces (`sample_depth`), so that there are no holes.
+
+    Args:
+        color: the color camera.
+        depth: the depth camera.
+        color_from_depth: float64 [4, 4], points of the depth camera to points of the color camera, m.
+    """
+
+    def __init__(self, color: Camera, depth: Camera, color_from_depth: np.ndarray) -> None:
+        self.camera = color
+        self._forward = _Projection(depth, color, color_from_depth)
+        self._back = _Projection(color, depth, inverse(color_from_depth))
+        self._buffer = _DepthBuffer(color, depth)
+        self._offset_z = np.float32(color_from_depth[2, 3])
+
+    def __call__(self, color: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Both images in the color camera's view.
+
+        Args:
+            color: uint8 [H, W, 3].
+            depth: float32 [Hd, Wd], m, 0 where nothing was measured.
+
+        Returns:
+            uint8 [H, W, 3], and float32 [H, W].
+        """
+        z = self._first_guess(depth)
+        for sample in (_nearest_depth, sample_depth):
+            found, seen = self._measured_there(z, depth, sample)
+            agrees = (found > 0) & (np.abs(seen - z) <= np.float32(_HIDDEN_SHARE) * z)
+            z = np.where(found > 0, seen, z)
+        shape = self.camera.height, self.camera.width
+        return color, np.where(agrees, z, np.float32(0)).reshape(shape)
+
+    def _first_guess(self, depth: np.ndarray) -> np.ndarray:
+        """Depth of the color camera's pixels to the nearest cell of the buffer, float32 [N], 0 unknown."""
+        z = depth.reshape(-1)
+        seen = self._forward.depth(z)
+        seen[z <= 0] = 0
+        nearest, _ = self._buffer.fill(*self._forward.pixels(z, seen), seen)
+        filled = np.where(np.isfinite(nearest), nearest, cv2.erode(nearest, _NEIGHBORS))
+        filled[~(filled < _FARTHEST_M)] = 0
+        size = self.camera.width, self.camera.height
+        return cv2.resize(filled, size, interpolation=cv2.INTER_NEAREST).reshape(-1)
+
+    def _measured_there(self, z: np.ndarray, depth: np.ndarray, sample: _Sample) -> tuple[np.ndarray, np.ndarray]:
+        """What the depth camera has on its ray to the points at depth z: its own depth, and that of the color camera.
+
+        Both are float32 [N]. A point at depth z in the color camera and p in the depth camera lies on a ray of the
+        latter along which the former's depth grows by (z - t) / p per meter, t being the offset of the cameras.
+        """
+        there = self._back.depth(z)
+        u, v = self._back.pixels(z, there)
+        shape = self.camera.height, self.camera.width
+        found = sample(depth, u.reshape(shape), v.reshape(shape)).reshape(-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = found / there * (z - self._offset_z) + self._offset_z
+        seen[~(there > 0)] = 0
+        return found, seen
+
+
+_Sample = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def _nearest_depth(depth: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Depth [h, w] of the pixels nearest to points, 0 outside."""
+    return cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

@@ -1,0 +1,266 @@
+"""Whether a recording is plausible: sound ones pass, and ones that are wrong in one way are named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.fault_injection import black_out, cover_garbage, cover_near, cover_wall
+from experiments.wrong_recordings import FAULTS, Fault, WrongRecording
+from spslam.datasets.base import RgbdDataset
+from spslam.datasets.places import Capture, PlacesDataset
+from spslam.datasets.plausibility import Finding, check_first_frames, folded, require_sound
+from spslam.datasets.plausibility.edges import TURNS, EdgeMatch
+from spslam.datasets.plausibility.flow_fit import Points, fit_flow
+from spslam.datasets.plausibility.lens import FOCAL, Lens
+from spslam.datasets.plausibility.pairing import pairing_findings
+from spslam.errors import DatasetError
+
+FRAMES = 60
+
+
+class Kept(RgbdDataset):
+    """A dataset whose frames are rendered once."""
+
+    def __init__(self, dataset):
+        self.name, self.camera, self.depth_range = dataset.name, dataset.camera, (0.1, 10.0)
+        self.frames = [dataset[i] for i in range(len(dataset))]
+        self.times, self.given_poses = dataset.timestamps(), dataset.poses()
+
+    def __len__(self):
+        return len(self.frames)
+
+    def timestamps(self):
+        return self.times
+
+    def poses(self):
+        return self.given_poses
+
+    def read(self, index):
+        frame = self.frames[index]
+        return type(frame)(index, frame.timestamp, frame.color.copy(), frame.depth.copy(), frame.pose)
+
+
+@pytest.fixture(scope="module")
+def apartment():
+    return Kept(PlacesDataset("apartment", "handheld", "structured_light", FRAMES, capture=Capture(color_noise=2)))
+
+
+def found(recording):
+    return {finding.kind: finding for finding in check_first_frames(recording)}
+
+
+def test_a_sound_recording_has_no_finding(apartment):
+    assert check_first_frames(WrongRecording(apartment, FAULTS["none"])) == []
+    assert check_first_frames(WrongRecording(apartment, FAULTS["none"], with_poses=False)) == []
+
+
+REFUSED = {
+    "depth is noise": ("depth", "depth is noise"),
+    "focal length x 1.1": ("intrinsics", "focal length looks 1"),
+    "fx, fy of twice the size, cx, cy too": ("intrinsics", "the principal point lies at"),
+    "cx off by 10 % of f": ("intrinsics", "principal point (cx, cy) looks shifted"),
+    "depth x 1.1": ("scale", "depth 0.909 times as large would fit"),
+    "depth x 5": ("scale", "depth 0.2 times as large would fit"),
+    "depth x 1000": ("scale", "the depth scale looks wrong"),
+    "depth of 8 bits": ("depth", "8 bits"),
+    "depth of one value": ("depth", "all depth is the same"),
+    "depth mirrored": ("pairing", "mirrored left to right"),
+    "disparity as depth": ("pairing", "inverse depth"),
+    "both upside down": ("mirrored", "mirrored upside down"),
+    "color frozen": ("frozen color", "color is frozen"),
+    "depth frozen": ("frozen depth", "depth is frozen"),
+    "depth every fifth frame": ("frozen depth", "depth is frozen"),
+    "every frame five times": ("frozen", "frames are repeated while the poses move"),
+    "frames shuffled": ("order", "out of order"),
+}
+
+
+def noise(read, i, count):
+    frame = read(i)
+    depth = np.random.default_rng(i).uniform(0.5, 6, frame.depth.shape)
+    return replace(frame, depth=depth.astype(np.float32))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_wrong_is_named_and_certain(apartment, name):
+    kind, words = REFUSED[name]
+    fault = Fault(frame=noise) if name == "depth is noise" else FAULTS[name]
+    finding = found(WrongRecording(apartment, fault))[kind]
+    assert finding.certain, finding
+    assert words in str(finding)
+    assert finding.remedy
+
+
+WARNED = {
+    "poses world-to-camera": ("poses", "world-to-camera"),
+    "time stamps all zero": ("times", "do not ascend"),
+}
+
+
+@pytest.mark.parametrize("name", WARNED)
+def test_what_does_not_spoil_the_trajectory_is_a_doubt(apartment, name):
+    kind, words = WARNED[name]
+    finding = found(WrongRecording(apartment, FAULTS[name]))[kind]
+    assert not finding.certain
+    assert words in str(finding)
+
+
+def stood_still(read, i, count):
+    """The first frame again and again, with noise of its own each time."""
+    frame, random = read(0), np.random.default_rng(i)
+    color = np.clip(frame.color + random.normal(0, 2, frame.color.shape), 0, 255).astype(np.uint8)
+    depth = frame.depth * (1 + random.normal(0, 0.002, frame.depth.shape))
+    return replace(frame, color=color, depth=depth.astype(np.float32))
+
+
+def covered(read, i, count):
+    """A lens that is covered three times."""
+    frame = read(i)
+    if i % 16 < 8:
+        return frame
+    return replace(frame, color=np.zeros_like(frame.color), depth=np.zeros_like(frame.depth))
+
+
+def away_and_back(count):
+    """As of a camera that turns back, and whose frames in between are missing."""
+    return np.array([*range(24), *range(23, 3, -1), *range(40, 50), *range(4, 24)])
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [Fault(frame=stood_still), Fault(frame=covered), Fault(order=away_and_back)],
+    ids=["still", "covered", "back"],
+)
+def test_what_cameras_do_is_no_wrong_order(apartment, fault):
+    """All three lie nearer to views elsewhere than to those beside them, or jump once, and no frame is out of order."""
+    assert "order" not in found(WrongRecording(apartment, fault, with_poses=False))
+
+
+def test_a_jump_after_a_black_out_does_not_stop_a_short_run(apartment):
+    """With few views one jump is a large share of the steps."""
+    order = np.array([*range(12), *range(12, 18), *range(4, 12)])
+
+    def black(read, i, count):
+        frame = read(i)
+        if not 12 <= i < 18:
+            return frame
+        return replace(frame, color=np.zeros_like(frame.color), depth=np.zeros_like(frame.depth))
+
+    findings = check_first_frames(WrongRecording(apartment, Fault(frame=black, order=lambda count: order)))
+    assert not any(finding.certain for finding in findings)
+
+
+def palm(frame, random):
+    """A hand 6 cm before the lens, nearer than any depth scale in use would put a room."""
+    frame.color[:] = random.integers(20, 40, frame.color.shape)
+    frame.depth[:] = 0.06 + random.normal(0, 0.001, frame.depth.shape)
+
+
+def fragments(count):
+    """Five pieces of a recording that was switched on and off."""
+    return np.array([*range(12), *range(30, 40), *range(6, 14), *range(34, 44), *range(2, 12)])
+
+
+@pytest.mark.parametrize("change", [black_out, cover_near, cover_garbage, cover_wall, palm])
+@pytest.mark.parametrize("frames", [range(30), range(20, 50)], ids=["at the start", "later"])
+def test_a_lens_that_is_covered_for_a_second_does_not_stop_a_run(apartment, change, frames):
+    def covered(read, i, count):
+        frame = read(i)
+        if i in frames:
+            change(frame, np.random.default_rng(i))
+        return frame
+
+    findings = check_first_frames(WrongRecording(apartment, Fault(frame=covered)))
+    assert not any(finding.certain for finding in findings), findings
+
+
+def test_gaps_do_not_stop_a_run():
+    desk = Kept(
+        PlacesDataset("desk", "stop_and_go", "structured_light", FRAMES, seed=5, capture=Capture(color_noise=2))
+    )
+    finding = found(WrongRecording(desk, Fault(order=fragments)))["order"]
+    assert "24% of the views" in finding.text
+    assert not finding.certain
+
+
+def test_a_camera_that_stalls_does_not_stop_a_run(apartment):
+    """A third of the views repeat the one before, while whatever measured the poses went on."""
+    recording = WrongRecording(apartment, Fault(frame=lambda read, i, count: read(10 if 10 <= i < 26 else i)))
+    finding = found(recording)["frozen"]
+    assert "while the poses move" in finding.text
+    assert not finding.certain
+
+
+def test_a_scale_that_only_poses_could_show_is_not_seen_without_them(apartment):
+    assert check_first_frames(WrongRecording(apartment, FAULTS["depth x 1.1"], with_poses=False)) == []
+
+
+def test_findings_do_not_depend_on_anything_but_the_frames(apartment):
+    recording = WrongRecording(apartment, FAULTS["fx x 1.1"])
+    assert check_first_frames(recording) == check_first_frames(recording)
+
+
+def test_edges_that_lie_elsewhere_are_a_matter_of_registration():
+    lens = Lens(PlacesDataset(frames=1).camera, 2.0)
+    shifted = EdgeMatch(0.1, 0.5, 0.1, 0.05, 0.002, dict.fromkeys(TURNS, 0.0))
+    (finding,) = pairing_findings([], [], lens, shifted)
+    assert finding.certain
+    assert str(finding).startswith("color and depth are not registered: their edges are up to 10 % of the width apart")
+    assert pairing_findings([], [], lens, replace(shifted, score=0.45)) == []
+    assert pairing_findings([], [], lens, replace(shifted, misfit=0.03)) == []
+    # A part of the image where they lie on each other.
+    assert pairing_findings([], [], lens, replace(shifted, least_offset=0.01)) == []
+
+
+def test_a_dataset_that_is_not_registered_is_not_expected_to_be(apartment):
+    recording = WrongRecording(apartment, FAULTS["depth mirrored"])
+    recording.is_registered = False
+    assert not {"registration", "pairing"} & found(recording).keys()
+
+
+def test_a_focal_length_is_estimated_from_exact_points():
+    random = np.random.default_rng(0)
+    camera = PlacesDataset(frames=1).camera
+    true = Lens(camera, 2.0)
+    pixels = random.uniform((0, 0), (camera.width, camera.height), (200, 2))
+    depth = random.uniform(1, 4, 200)
+    turn = np.array([[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]])
+    last = true.pixels(true.points(pixels, depth) @ turn.T + (0.1, 0, 0.05))
+    wrong = np.zeros(7)
+    wrong[FOCAL] = 0.1
+    fit = fit_flow(Points(pixels, depth, last), Lens(camera, 2.0, wrong), [FOCAL])
+    assert fit.numbers[FOCAL] == pytest.approx(0, abs=1e-3)
+    assert fit.error_px < 0.01
+    assert fit.translation == pytest.approx([0.1, 0, 0.05], abs=1e-3)
+
+
+def test_findings_of_a_kind_are_folded_with_their_number():
+    doubt, certain = Finding("scale", "maybe"), Finding("scale", "surely", "mend it", certain=True)
+    kept = folded([doubt, Finding("order", "mixed"), certain, doubt])
+    assert [(finding.text, finding.times) for finding in kept] == [("surely", 3), ("mixed", 1)]
+    assert str(kept[0]) == "surely (3 times); mend it"
+
+
+def test_doubts_are_no_reason_to_stop():
+    require_sound([Finding("scale", "maybe")], "data")
+    with pytest.raises(DatasetError, match=r"data: the first frames do not fit together: surely.*run\.data_check=warn"):
+        require_sound([Finding("scale", "maybe"), Finding("scale", "surely", certain=True)], "data")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["exact", "stereo", "time_of_flight", "phone_lidar"])
+@pytest.mark.parametrize("place", ["room", "stairwell", "hall"])
+def test_sound_places_pass(place, sensor):
+    recording = PlacesDataset(place, "walking", sensor, 300, seed=5, capture=Capture(color_noise=2))
+    recording.depth_range = (0.1, 10.0)
+    assert check_first_frames(recording) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.9, 0.95, 1.05, 1.1])
+@pytest.mark.parametrize("sensor", ["exact", "stereo", "time_of_flight"])
+def test_focal_lengths_off_by_5_and_10_percent_are_refused(sensor, factor):
+    dataset = PlacesDataset("room", "handheld", sensor, 600, seed=5, capture=Capture(color_noise=2))
+    recording = WrongRecording(dataset, FAULTS[f"focal length x {factor:g}"])
+    assert found(recording)["intrinsics"].certain

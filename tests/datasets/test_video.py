@@ -1,0 +1,113 @@
+"""Videos by OpenCV's writer and by FFmpeg's encoders give their frames, in any order, from threads and copies."""
+
+import pickle
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+
+from spslam.datasets.prefetch import prefetch
+from spslam.datasets.video import VideoStream
+from spslam.errors import DatasetError
+
+av = pytest.importorskip("av")
+WIDTH, HEIGHT, COUNT = 64, 48, 30
+
+
+def picture(number):
+    """A plain picture whose red says which frame it is."""
+    image = np.full((HEIGHT, WIDTH, 3), (0, 90, 160), np.uint8)
+    image[..., 0] = 8 * number
+    return image
+
+
+def write_opencv(path, count=COUNT, fourcc="mp4v", size=(WIDTH, HEIGHT), draw=picture):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*fourcc), 30, size)
+    assert writer.isOpened()
+    for number in range(count):
+        writer.write(cv2.cvtColor(draw(number), cv2.COLOR_RGB2BGR))
+    writer.release()
+    return path
+
+
+def write_h264(path, seconds):
+    """With B-frames and uneven times."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=1000, options={"bf": "3", "g": "20", "crf": "5"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for number, time in enumerate(seconds):
+            frame = av.VideoFrame.from_ndarray(picture(number), format="rgb24")
+            frame.pts = round(1000 * time)
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+def reds(stream, numbers):
+    return [float(stream.read(int(number))[..., 0].mean()) / 8 for number in numbers]
+
+
+@pytest.mark.parametrize(("suffix", "fourcc"), [(".mp4", "mp4v"), (".avi", "MJPG")])
+def test_frames_by_number_in_any_order(tmp_path, suffix, fourcc):
+    stream = VideoStream(write_opencv(tmp_path / f"a{suffix}", fourcc=fourcc))
+    assert len(stream) == COUNT
+    np.testing.assert_allclose(np.diff(stream.times()), 1 / 30, atol=1e-3)
+    for order in (range(COUNT), np.random.default_rng(0).permutation(COUNT)):
+        np.testing.assert_allclose(reds(stream, order), list(order), atol=0.5)
+    np.testing.assert_allclose(reds(pickle.loads(pickle.dumps(stream)), [25, 3, 4]), [25, 3, 4], atol=0.5)
+    assert stream.read(3).dtype == np.uint8
+    assert stream.read(3).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_frames_that_are_stored_out_of_order_and_at_uneven_times(tmp_path):
+    seconds = np.cumsum(np.random.default_rng(0).integers(10, 60, COUNT)) / 1000
+    stream = VideoStream(write_h264(tmp_path / "a.mp4", seconds - seconds[0]))
+    np.testing.assert_allclose(stream.times() - stream.times()[0], seconds - seconds[0], atol=1.1e-3)
+    np.testing.assert_allclose(reds(stream, range(COUNT)), range(COUNT), atol=0.5)
+    np.testing.assert_allclose(reds(stream, [28, 27, 2]), [28, 27, 2], atol=0.5)
+
+
+def test_from_threads(tmp_path):
+    class Frames:
+        def __init__(self, stream):
+            self.stream = stream
+
+        def __len__(self):
+            return COUNT
+
+        def __getitem__(self, number):
+            return self.stream.read(number)
+
+    with prefetch(Frames(VideoStream(write_opencv(tmp_path / "a.mp4"))), workers=4, ahead=12) as frames:
+        np.testing.assert_allclose([frame[..., 0].mean() / 8 for frame in frames], range(COUNT), atol=0.5)
+
+
+def test_broken_videos_are_one_line(tmp_path):
+    path = write_opencv(tmp_path / "a.mp4")
+    content = path.read_bytes()
+    for spoiled, message in (
+        (b"", "can't be read as a video"),
+        (content[:200], "can't be read as a video"),
+        (content[: len(content) // 2], "can't be read as a video"),
+        (b"no video at all" * 50, "can't be read as a video"),
+    ):
+        path.write_bytes(spoiled)
+        with pytest.raises(DatasetError, match=message) as error:
+            VideoStream(path)
+        assert "\n" not in str(error.value)
+    with pytest.raises(DatasetError, match="no such file"):
+        VideoStream(tmp_path / "absent.mp4")
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match="must have a video track 1, got 1 of them"):
+        VideoStream(path, 1)
+
+
+def test_pyav_absent_is_one_line(tmp_path, monkeypatch):
+    path = write_opencv(tmp_path / "a.mp4", 2)
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(DatasetError, match=r"videos need PyAV: pip install 'spslam\[video\]'"):
+        VideoStream(path)
