@@ -1,0 +1,88 @@
+"""The thread that takes frames from a camera: into the queue, and to the recorder."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from dataclasses import replace
+from types import TracebackType
+
+from spslam.datasets.base import RgbdFrame
+from spslam.datasets.frame_arrays import check_frame
+from spslam.errors import DatasetError, SourceError
+from spslam.live.frame_queue import FrameQueue
+from spslam.live.recorder import FolderRecorder
+from spslam.live.source import LiveFrame, LiveSource
+
+_END_S = 10.0  # for the source to yield once more after it was told to end
+
+
+class Capture(contextlib.AbstractContextManager):
+    """Iterates over a source's frames on a thread, from `with` until its end.
+
+    Args:
+        source: the camera; closed at the end.
+        queue: receives the frames, numbered in the order in which they came; closed at the end.
+        recorder: receives them too; None records nothing.
+
+    Attributes:
+        received: frames that came, with those that could not be used and those that the source left out.
+        failure: what the source, or a check of its frames, raised.
+    """
+
+    def __init__(self, source: LiveSource, queue: FrameQueue, recorder: FolderRecorder | None = None) -> None:
+        self.source, self.queue, self.recorder = source, queue, recorder
+        self.failure: Exception | None = None
+        self._count = 0
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="spslam-capture", daemon=True)
+
+    @property
+    def received(self) -> int:
+        return self._count + self.source.dropped
+
+    def __enter__(self) -> Capture:
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Ends the thread and closes the source; waits until the source has yielded once more."""
+        self._ending.set()
+        self._thread.join(_END_S)
+        if self._thread.is_alive() and self.failure is None:
+            self.failure = SourceError(f"{self.source.name}: did not end within {_END_S:g} s; it is left alone")
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        try:
+            for item in self.source.frames():
+                if self._ending.is_set():
+                    break
+                if item is not None:
+                    self._pass_on(item, time.monotonic())
+        except Exception as error:
+            self.failure = error
+        finally:
+            try:
+                self.source.close()
+            except Exception as error:
+                self.failure = self.failure or error
+            self.queue.close()
+
+    def _pass_on(self, item: RgbdFrame | LiveFrame | DatasetError, now: float) -> None:
+        self._count += 1
+        if isinstance(item, DatasetError):
+            self.queue.put(item)
+            return
+        arrived = item if isinstance(item, LiveFrame) else LiveFrame(item, now)
+        frame = arrived.frame
+        check_frame(self.source.name, frame.color, frame.depth, self.source.camera)
+        numbered = LiveFrame(replace(frame, index=self._count - 1 + self.source.dropped), arrived.complete_s)
+        if self.recorder is not None:
+            self.recorder.offer(numbered.frame)
+        self.queue.put(numbered)

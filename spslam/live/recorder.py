@@ -1,0 +1,148 @@
+"""Records a live camera in the `folder` layout on a thread, which never holds up the camera or the loop."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+import cv2
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.datasets.base import RgbdFrame
+from spslam.errors import OutputError
+from spslam.io import atomic_write, writing
+
+WAITING_FRAMES = 32  # one second at 30 Hz; 68 MB of 640x480
+# Full resolution of the colors: averaged over 2 x 2 pixels, as JPEG has it otherwise, patterns lose theirs.
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+_PNG_LEVEL = 1  # four times as fast as the default, for a tenth more bytes
+_MOST_UNITS = 65535
+
+
+class FolderRecorder(contextlib.AbstractContextManager):
+    """Writes frames to `color/NNNNNN.jpg` and `depth/NNNNNN.png`, with `intrinsics.json` and `times.txt`.
+
+    `spslam run folder --data DIR` reads the result, also after a kill: each image appears whole, and a frame's time is
+    the last that is written of it. Color is JPEG of quality 95. A frame that comes while `WAITING_FRAMES` others wait
+    for the disk is left out and counted.
+
+    Args:
+        folder: made where it is missing; it must be empty.
+        camera: of all frames.
+        depth_scale: depth is rounded to 1 / `depth_scale` m; what does not fit 16 bits then is stored as 0, unknown.
+
+    Attributes:
+        frames: recorded so far.
+        left_out: frames that were not recorded.
+        failure: why recording stopped before its end; None where it did not.
+
+    Raises:
+        OutputError: the folder holds something, or can't be written.
+    """
+
+    def __init__(self, folder: str | os.PathLike, camera: Camera, depth_scale: float = 1000.0) -> None:
+        self.folder, self._scale = Path(folder), depth_scale
+        if self.folder.is_dir() and any(self.folder.iterdir()):
+            raise OutputError(f"{self.folder}: is not empty; record into another folder")
+        with writing(self.folder):
+            for name in ("color", "depth"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+        intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        content = json.dumps(intrinsics | {"depth_scale": depth_scale}, indent=1) + "\n"
+        atomic_write(self.folder / "intrinsics.json", content)
+        self.frames = self.left_out = 0
+        self.failure: OutputError | None = None
+        self._waiting: queue.Queue[RgbdFrame | None] = queue.Queue()
+        self._times: TextIO | None = None
+        self._poses: TextIO | None = None
+        self._thread = threading.Thread(target=self._run, name="spslam-recorder", daemon=True)
+        self._thread.start()
+
+    def offer(self, frame: RgbdFrame) -> None:
+        """Takes a frame to be recorded, or leaves it out; never waits. The frame must not be changed after."""
+        if self.failure is not None or self._waiting.qsize() >= WAITING_FRAMES:
+            self.left_out += 1
+        else:
+            self._waiting.put(frame)
+
+    def close(self) -> None:
+        """Writes the frames that wait. May be called again."""
+        self._waiting.put(None)
+        self._thread.join()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"FolderRecorder({str(self.folder)!r}, {self.frames} frames, {self.left_out} left out)"
+
+    def _run(self) -> None:
+        with contextlib.ExitStack() as files:
+            while (frame := self._waiting.get()) is not None:
+                if self.failure is not None:
+                    self.left_out += 1
+                    continue
+                try:
+                    self._write(frame, files)
+                    self.frames += 1
+                except OutputError as error:
+                    self.failure = error
+                    self.left_out += 1
+                except Exception as error:  # whatever it is: a thread that ends silently would look like a slow disk
+                    self.failure = OutputError(f"{self.folder}: frame {self.frames} can't be written: {error}")
+                    self.left_out += 1
+
+    def _write(self, frame: RgbdFrame, files: contextlib.ExitStack) -> None:
+        name = f"{self.frames:06d}"
+        color = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+        units = np.rint(frame.depth * np.float32(self._scale))
+        depth = np.where(units <= _MOST_UNITS, units, 0).astype(np.uint16)
+        self._write_image("depth", f"{name}.png", depth, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
+        self._write_image("color", f"{name}.jpg", color, _JPEG)
+        if self._times is None:
+            self._times = self._open("times.txt", files)
+            self._poses = self._open("poses.txt", files) if frame.pose is not None else None
+        if self._poses is not None:
+            pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
+            self._append(self._poses, " ".join(f"{value:.12g}" for value in pose.reshape(-1)))
+        self._append(self._times, f"{frame.timestamp:.9f}")
+
+    def _write_image(self, kind: str, name: str, image: np.ndarray, options: list[int]) -> None:
+        """Writes an image under a hidden name and renames it, so that it is there whole or not at all."""
+        path = self.folder / kind / name
+        hidden = path.with_name(f".{name}")
+        content = cv2.imencode(path.suffix, image, options)[1]
+        try:
+            with writing(path):
+                hidden.write_bytes(content.tobytes())
+                os.replace(hidden, path)
+        except OutputError:
+            with contextlib.suppress(OSError):
+                hidden.unlink(missing_ok=True)
+            raise
+
+    def _open(self, name: str, files: contextlib.ExitStack) -> TextIO:
+        path = self.folder / name
+        with writing(path):
+            file = path.open("w", encoding="utf-8", buffering=1)
+        files.callback(_close, file)
+        return file
+
+    def _append(self, file: TextIO, row: str) -> None:
+        with writing(file.name):
+            file.write(row + "\n")
+
+
+def _close(file: TextIO) -> None:
+    """Closes a file; a row that could not be written was reported already."""
+    with contextlib.suppress(OSError):
+        file.close()

@@ -1,0 +1,105 @@
+"""RealSense by the real SDK: recordings that it made of generated frames; only the camera itself is not there."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from spslam.errors import SourceError
+from spslam.live.realsense import RealSenseSource, _explained
+from tests.cli.command import assert_refused, spslam
+from tests.live.realsense_sdk import load_sdk, record
+from tests.system.sequences import Recorded
+
+
+@pytest.fixture(scope="module")
+def sdk():
+    return load_sdk()
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return Recorded(12)
+
+
+@pytest.fixture(scope="module")
+def recording(sdk, dataset, tmp_path_factory):
+    return record(sdk, tmp_path_factory.mktemp("sdk") / "room.db3", dataset, dataset.camera)
+
+
+def test_frames_come_as_they_were_recorded(recording, dataset):
+    with RealSenseSource(recording=recording) as source:
+        assert repr(source) == "RealSenseSource(RealSense recording room.db3, 160x120)"
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert getattr(source.camera, name) == pytest.approx(getattr(dataset.camera, name), rel=1e-6)
+        frames = [item.frame for item in source.frames() if item is not None]
+    # The SDK's player gives the first pair of images only where it was complete in time.
+    assert len(frames) >= 10
+    for frame in frames:
+        number = round(30 * frame.timestamp)
+        np.testing.assert_array_equal(frame.color, dataset[number].color)
+        # Registration to a color camera in the same place leaves depth where it is, but for holes and edges.
+        assert np.mean(np.abs(frame.depth - dataset[number].depth) < 0.0006) > 0.9
+
+
+def test_a_recording_is_tracked_and_recorded_by_the_command(recording, tmp_path):
+    arguments = ["--recording", recording, "--max-wait", "60000", "--no-mesh", "--device", "cpu"]
+    arguments += ["--set", "mapping.first_iterations=12", "--output", "out", "--record", "rec"]
+    result = spslam("live", "realsense", *arguments, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "latency p99" in result.stdout
+    again = spslam("run", "folder", "--data", "rec", "--device=cpu", "--no-mesh", "--quiet", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+
+
+def test_distortion_of_the_lens_is_undone(sdk, dataset, tmp_path):
+    coefficients = (0.1, -0.05, 0.001, -0.001, 0.02)
+    path = record(sdk, tmp_path / "lens.db3", [dataset[0]] * 4, dataset.camera, coefficients)
+    with RealSenseSource(recording=path) as source:
+        item = next(item for item in source.frames() if item is not None)
+    matrix = dataset.camera.matrix()
+    expected = cv2.undistort(dataset[0].color, matrix, np.array(coefficients))
+    inner = np.s_[10:-10, 10:-10]
+    difference = np.abs(item.frame.color[inner].astype(int) - expected[inner])
+    # The room's patterns are as fine as pixels, where two interpolations differ; undone not at all, it is 30.
+    assert difference.mean() < 3
+    assert np.abs(dataset[0].color[inner].astype(int) - expected[inner]).mean() > 4 * difference.mean()
+
+
+def test_files_that_cannot_be_played_are_named(sdk, tmp_path):
+    with pytest.raises(SourceError, match="absent.bag: no such file"):
+        RealSenseSource(recording=tmp_path / "absent.bag")
+    (tmp_path / "text.db3").write_text("hello")
+    with pytest.raises(SourceError, match="text.db3: can't be played by pyrealsense2: "):
+        RealSenseSource(recording=tmp_path / "text.db3")
+
+
+def test_without_a_camera_one_line_says_so(sdk, tmp_path):
+    assert_refused(spslam("live", "realsense", cwd=tmp_path), "no RealSense camera is connected; check its cable")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_sdk_refuses_is_explained():
+    assert "no camera 77 sends color and depth of 9x9 at 1 Hz; choose another --size or --rate" in _explained(
+        "Couldn't resolve requests", None, "77", "9x9 at 1 Hz"
+    )
+    assert "can't be started: busy" in _explained("busy", None, None, "")
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ModuleNotFoundError("No module named 'pyrealsense2'"), "needs pyrealsense2: pip install 'spslam[realsense]'"),
+        (ImportError("libusb-1.0.so.0: cannot open shared object file"), "`apt install libusb-1.0-0`"),
+    ],
+)
+def test_without_the_sdk_one_line_says_what_to_install(monkeypatch, tmp_path, error, message):
+    class Missing:
+        def find_spec(self, name, path=None, target=None):
+            if name == "pyrealsense2":
+                raise error
+
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Missing(), *sys.meta_path])
+    assert_refused(spslam("live", "realsense", cwd=tmp_path), message)
