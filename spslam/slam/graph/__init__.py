@@ -1,0 +1,1 @@
+"""The keyframe graph: what makes poses and map globally consistent."""

@@ -1,0 +1,155 @@
+"""Keyframes and edges of the graph, as the state keeps them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from spslam.geometry import compose
+from spslam.slam.graph.archive import KeyframeArchive
+from spslam.slam.graph.edges import Link
+from spslam.slam.graph.image_pool import ImagePool
+from spslam.slam.graph.keyframe import Keyframe, KeyframeCamera
+from spslam.slam.graph.keyframe_graph import GraphContent
+from spslam.slam.graph.keyframe_tensors import (
+    cameras_of,
+    edge_tensors,
+    edges_of,
+    keyframe_tensors,
+    keyframes_of,
+    link_tensors,
+    links_of,
+    pair_tensor,
+    pairs_of,
+    stacked,
+)
+from spslam.slam.graph.loops import Proposal
+from spslam.slam.graph.redundancy import Anchor, moved_anchors
+
+
+class KeyframeStore:
+    """The graph's keyframes, what was measured between them, and the solution that is being made.
+
+    Attributes:
+        camera: of the keyframes that are added; those of an opened map may have others.
+        keyframes: in the order of their frames.
+        links: of each keyframe to the one before; only that of new ones is used.
+        anchors: of keyframes that were left out, ascending.
+        content: edges, as of the last solution.
+        begun: number of the frame at which the solution that is being made began; None where none is.
+        start: float64 [K', 4, 4] poses of the keyframes at that frame.
+        noise: float32 [4] of the sensor at that frame.
+        target: float64 [K', 4, 4] the solution for which the map is being made again; None where it is not.
+        opened_noise: float32 [4] of the sensors of an opened map's cameras.
+        opened: the map that was opened, as it was; None without one.
+    """
+
+    def __init__(self, camera: KeyframeCamera):
+        self.camera = camera
+        self.keyframes: list[Keyframe] = []
+        self._images: dict[KeyframeCamera, ImagePool] = {}
+        self.links: list[Link] = []
+        self.anchors: list[Anchor] = []
+        self.content = GraphContent()
+        self.begun: int | None = None
+        self.start = np.zeros((0, 4, 4))
+        self.noise = torch.zeros(4)
+        self.target: np.ndarray | None = None
+        self.opened_noise: dict[KeyframeCamera, torch.Tensor] = {}
+        self.opened: KeyframeArchive | None = None
+
+    @property
+    def rows(self) -> np.ndarray:
+        """int64 [K] numbers of the keyframes' frames."""
+        return np.array([keyframe.frame for keyframe in self.keyframes], np.int64)
+
+    @property
+    def noises(self) -> dict[KeyframeCamera, torch.Tensor]:
+        """float32 [4] of every camera's sensor, as of the last solution."""
+        return {**self.opened_noise, self.camera: self.noise}
+
+    def add(self, keyframe: Keyframe, link: Link) -> None:
+        """Appends a keyframe; its images move to a file that the system can put out of memory."""
+        self._keep(keyframe)
+        self.links.append(link)
+
+    def leave_out(self, out: Mapping[int, int], poses: np.ndarray) -> None:
+        """Leaves out keyframes, given with their references, of the first K, at poses float64 [K, 4, 4].
+
+        Nothing may read their images any more.
+        """
+        frames = [keyframe.frame for keyframe in self.keyframes]
+        kept = [one for one in range(len(frames)) if one not in out]
+        numbers = {one: number for number, one in enumerate(kept)}
+        moved = moved_anchors(self.anchors, out, frames, poses)
+        self.anchors = [replace(anchor, reference=numbers[anchor.reference]) for anchor in moved]
+        for one in out:
+            keyframe = self.keyframes[one]
+            self._images[keyframe.camera].give_back(keyframe.depth, keyframe.intensity)
+        self.keyframes, self.links = [self.keyframes[one] for one in kept], [self.links[one] for one in kept]
+
+    def with_anchors(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers int64 [N], ascending, and poses float64 [N, 4, 4] of keyframes and those left out.
+
+        Args:
+            poses: float64 [K, 4, 4] of the keyframes.
+        """
+        if not self.anchors:
+            return self.rows, poses
+        references = [anchor.reference for anchor in self.anchors]
+        followed = compose(poses[references], np.stack([anchor.pose for anchor in self.anchors]))
+        rows = np.append(self.rows, [anchor.frame for anchor in self.anchors])
+        order = np.argsort(rows, kind="stable")
+        return rows[order], np.concatenate([poses, followed])[order]
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All that a checkpoint needs, on the CPU."""
+        content, cameras = self.content, [self.camera, *(one for one in self.opened_noise if one != self.camera)]
+        return {
+            **keyframe_tensors(self.keyframes, cameras),
+            **link_tensors(self.links),
+            "anchors": torch.tensor([(one.frame, one.reference) for one in self.anchors], dtype=torch.int64).view(
+                -1, 2
+            ),
+            "anchor_poses": stacked([anchor.pose for anchor in self.anchors], 4),
+            **edge_tensors("edge_", content.edges),
+            **edge_tensors("waiting_", [proposal.edge for proposal in content.waiting]),
+            "waiting_correction": stacked([proposal.correction for proposal in content.waiting], 4),
+            "tried": pair_tensor(content.tried),
+            "start": torch.from_numpy(self.start),
+            "target": torch.from_numpy(np.zeros((0, 4, 4)) if self.target is None else self.target),
+            "noise": torch.stack([self.noise, *(self.opened_noise[camera] for camera in cameras[1:])]),
+            "numbers": torch.tensor([content.done, -1 if self.begun is None else self.begun]),
+        }
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Replaces the content by a copy of what `tensors()` returned; raises ValueError for another camera's."""
+        cameras = cameras_of(state["cameras"])
+        if cameras[:1] != [self.camera]:
+            raise ValueError("the keyframes are of another camera")
+        self.keyframes = []
+        self._images.clear()
+        for keyframe in keyframes_of(state, cameras):
+            self._keep(keyframe)
+        self.links = links_of(state)
+        anchored = zip(state["anchors"].tolist(), state["anchor_poses"].cpu().numpy().copy(), strict=True)
+        self.anchors = [Anchor(frame, to, pose) for (frame, to), pose in anchored]
+        done, begun = state["numbers"].tolist()
+        corrections = state["waiting_correction"].cpu().numpy().copy()
+        waiting = [Proposal(*each) for each in zip(edges_of("waiting_", state), corrections, strict=True)]
+        self.content = GraphContent(edges_of("edge_", state), pairs_of(state["tried"]), done, waiting)
+        self.begun = None if begun < 0 else begun
+        self.start = state["start"].cpu().numpy().copy()
+        self.target = state["target"].cpu().numpy().copy() if len(state["target"]) else None
+        self.noise, *others = state["noise"].cpu().clone()
+        self.opened_noise = dict(zip(cameras[1:], others, strict=True))
+
+    def _keep(self, keyframe: Keyframe) -> None:
+        camera = keyframe.camera
+        if camera not in self._images:
+            self._images[camera] = ImagePool(camera.camera.height, camera.camera.width)
+        depth, intensity = self._images[camera].keep(keyframe.depth, keyframe.intensity)
+        self.keyframes.append(keyframe.changed(depth=depth, intensity=intensity))

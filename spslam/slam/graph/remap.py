@@ -1,0 +1,88 @@
+"""The map made again from keyframes, where the graph has moved them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.config import Config
+from spslam.geometry import compose, interpolate_pose, inverse
+from spslam.prior import Prior
+from spslam.scene import Scene, SparseVolume
+from spslam.slam.encode_frame import encode_frame
+from spslam.slam.graph.keyframe import Keyframe
+from spslam.slam.poses import pose_tensor
+
+SAMPLED_SHARE = 1.5  # pixels that are drawn for each that is encoded, as not all have a normal
+
+
+def encode_keyframe(volume: SparseVolume, keyframe: Keyframe, pose: np.ndarray, prior: Prior, config: Config) -> None:
+    """Fuses a keyframe into a volume as mapping fuses frames; the same bytes every time.
+
+    Args:
+        volume: changed.
+        keyframe: in the host's memory.
+        pose: float64 [4, 4] T_world_camera.
+        prior: on the volume's device.
+        config: of the run.
+    """
+    records, normals = keyframe.sample(round(SAMPLED_SHARE * config.prior.points_per_frame), config.seed)
+    if not len(records):
+        return
+    records, normals = (tensor.contiguous().to(volume.device) for tensor in (records, normals))
+    at = pose_tensor(pose, volume.device)
+    points, turned = ops.unproject_pixels(records, normals, at, *keyframe.camera.intrinsics)
+    encode_frame(volume, points, turned, prior, config.prior, config.seed, config.precision == "tf32")
+
+
+def empty_volume(scene: Scene) -> SparseVolume:
+    """A volume of a scene's settings without vertices."""
+    return SparseVolume(scene.settings.voxel_size_m, scene.settings.max_voxels, scene.device)
+
+
+@contextmanager
+def own_stream(device: torch.device) -> Iterator[None]:
+    """On CUDA, launches on a stream of its own, so that tracking's need not wait; waits for it at the end."""
+    if device.type != "cuda":
+        yield
+        return
+    stream = torch.cuda.Stream(device)
+    with torch.cuda.stream(stream):
+        yield
+    stream.synchronize()
+
+
+def handed_over(volume: SparseVolume) -> SparseVolume:
+    """A volume that was made on another stream, for the current one; the same on the CPU."""
+    if volume.device.type != "cuda" or volume.num_voxels == 0:
+        return volume
+    content = volume.voxel_coords, volume.embeddings, volume.weights
+    taken = SparseVolume(volume.voxel_size_m, volume.cells.max_voxels, volume.device)
+    taken.restore(*content)
+    for tensor in content:
+        tensor.record_stream(torch.cuda.current_stream(volume.device))
+    return taken
+
+
+def corrected_poses(poses: np.ndarray, rows: np.ndarray, keyframe_poses: np.ndarray) -> np.ndarray:
+    """Poses of all frames after keyframes have moved: each follows the two keyframes that it lies between.
+
+    Args:
+        poses: float64 [F, 4, 4] T_world_camera of all frames as they were.
+        rows: int64 [K] of the keyframes, ascending.
+        keyframe_poses: float64 [K, 4, 4], where they are now.
+
+    Returns:
+        float64 [F, 4, 4]. Frames after the last keyframe move as it does.
+    """
+    corrections = compose(keyframe_poses, inverse(poses[rows]))
+    frames = np.arange(len(poses))
+    before = np.clip(np.searchsorted(rows, frames, "right") - 1, 0, len(rows) - 1)
+    after = np.minimum(before + 1, len(rows) - 1)
+    between = np.maximum(rows[after] - rows[before], 1)
+    share = np.clip((frames - rows[before]) / between, 0.0, 1.0)
+    return interpolate_pose(compose(corrections[before], poses), compose(corrections[after], poses), share)

@@ -1,0 +1,119 @@
+"""What a lost camera sees is mapped on its own, and joined with the map when the camera is known there again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spslam.datasets.base import RgbdDataset
+from spslam.datasets.generated import GeneratedDataset
+from spslam.slam.system import SlamSystem
+from spslam.trajectory import Trajectory
+from tests.system.sequences import run_on, settings
+
+KNOWN, BLACK, ELSEWHERE = 12, 3, 30  # frames
+CONFIG = ("graph.new_map_after_s=0.05", "mapping.iterations=3", "tracking.first_frames=2")
+BACK = (*range(76, 54, -3),)  # from where nothing known is seen to where the first frames look
+ORDER = (*range(0, 2 * KNOWN, 2), *[-1] * BLACK, *range(106, 76, -3), *BACK)
+COUNT = len(ORDER)
+POSES = GeneratedDataset(300, 160, 120).poses()
+
+
+class Frames(RgbdDataset):
+    """The generated room's frames in the order of the test, -1 black, at 30 Hz."""
+
+    name = "lost"
+
+    def __init__(self, count=COUNT):
+        self._room, self._count = GeneratedDataset(300, 160, 120), count
+        self.camera = self._room.camera
+
+    def __len__(self):
+        return self._count
+
+    def timestamps(self):
+        return np.arange(len(self)) / 30
+
+    def poses(self):
+        return None
+
+    def read(self, index):
+        frame = self._room[max(ORDER[index], 0)]
+        if ORDER[index] < 0:
+            frame.color[:], frame.depth[:] = 0, 0
+        return replace(frame, index=index, timestamp=index / 30)
+
+
+def lost_and_back(frames, stop_at=COUNT, path=None):
+    """A system after the frames, which was saved and loaded once before frame `stop_at`."""
+    system = SlamSystem(settings(*CONFIG), frames.camera, POSES[0])
+    for i in range(COUNT):
+        if i == stop_at:
+            assert system.state.segment is not None
+            system.save(path)
+            system = SlamSystem.load(path)
+        system.process(frames[i])
+    return system
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return Frames()
+
+
+@pytest.fixture(scope="module")
+def joined(frames):
+    system = lost_and_back(frames)
+    assert system.state.segment is None
+    system.finish()
+    return system
+
+
+def test_frames_seen_while_lost_get_poses_and_a_map(joined):
+    trajectory = joined.trajectory()
+    assert np.flatnonzero(trajectory.lost).tolist() == list(range(KNOWN, KNOWN + BLACK))
+    known = ~trajectory.lost
+    distance = np.linalg.norm(trajectory.poses[known, :3, 3] - POSES[np.array(ORDER)[known], :3, 3], axis=1)
+    assert distance.max() < 0.005
+    assert joined.segments() == []
+    # Keyframes of the places that were seen while it was lost are the graph's.
+    rows = joined.state.graph.rows
+    assert (np.diff(rows) > 0).all()
+    assert ((rows >= KNOWN + BLACK) & (rows < len(ORDER) - len(BACK))).sum() >= 2
+
+
+def test_resumed_within_a_segment_it_gives_the_same_bytes(frames, joined, tmp_path):
+    resumed = lost_and_back(frames, KNOWN + BLACK + 4, tmp_path / "system")
+    resumed.finish()
+    np.testing.assert_array_equal(resumed.trajectory().poses, joined.trajectory().poses)
+    one, other = (system.state.scene.volume for system in (resumed, joined))
+    assert one.embeddings.equal(other.embeddings)
+
+
+def test_a_place_that_is_never_joined_is_kept_apart(frames):
+    system = SlamSystem(settings(*CONFIG), frames.camera, POSES[0])
+    voxels = 0
+    for i in range(KNOWN + BLACK + 5):
+        system.process(frames[i])
+        voxels = system.state.scene.volume.num_voxels if i < KNOWN else voxels
+    system.finish()
+    assert system.trajectory().lost[KNOWN:].all()
+    assert system.state.scene.volume.num_voxels == voxels
+    (segment,) = system.segments()
+    truth = POSES[np.array(ORDER)[KNOWN + BLACK : KNOWN + BLACK + 5]]
+    assert len(segment) == 5
+    np.testing.assert_allclose(segment.poses, np.linalg.inv(truth[0]) @ truth, atol=0.01)
+
+
+def test_without_the_option_none_begins(frames):
+    system = SlamSystem(settings(*CONFIG, "graph.new_map_after_s=null"), frames.camera, POSES[0])
+    for i in range(KNOWN + BLACK + 2):
+        system.process(frames[i])
+    assert system.state.segment is None
+
+
+def test_a_run_writes_the_poses_of_segments(monkeypatch, tmp_path):
+    metrics = run_on(monkeypatch, Frames(KNOWN + BLACK + 5), tmp_path / "run", *CONFIG)
+    assert (metrics["lost_frames"], metrics["unjoined_frames"]) == (BLACK + 5, 5)
+    segment = Trajectory.load_tum(tmp_path / "run" / "segment-1.txt")
+    np.testing.assert_allclose(segment.timestamps, np.arange(KNOWN + BLACK, KNOWN + BLACK + 5) / 30, atol=1e-6)
