@@ -82,7 +82,7 @@ def fit_from(
     """The fit of what tracking alone makes of a start, verified, and its pose."""
     estimate = system.tracker.track(TrackingProblem(system.state.scene, pixels.records, start, number))
     alignment = IcpAlignment(pixels, system.camera)
-    fit = verifier.verified(estimate.fit, estimate.pose, system.state.scene, alignment, system.history, pixels.records)
+    fit = verifier.verified(estimate.fit, estimate.pose, system.state.scene, alignment, system.history, pixels)
     return fit, matrix(estimate.pose)
 
 

@@ -7,7 +7,7 @@ the dataset is mapped, and the camera returns with frames in between, so that no
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapsho
 from spslam.slam.system import SlamSystem
 
 STEP = 2  # between mapped frames; the frames in between are for the way back
+FRAMES_PER_SECOND = 30
 BLACK_FRAMES, JUMP_FRAMES, COVERED_FRAMES, BACK_FRAMES = 30, 60, 20, 15
 FOUND_CM, FOUND_DEG = 3.0, 3.0
 WRONG_CM, WRONG_DEG = 8.0, 6.0  # ground truth and map differ by a few centimeters anyway
@@ -140,6 +141,20 @@ def plan(dataset: RgbdDataset, count: int, seed: int) -> list[Trial]:
         for i, (fault, (during, after)) in enumerate(shown.items()):
             trials.append(Trial(fault, place, during, after, seed + 4 * place + i))
     return sorted(trials, key=lambda trial: trial.place)
+
+
+def plan_black_outs(dataset: RgbdDataset, count: int, seed: int, seconds: Sequence[float]) -> list[Trial]:
+    """`count` black-outs of each length, at places spread over the run, each with another mapped place to return to."""
+    random = np.random.default_rng(seed)
+    rows = len(dataset) // STEP
+    trials = []
+    for place in np.linspace(0.25 * rows, rows - 1, count).astype(int).tolist():
+        for length in seconds:
+            goal = int(random.integers(0, max(place - BACK_FRAMES, 1)))
+            during = (Shown(STEP * place, black_out),) * round(length * FRAMES_PER_SECOND)
+            back = tuple(Shown(STEP * (goal + i) + 1) for i in range(BACK_FRAMES))
+            trials.append(Trial(f"black-out of {length:g} s", place, during, back, seed + place))
+    return trials
 
 
 def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device: torch.device) -> Iterator[Outcome]:

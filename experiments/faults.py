@@ -3,8 +3,9 @@
     python -m experiments.faults --config 7scenes --data path/to/redkitchen --preset fast --trials 10 --json faults.json
 
 Faults are 30 black frames, a jump over 60 frames, 20 frames of a covered lens, and an immediate return to the start;
-each trial returns to another place (`experiments/fault_injection.py`). Exits with 1 unless the failure is flagged
-within 3 frames in every trial, and 9 of 10 trials have a pose within 3 cm within 10 frames after the return.
+each trial returns to another place (`experiments/fault_injection.py`). `--black-outs 1 3 10` tries only black-outs of
+these lengths. Exits with 1 unless the failure is flagged within 3 frames in every trial, and 9 of 10 trials have a pose
+within 3 cm within 10 frames after the return.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import torch
 
 from experiments import timing
 from experiments.arguments import add_options, add_sequence, make_parser
-from experiments.fault_injection import FLAG_WITHIN, Outcome, plan, run_trials
+from experiments.fault_injection import FLAG_WITHIN, Outcome, plan, plan_black_outs, run_trials
 from spslam.cli.arguments import frame_range
 from spslam.config import load_config
 from spslam.datasets import open_sequence
@@ -32,7 +33,10 @@ def main() -> None:
     config = load_config(args.config, args.preset, [f"device={args.device}", *args.set])
     dataset = open_sequence(config.dataset, args.data, args.frames)
     outcomes = []
-    for outcome in run_trials(config, dataset, plan(dataset, args.trials, args.seed), device):
+    trials = plan(dataset, args.trials, args.seed)
+    if args.black_outs:
+        trials = plan_black_outs(dataset, args.trials, args.seed, args.black_outs)
+    for outcome in run_trials(config, dataset, trials, device):
         outcomes.append(outcome)
         if args.verbose or not outcome.passed:
             print(describe(outcome), flush=True)
@@ -50,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=frame_range, help="START:STOP[:STEP]")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--trials", type=int, default=10, help="of each fault")
+    parser.add_argument("--black-outs", type=float, nargs="+", help="only black-outs, of so many seconds each")
     parser.add_argument("--seed", type=int, default=0, help="of the places to return to and of noise")
     add_options(parser)
     parser.add_argument("--verbose", action="store_true", help="print a line per trial")

@@ -6,8 +6,9 @@
 Every second frame of a sequence is mapped. At four places the camera is interrupted, and frames from the whole sequence
 are shown to it one by one, each as the first after the failure: some show mapped surface, others do not. Every third of
 them is shown again as a wall of one color, 0.8 to 2.7 m away, that is nowhere in the map. The script prints how many
-poses are accepted, at once or if four frames agree, with and without the check of colors. The first command measures
-one sequence, the second evaluates saved measurements.
+poses are accepted, at once or if four frames agree, with and without the check of colors, and the reliability diagram:
+the error probability stated against the share of poses that are wrong. The first command measures one sequence, the
+second evaluates saved measurements.
 """
 
 import argparse
@@ -47,6 +48,7 @@ PLACES, FIRST_PLACE = 4, 0.25  # of the sequence
 LOST_FRAMES = 6
 WALL_EVERY, NEARER_M, FARTHER_M = 3, 0.7, 1.2
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 1.0)
+RANGES = (0.005, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9)  # of the reliability diagram
 # Otherwise the pose of a lost frame would be the start.
 KEEPING = ["tracking.lost_threshold=1", "tracking.min_inlier_share=0", "tracking.relocalization_threshold=1"]
 
@@ -128,6 +130,17 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
             shares = ", ".join(f"{(error_probability[group] <= bound).sum()} below {bound:g}" for bound in bounds)
             quantiles = " ".join(f"{value:.3f}" for value in np.quantile(error_probability[group], QUANTILES))
             print(f"  error probability {how:12s} {shares}; quantiles {QUANTILES}: {quantiles}")
+    print_reliability(error_probabilities["with colors"], is_wrong | wall)
+
+
+def print_reliability(stated: np.ndarray, is_wrong: np.ndarray) -> None:
+    """Prints the reliability diagram: how many of the poses with an error probability in a range are wrong."""
+    print("| error probability | poses | mean stated | wrong |\n|---|---|---|---|")
+    for low, high in zip((0.0, *RANGES), (*RANGES, 1.0), strict=True):
+        inside = (stated >= low) & ((stated < high) | (high == 1.0))
+        if inside.any():
+            frequency, mean = is_wrong[inside].mean(), stated[inside].mean()
+            print(f"| {low:g} to {high:g} | {inside.sum()} | {mean:.3f} | {frequency:.3f} |")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -9,17 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from spslam.config import Config, read_shipped
 from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
 from spslam.slam.recovery.pose_confidence import MODEL_FILE
-from spslam.slam.state import Moments, SlamState
+from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
 from spslam.tensor_schema import CHECKPOINT
 
-FORMAT = "spslam-checkpoint-3"
+FORMAT = "spslam-checkpoint-6"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
 # The ops number iterations up to 2^30; this many leave room to continue.
 _MOST_ITERATIONS = 2**29
@@ -37,6 +38,8 @@ def fingerprint(config: Config) -> str:
     content["pose_confidence"] = read_shipped(MODEL_FILE)["constants"]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
+
+_SEGMENT = "segment."  # before the names of a segment's tensors
 
 # Rows of these are never changed once they are there, so a snapshot may share them.
 _APPENDED_ONLY = ("scene.volume.voxel_coords", "frames.depth_thumbnails", "pixels.records")
@@ -69,9 +72,13 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
         **_prefixed("frames.", state.frames.tensors()),
         **_prefixed("pixels.", {"records": state.pixels.records, "has_pixels": state.pixels.has_pixels}),
     }
+    tensors.update(_prefixed("unjoined.", _unjoined_tensors(state.unjoined)))
     tensors.update(_prefixed("noise.", state.noise.tensors()))
+    tensors.update(_prefixed("features.", state.features.tensors()))
     if state.depth_keyframes is not None:
         tensors.update(_prefixed("depth_keyframes.", state.depth_keyframes.tensors()))
+    if state.graph is not None:
+        tensors.update(_prefixed("graph.", state.graph.tensors()))
     # Moments that the next mapping call resets anyway need no place.
     if not config.mapping.reset_moments:
         for name, moments in state.moments.items():
@@ -85,8 +92,13 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
         "steps": state.steps,
         "stamp": state.stamp,
         "unmapped": state.unmapped,
+        "opened": state.frames.opened,
         "source": source,
     }
+    if state.segment is not None:
+        inner = take_snapshot(state.segment.state, config, {}, copy)
+        tensors.update(_prefixed(_SEGMENT, inner.tensors))
+        header["segment"] = {"first": state.segment.first, **inner.header}
     return Snapshot(tensors, header)
 
 
@@ -98,6 +110,12 @@ def write_snapshot(path: Path, snapshot: Snapshot) -> None:
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in snapshot.tensors.items()}
     save_tensors(path, tensors, snapshot.header)
+
+
+def read_source(path: Path) -> dict[str, Any]:
+    """The `source` object of a checkpoint, not checked; raises OutputError where there is no readable checkpoint."""
+    source = load_header(path, _FILE).get("source")
+    return source if isinstance(source, dict) else {}
 
 
 def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, Any]:
@@ -120,8 +138,11 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, A
         raise OutputError(f"{path}: belongs to a run with other options; use the same ones, or another --output")
     tensors = load_tensors(path, _FILE, _sizes(state))
     try:
-        source = _checked_source(header, len(tensors["frames.poses"]))
+        opened = whole_number(header, "opened", high=len(tensors["frames.poses"]))
+        source = _checked_source(header, len(tensors["frames.poses"]) - opened)
         _restore(state, tensors, header)
+        if "segment" in header:
+            _restore_segment(path, state, config, header["segment"])
         return source
     except (SpslamError, KeyError, TypeError, ValueError) as error:
         raise OutputError(f"{path}: a damaged checkpoint ({brief(str(error), 300)})") from None
@@ -130,10 +151,15 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, A
 def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
     state.scene.load_state_dict(_section(tensors, "scene."))
     state.frames.load_state_dict(_section(tensors, "frames."))
+    state.frames.opened = header["opened"]
     state.pixels.load_state_dict(_section(tensors, "pixels."))
+    state.unjoined = _unjoined(_section(tensors, "unjoined."), len(tensors["frames.poses"]))
     state.noise.load_state_dict(_section(tensors, "noise."))
+    state.features.load_state_dict(_section(tensors, "features."))
     if state.depth_keyframes is not None:
         state.depth_keyframes.load_state_dict(_section(tensors, "depth_keyframes."))
+    if state.graph is not None:
+        state.graph.load_state_dict(_section(tensors, "graph."))
     device = state.scene.device
     state.moments = {
         name.removesuffix(".first"): Moments.of(
@@ -146,6 +172,37 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
     if not isinstance(header.get("unmapped"), bool):
         raise ValueError(f"unmapped must be true or false, got {brief(header.get('unmapped'))}")
     state.unmapped = header["unmapped"]
+
+
+def _restore_segment(path: Path, state: SlamState, config: Config, header: Any) -> None:
+    """The segment of a state whose frames were restored; raises SpslamError or ValueError."""
+    if not isinstance(header, dict):
+        raise ValueError(f"segment must be an object, got {brief(header)}")
+    inner = SlamState.start(config, state.frames.camera, np.eye(4), None, state.scene.device)
+    tensors = load_tensors(path, _FILE, _sizes(inner), _SEGMENT)
+    first = whole_number(header, "first", high=len(state.frames))
+    if first + len(tensors["frames.poses"]) != len(state.frames):
+        raise ValueError("a segment must end with the newest frame")
+    _restore(inner, tensors, header)
+    state.segment = Segment(first, inner)
+
+
+def _unjoined_tensors(unjoined: list[UnjoinedFrames]) -> dict[str, torch.Tensor]:
+    none = UnjoinedFrames(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 7))
+    return {
+        "rows": torch.cat([each.rows for each in (none, *unjoined)]),
+        "poses": torch.cat([each.poses for each in (none, *unjoined)]),
+        "counts": torch.tensor([len(each.rows) for each in unjoined], dtype=torch.int64),
+    }
+
+
+def _unjoined(tensors: dict[str, torch.Tensor], frames: int) -> list[UnjoinedFrames]:
+    """Of a run of so many frames; raises ValueError where the tensors do not fit together."""
+    counts, rows = tensors["counts"].tolist(), tensors["rows"]
+    if sum(counts) != len(rows) or bool((rows >= frames).any()):
+        raise ValueError("unjoined.counts must add up to the unjoined frames, and these must be frames of the run")
+    parts = (tensors[name].clone().split(counts) for name in ("rows", "poses"))
+    return [UnjoinedFrames(*each) for each in zip(*parts, strict=True)]
 
 
 def _sizes(state: SlamState) -> dict[str, int]:

@@ -19,6 +19,7 @@ class DepthKeyframeStore:
         intensities: uint8 [S, h, w] in 1/255.
         frames: number of the frame that each image is of, -1 for none.
         unit: m.
+        max_depth_m: the largest depth that images hold.
     """
 
     def __init__(self, camera: Camera, max_depth_m: float, kernel_m: float, device: torch.device | str = "cpu"):
@@ -31,15 +32,14 @@ class DepthKeyframeStore:
             device: where the images are.
         """
         self.step = depth_image_step(camera)
-        self.unit = max_depth_m / UNITS
+        self.unit, self.max_depth_m = depth_unit(max_depth_m), max_depth_m
         self._kernel_m = kernel_m
         slots = 2 + max(AGES)
         rows, columns = (-(-size // self.step) for size in (camera.height, camera.width))
         self.images = torch.zeros(slots, rows, columns, dtype=torch.uint16, device=device)
         self.intensities = torch.zeros_like(self.images, dtype=torch.uint8)
         self.frames = [-1] * slots
-        fx, fy, cx, cy = (number / self.step for number in (camera.fx, camera.fy, camera.cx, camera.cy))
-        self.intrinsics = ops.Intrinsics(fx, fy, cx, cy)
+        self.intrinsics = depth_image_intrinsics(camera)
 
     def add(self, frame: int, depth: torch.Tensor, intensity: torch.Tensor) -> None:
         """Stores the images uint16 and uint8 [h, w] of frame number `frame`, asynchronously."""
@@ -85,6 +85,17 @@ class DepthKeyframeStore:
     @staticmethod
     def _slot(frame: int) -> int:
         return 1 + frame // INTERVAL % (1 + max(AGES))
+
+
+def depth_unit(max_depth_m: float) -> float:
+    """What a depth image counts depth in, m, where it holds depths up to a largest one."""
+    return max_depth_m / UNITS
+
+
+def depth_image_intrinsics(camera: Camera) -> ops.Intrinsics:
+    """Those of a camera's depth and intensity images."""
+    step = depth_image_step(camera)
+    return ops.Intrinsics(camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step)
 
 
 def depth_image_step(camera: Camera) -> int:

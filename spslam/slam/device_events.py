@@ -63,3 +63,10 @@ def event_recorder(device: torch.device) -> Callable[[], DeviceEvent]:
         return HostEvent
     stream = torch.cuda.current_stream(device)
     return lambda: StreamEvent(stream)
+
+
+def fetch(numbers: torch.Tensor) -> torch.Tensor:
+    """A copy of a tensor that is on its way to the CPU; to be read once the device is done."""
+    if numbers.device.type == "cpu":
+        return numbers.clone()
+    return torch.empty_like(numbers, device="cpu", pin_memory=True).copy_(numbers, non_blocking=True)

@@ -21,7 +21,12 @@ class Fit:
         occluded_share: share of that surface that something nearer occludes; no sign of a wrong pose.
         map_coverage: share of the last trusted frame's pixels that fall on mapped surface. Where images are small or
             points are few the map has holes, and no pose has a larger mean robust weight than this.
-        brightness_correlation: correlation of the pixels' brightness with that of the map's colors.
+        brightness_correlation: correlation of the brightness of earlier frames' points with that of the frame, where
+            it sees them.
+        feature_inliers: number of image features whose points in earlier frames lie, from the pose, within 0.33
+            degrees of where the frame shows them.
+        feature_share: of the features that agree on a pose, the share that agrees with this one; of the earlier frames
+            that they were matched with, the least. Unknown where colors are not where depth is.
     """
 
     residual_cm: float = math.nan
@@ -34,6 +39,8 @@ class Fit:
     occluded_share: float = math.nan
     map_coverage: float = math.nan
     brightness_correlation: float = math.nan
+    feature_inliers: float = math.nan
+    feature_share: float = math.nan
 
 
 def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam import ops
+from spslam.slam.image_features import ImageFeatures, features_of_images
 from spslam.slam.state import SlamState
 
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
@@ -64,10 +65,19 @@ class FrameHistory:
         """The frame in a row of the frame table."""
         return EarlierFrame(self._state.pixels.records[row], self._state.frames.poses[row])
 
+    def frames(self, rows: torch.Tensor, points: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of the frames in rows int64 [F] of the frame table: so many of their records [F, P, 3], and poses [F, 7]."""
+        return self._state.pixels.records[rows, :points], self._state.frames.poses[rows]
+
     def last(self) -> EarlierFrame | None:
         """The last frame with pixels and a trusted pose; None where there is none."""
+        row = self.last_row()
+        return None if row is None else self.frame(row)
+
+    def last_row(self) -> int | None:
+        """Row of the last frame with pixels and a trusted pose; None where there is none."""
         rows = self.usable_rows()
-        return self.frame(int(rows[-1])) if len(rows) else None
+        return int(rows[-1]) if len(rows) else None
 
     def last_mapped(self, every: int) -> tuple[int, EarlierFrame] | None:
         """The newest frame with a trusted pose that mapping took, given that it takes every n-th, and its number."""
@@ -84,14 +94,25 @@ class FrameHistory:
 
     def depth_keyframes(self) -> ops.DepthKeyframes | None:
         """Earlier images to align the next frame with; None if there is none with a trusted pose."""
-        return self.depth_keyframes_before(len(self._state.frames))
-
-    def depth_keyframes_before(self, number: int) -> ops.DepthKeyframes | None:
-        """The same of frame `number`, the next one or the last."""
         state = self._state
         if state.depth_keyframes is None:
             return None
-        return state.depth_keyframes.select(number, state.frames.lost, state.frames.poses)
+        return state.depth_keyframes.select(len(state.frames), state.frames.lost, state.frames.poses)
+
+    def features(self, row: int) -> ImageFeatures | None:
+        """Image features of the frame in a row, if they are kept or its images still are; may wait for the device."""
+        store, images = self._state.features, self._state.depth_keyframes
+        if row in store.frames:
+            return store[store.frames.index(row)]
+        if images is None or row != images.frames[0]:
+            return None
+        intensity, depth = (one[0].cpu().numpy() for one in (images.intensities, images.images))
+        return features_of_images(intensity, depth, self._state.frames.camera, images.max_depth_m)
+
+    def feature_rows(self) -> list[int]:
+        """Rows of the frames with a trusted pose whose image features are kept, ascending."""
+        usable = self._state.usable
+        return [row for row in self._state.features.frames if usable[row]]
 
     def usable_rows(self) -> torch.Tensor:
         """int64 on the CPU, ascending: frames that have pixels and a trusted pose."""

@@ -1,16 +1,23 @@
 """The report of a frame, which can be created before the device has finished the frame."""
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 
+from spslam.geometry import pose7_to_matrix
 from spslam.slam.device_events import DeviceEvent
 from spslam.slam.fit import Fit
+from spslam.slam.graph.edges import LoopDecision
+from spslam.slam.pixels import FramePixels
+from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.recovery.tracked_frame import TrackedFrame
+from spslam.slam.state import SlamState
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameReport:
     """What happened to one frame; `log_row()` is its line of log.jsonl.
 
@@ -38,6 +45,9 @@ class FrameReport:
         encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
         mapping_ms: joint optimization; 0 where there was none.
         other_ms: the rest of the time from when the frame was requested until it was done.
+        loops: what was decided before the frame on loops that the keyframe graph tried.
+        pose: float64 [4, 4] T_world_camera as it was tracked; None where the frame is lost. `SlamSystem.trajectory()`
+            has the poses as mapping may have refined them since.
     """
 
     frame: int
@@ -60,14 +70,28 @@ class FrameReport:
     encode_ms: float = 0.0
     mapping_ms: float = 0.0
     other_ms: float = 0.0
+    loops: tuple[LoopDecision, ...] = ()
+    pose: np.ndarray | None = field(default=None, compare=False)
 
     def log_row(self) -> dict[str, Any]:
-        """All fields in one flat JSON object, those of `fit` among them; None for NaN, which JSON does not know."""
-        row = asdict(self)
+        """All fields but the pose in one flat JSON object, those of `fit` among them; None for NaN, unknown to JSON."""
+        row = asdict(replace(self, pose=None))
+        del row["pose"]
+        row["loops"] = list(row["loops"])
         flat = {**row, **row.pop("fit")}
         return {
             name: None if isinstance(x, float) and math.isnan(x) else x for name, x in flat.items() if name != "fit"
         }
+
+    def __repr__(self) -> str:
+        parts = [f"frame {self.frame}", "lost" if self.lost else "tracked"]
+        if self.pose is not None:
+            parts.append("at ({:.3f}, {:.3f}, {:.3f}) m".format(*self.pose[:3, 3]))
+        if not math.isnan(self.fit.residual_cm):
+            parts.append(f"residual {self.fit.residual_cm:.2f} cm")
+        if self.mapping_iterations:
+            parts.append("mapped")
+        return f"FrameReport({', '.join(parts)})"
 
 
 @dataclass
@@ -115,12 +139,14 @@ class PendingReport:
         events: of the stages.
         host_wait_ms: how long the host waited for the frame to be read.
         loss: float32 [] in page-locked memory, on its way there; None where there is none.
+        pose: float32 [7] likewise; None where the frame is lost.
     """
 
     report: FrameReport
     events: FrameEvents
     host_wait_ms: float
     loss: torch.Tensor | None
+    pose: torch.Tensor | None = None
 
     def is_done(self) -> bool:
         """Whether `result()` would return at once."""
@@ -131,8 +157,49 @@ class PendingReport:
         self.events.finished.wait()
         loss = None if self.loss is None else float(self.loss)
         times: dict[str, Any] = {**self.events.times_ms(self.host_wait_ms)}
-        return replace(self.report, loss=loss, **times)
+        return replace(self.report, loss=loss, pose=pose_matrix(self.pose), **times)
+
+
+def pose_matrix(pose: torch.Tensor | None) -> np.ndarray | None:
+    """float64 [4, 4] of a pose float32 [7] on the CPU; None of None."""
+    return None if pose is None else pose7_to_matrix(pose.numpy().astype(np.float64))
 
 
 def _length_ms(stage: tuple[DeviceEvent, DeviceEvent] | None) -> float:
     return stage[1].ms_since(stage[0]) if stage else 0.0
+
+
+def frame_report(
+    state: SlamState,
+    frame: PreparedFrame,
+    pixels: FramePixels,
+    tracked: TrackedFrame,
+    mapping_iterations: int,
+    loops: tuple[LoopDecision, ...],
+) -> FrameReport:
+    """The report of the newest frame of a state, without the times of the device.
+
+    Args:
+        state: after the frame.
+        frame: as it came.
+        pixels: of the frame.
+        tracked: what tracking made of it.
+        mapping_iterations: made after it.
+        loops: that were decided on before it.
+    """
+    return FrameReport(
+        frame=state.frames.processed - 1,
+        index=frame.index,
+        timestamp=frame.timestamp,
+        lost=bool(state.frames.lost[-1]),
+        valid_depth_share=pixels.valid_depth_share,
+        tracking_iterations=tracked.iterations,
+        fit=tracked.fit,
+        error_probability=tracked.error_probability,
+        recovered=tracked.recovered,
+        relocalized=tracked.relocalized,
+        mapping_iterations=mapping_iterations,
+        voxels=state.scene.volume.num_voxels,
+        decode_ms=frame.decode_ms,
+        loops=loops,
+    )

@@ -1,5 +1,7 @@
 """Grows the map from new frames and optimizes it together with the poses (sections III.A, III.C, III.D)."""
 
+from dataclasses import dataclass, replace
+
 import torch
 
 from spslam import ops
@@ -12,6 +14,30 @@ from spslam.slam.encode_frame import encode_frame
 from spslam.slam.pixels import FramePixels
 from spslam.slam.render_options import render_options
 from spslam.slam.state import Moments, SlamState
+
+
+@dataclass
+class MappingTask:
+    """An optimization of the map that is made in one go or in parts; the result is the same if nothing comes between.
+
+    Attributes:
+        frames: int64 [n] rows of the frames to draw pixels from.
+        newest: number of the newest frame; keys the draws.
+        fixed_frame: row whose pose is not changed.
+        iterations: to be made in all.
+        done: made so far.
+    """
+
+    frames: torch.Tensor
+    newest: int
+    fixed_frame: int
+    iterations: int
+    done: int = 0
+
+    @property
+    def left(self) -> int:
+        """Iterations still to be made."""
+        return self.iterations - self.done
 
 
 class Mapper:
@@ -34,10 +60,7 @@ class Mapper:
         encoded = encode_frame(
             scene.volume, points, normals, self._prior(scene), self.config.prior, self.config.seed, tf32
         )
-        margin = torch.tensor([[-1.0], [1.0]]) * self.config.scene.truncation_m
-        moved = scene.planes.cover(encoded.bounds + margin)
-        if moved is not None and "texels" in state.moments:
-            state.moments["texels"].move_rows(moved, len(scene.planes.texels))
+        state.cover_planes(encoded.bounds)
 
     def _prior(self, scene: Scene) -> Prior | None:
         """The prior, on the scene's device from the first use on."""
@@ -55,30 +78,56 @@ class Mapper:
         Returns:
             float32 [5] losses of the last iteration (total, rgb, depth, free space, SDF); None where there was none.
         """
+        task = self.begin(state, iterations)
+        return None if task is None else self.advance(state, task, iterations)
+
+    def begin(self, state: SlamState, iterations: int) -> MappingTask | None:
+        """Selects frames and resets the optimizer for an optimization that `advance` makes; None if there is none."""
         if iterations == 0 or state.scene.volume.num_voxels == 0:
             return None
         if not bool(state.usable.any()):
             return None
-        frames = self._select(state)
+        return self.begin_on(state, self._select(state), iterations)
+
+    def begin_on(self, state: SlamState, frames: torch.Tensor, iterations: int) -> MappingTask:
+        """As `begin`, of an optimization over given frames, int64 [n] rows; some frame must have pixels and a pose."""
         if self.config.mapping.reset_moments:
             _reset(state)
-        config, newest = self.config, len(state.frames) - 1
+        # The first usable frame is kept fixed: it defines the world frame.
+        return MappingTask(frames, len(state.frames) - 1, int(state.usable.nonzero()[0, 0]), iterations)
+
+    def advance(self, state: SlamState, task: MappingTask, iterations: int) -> torch.Tensor:
+        """Makes the next iterations of a task.
+
+        Args:
+            state: changed in place. Frames may have been added since the task began, but not vertices of the map.
+            task: its progress is kept up to date.
+            iterations: at least 1 and at most what is left.
+
+        Returns:
+            float32 [5] losses of the last iteration, as `optimize`.
+        """
+        config = self.config
+        options = replace(
+            render_options(config, ops.RandomStream.MAPPING_RAYS, task.newest),
+            iteration=task.done,
+        )
         losses = ops.optimize_map_(
             state.scene.view(),
             state.pixels.records,
             state.frames.poses,
-            frames,
+            task.frames,
             self.intrinsics,
-            render_options(config, ops.RandomStream.MAPPING_RAYS, newest),
+            options,
             self._moments(state),
             num_pixels=config.mapping.pixels,
             iterations=iterations,
-            # The first usable frame is kept fixed: it defines the world frame.
-            fixed_frame=int(state.usable.nonzero()[0, 0]),
+            fixed_frame=task.fixed_frame,
             first_step=state.steps + 1,
             first_stamp=state.stamp + 1,
             graph=self._graph,
         )
+        task.done += iterations
         state.steps += iterations
         state.stamp += iterations
         return losses[-1]

@@ -1,11 +1,15 @@
 """Pixels of all processed frames, within a memory budget (section III.D)."""
 
+import numpy as np
 import torch
 
 from spslam.errors import SpslamError
 
 RECORD_BYTES = 12
+RECORD_WORDS = 3
 MIN_PIXELS_PER_FRAME = 64
+_FIRST_CAPACITY = 16  # frames
+_FRAMES_AT_ONCE = 64  # moved while thinning
 
 
 class PixelDatabase:
@@ -13,6 +17,9 @@ class PixelDatabase:
 
     When the budget is reached, every frame's pixels are thinned to the same smaller number: as records lie in random
     order, keeping a prefix keeps an even sample. So memory does not grow past the budget, while frames do.
+
+    On the CPU addresses for the budget are reserved at once, and memory comes as records are written: adding
+    a frame never moves the others, for which a live camera would not wait. Thinning moves them within that memory.
 
     Attributes:
         pixels_per_frame: P, what each frame holds now.
@@ -40,13 +47,13 @@ class PixelDatabase:
                 f"pixels.budget_mb must hold at least one frame of {pixels_per_frame} pixels "
                 f"({pixels_per_frame * RECORD_BYTES / 2**20:.2f} MB), got {budget_mb}"
             )
-        self._storage = torch.zeros(0, pixels_per_frame, 3, dtype=torch.int32, device=device)
+        self._words = torch.zeros(0, dtype=torch.int32, device=device)
         self._has_pixels = torch.zeros(0, dtype=torch.bool)
 
     @property
     def records(self) -> torch.Tensor:
         """int32 [F, P, 3]."""
-        return self._storage[: self.num_frames]
+        return self._words[: self.num_frames * self._words_per_frame].view(-1, self.pixels_per_frame, RECORD_WORDS)
 
     @property
     def has_pixels(self) -> torch.Tensor:
@@ -55,8 +62,12 @@ class PixelDatabase:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
-        return self._storage.numel() * 4
+        """Bytes of all records."""
+        return 4 * self.num_frames * self._words_per_frame
+
+    @property
+    def _words_per_frame(self) -> int:
+        return self.pixels_per_frame * RECORD_WORDS
 
     def add(self, records: torch.Tensor) -> None:
         """Appends a frame.
@@ -70,11 +81,13 @@ class PixelDatabase:
         if newest > 0 and newest % self.keyframe_every:
             self._has_pixels[newest] = False
         count = self.pixels_per_frame
+        self.num_frames += 1
         if len(records):
             repeated = records.repeat(-(-count // len(records)), 1) if len(records) < count else records
-            self._storage[self.num_frames].copy_(repeated[:count], non_blocking=True)
-        self._has_pixels[self.num_frames] = len(records) > 0
-        self.num_frames += 1
+            self.records[-1].copy_(repeated[:count], non_blocking=True)
+        else:
+            self.records[-1].zero_()
+        self._has_pixels[self.num_frames - 1] = len(records) > 0
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The content, on the CPU; views where it is there already."""
@@ -84,27 +97,63 @@ class PixelDatabase:
         """Replaces the content by that of `state_dict()`."""
         records = state["records"]
         self.num_frames, self.pixels_per_frame = records.shape[0], records.shape[1]
-        self._storage = records.to(self._storage.device, copy=True)
+        self._words = records.to(self._words.device, copy=True).view(-1)
         self._has_pixels = state["has_pixels"].clone()
 
     def _reserve(self, frames: int) -> None:
-        if frames <= len(self._storage):
+        """Makes room for so many frames, thinning all of them if the budget requires it."""
+        if frames > len(self._has_pixels):
+            flags = torch.zeros(max(frames, _FIRST_CAPACITY, 2 * len(self._has_pixels)), dtype=torch.bool)
+            flags[: self.num_frames] = self.has_pixels
+            self._has_pixels = flags
+        if frames * self._words_per_frame <= len(self._words):
             return
-        capacity = max(frames, 16, 2 * len(self._storage))
-        while capacity * self.pixels_per_frame * RECORD_BYTES > self.budget_bytes:
-            affordable = self.budget_bytes // (self.pixels_per_frame * RECORD_BYTES)
-            if affordable >= frames:  # the budget holds what is needed, only not the spare capacity
-                capacity = affordable
-                break
-            if self.pixels_per_frame // 2 < MIN_PIXELS_PER_FRAME:
+        pixels = self._affordable_pixels(frames)
+        if pixels < self.pixels_per_frame and len(self._words) == self._budget_words:
+            self._thin_in_place(pixels)
+        else:
+            self._move(frames, pixels)
+
+    def _affordable_pixels(self, frames: int) -> int:
+        """P halved until the budget holds so many frames; raises SpslamError where it can't."""
+        pixels = self.pixels_per_frame
+        while frames * pixels * RECORD_BYTES > self.budget_bytes:
+            if pixels // 2 < MIN_PIXELS_PER_FRAME:
                 raise SpslamError(
                     f"pixels.budget_mb of {self.budget_bytes / 2**20:.0f} cannot hold {frames} frames of "
                     f"{MIN_PIXELS_PER_FRAME} pixels; raise it"
                 )
-            self.pixels_per_frame //= 2
-        grown = torch.zeros(capacity, self.pixels_per_frame, 3, dtype=torch.int32, device=self._storage.device)
-        grown[: self.num_frames] = self._storage[: self.num_frames, : self.pixels_per_frame]
-        self._storage = grown
-        flags = torch.zeros(capacity, dtype=torch.bool)
-        flags[: self.num_frames] = self._has_pixels[: self.num_frames]
-        self._has_pixels = flags
+            pixels //= 2
+        return pixels
+
+    @property
+    def _budget_words(self) -> int | None:
+        """Length of the buffer that holds the whole budget; None on a GPU, where a snapshot may share the buffer."""
+        return self.budget_bytes // 4 if self._words.device.type == "cpu" else None
+
+    def _thin_in_place(self, pixels: int) -> None:
+        for first in range(0, self.num_frames, _FRAMES_AT_ONCE):
+            kept = self.records[first : first + _FRAMES_AT_ONCE, :pixels].reshape(-1)
+            begin = first * pixels * RECORD_WORDS
+            self._words[begin : begin + len(kept)] = kept.clone()
+        self.pixels_per_frame = pixels
+
+    def _move(self, frames: int, pixels: int) -> None:
+        """Brings the first `pixels` records of every frame to a larger buffer."""
+        kept, self.pixels_per_frame = self.records[:, :pixels], pixels
+        affordable = self.budget_bytes // (pixels * RECORD_BYTES)
+        grown = self._reserved_budget()
+        if grown is None:
+            capacity = min(max(frames, _FIRST_CAPACITY, 2 * self.num_frames), affordable)
+            grown = torch.zeros(capacity * self._words_per_frame, dtype=torch.int32, device=self._words.device)
+        grown[: kept.numel()].view(kept.shape).copy_(kept)
+        self._words = grown
+
+    def _reserved_budget(self) -> torch.Tensor | None:
+        """Zeros that take memory only where they are written; None on a GPU and where the system refuses so many."""
+        if self._budget_words is None:
+            return None
+        try:
+            return torch.from_numpy(np.zeros(self._budget_words, dtype=np.int32))
+        except MemoryError:
+            return None

@@ -15,7 +15,7 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
-from spslam.slam.depth_keyframes import UNITS, depth_image_step
+from spslam.slam.depth_keyframes import depth_image_step, depth_unit
 
 THUMBNAIL_STEP_PX = 16
 
@@ -137,8 +137,8 @@ def _sampling(camera: Camera, config: Config) -> ops.PixelSampling:
         step_px=config.prior.normal_step_px,
         max_jump=config.prior.max_jump,
         thumbnail_step=THUMBNAIL_STEP_PX,
-        depth_image_step=depth_image_step(camera) if config.tracking.depth_keyframes else 0,
-        depth_image_unit=config.dataset.max_depth_m / UNITS,
+        depth_image_step=depth_image_step(camera),
+        depth_image_unit=depth_unit(config.dataset.max_depth_m),
     )
 
 

@@ -2,11 +2,15 @@
 
 import time
 from dataclasses import dataclass
+from typing import cast
 
+from spslam.camera import Camera
 from spslam.config import Config
-from spslam.datasets.base import RgbdDataset
+from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.slam.device_events import DeviceEvent
+from spslam.slam.feature_store import keeps_features
+from spslam.slam.image_features import ImageFeatures, extract_features
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.upload import Upload, Uploader
 
@@ -23,6 +27,8 @@ class PreparedFrame:
         wait_ms: how long the host waited for the frame.
         requested: when it was requested; None where nobody kept the time.
         signature: what tells frozen depth; None where nobody asks.
+        features: of its image, where they are kept in any case and were extracted ahead; else this is done once the
+            pose is known.
     """
 
     index: int
@@ -32,10 +38,21 @@ class PreparedFrame:
     wait_ms: float = 0.0
     requested: DeviceEvent | None = None
     signature: FrameSignature | None = None
+    features: ImageFeatures | None = None
+
+    @classmethod
+    def of(cls, frame: RgbdFrame, camera: Camera, config: Config) -> "PreparedFrame":
+        """Samples a frame of color, depth and time stamp, of pinhole intrinsics, for a run of a configuration."""
+        began = time.perf_counter()
+        pixels = sample_frame(frame, camera, config)
+        return cls(frame.index, frame.timestamp, pixels, 1e3 * (time.perf_counter() - began))
 
 
 class FramePreparation:
-    """The frames of a dataset from a position on, each read, decoded, sampled and, with an uploader, sent off."""
+    """The frames of a dataset from a position on, each read, decoded, sampled and, with an uploader, sent off.
+
+    Image features that are kept in any case are extracted too.
+    """
 
     def __init__(self, dataset: RgbdDataset, config: Config, start: int = 0, uploader: Uploader | None = None):
         self._dataset, self._config, self._start, self._uploader = dataset, config, start, uploader
@@ -45,9 +62,13 @@ class FramePreparation:
 
     def __getitem__(self, i: int) -> PreparedFrame:
         began = time.perf_counter()
-        frame = self._dataset[i + self._start]
-        pixels = sample_frame(frame, self._dataset.camera, self._config)
-        signature = FrameSignature.of(frame)
-        decode_ms = 1e3 * (time.perf_counter() - began)
-        sent = self._uploader.send(pixels) if self._uploader else pixels
-        return PreparedFrame(frame.index, frame.timestamp, sent, decode_ms, signature=signature)
+        frame, config = self._dataset[i + self._start], self._config
+        prepared = PreparedFrame.of(frame, self._dataset.camera, config)
+        if keeps_features(config, i + self._start):
+            pixels = cast(FramePixels, prepared.pixels)
+            prepared.features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
+        prepared.signature = FrameSignature.of(frame)
+        prepared.decode_ms = 1e3 * (time.perf_counter() - began)
+        if self._uploader:
+            prepared.pixels = self._uploader.send(cast(FramePixels, prepared.pixels))
+        return prepared

@@ -11,7 +11,7 @@ def render_options(config: Config, stream: ops.RandomStream, frame: int) -> ops.
         num_surface=config.sampling.surface,
         near=config.sampling.near,
         far=config.sampling.far,
-        truncation=config.scene.truncation_m,
+        truncation=config.scene.truncation,
         cosine_targets=config.loss.cosine_targets,
         weight_rgb=config.loss.rgb,
         weight_depth=config.loss.depth,

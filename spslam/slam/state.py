@@ -1,5 +1,7 @@
 """The system's whole state, as one explicit object that can be checkpointed."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,8 +13,11 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.geometry import pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
-from spslam.scene.sparse_volume import resize_rows
+from spslam.scene.sparse_volume import SparseVolume, resize_rows
 from spslam.slam.depth_keyframes import DepthKeyframeStore
+from spslam.slam.feature_store import FeatureStore
+from spslam.slam.graph.keyframe import KeyframeCamera
+from spslam.slam.graph.keyframe_store import KeyframeStore
 from spslam.slam.pixel_database import PixelDatabase
 from spslam.slam.pixels import THUMBNAIL_STEP_PX
 from spslam.slam.sensor_noise import SensorNoiseEstimate
@@ -28,6 +33,7 @@ class FrameTable:
 
     Attributes:
         camera: of all frames.
+        opened: how many rows at the begin came with an opened map: its keyframes.
     """
 
     def __init__(self, camera: Camera, device: torch.device | str = "cpu"):
@@ -36,6 +42,7 @@ class FrameTable:
         rows = len(range(offset, camera.height, THUMBNAIL_STEP_PX))
         columns = len(range(offset, camera.width, THUMBNAIL_STEP_PX))
         self.camera = camera
+        self.opened = 0
         self._count = 0
         self._columns = {
             "poses": torch.zeros(0, 7, device=device),
@@ -75,6 +82,16 @@ class FrameTable:
     def depth_thumbnails(self) -> torch.Tensor:
         """float16 [F, h, w] depth thumbnails (m), on the device."""
         return self._columns["depth_thumbnails"][: self._count]
+
+    @property
+    def processed(self) -> int:
+        """How many frames were processed: all rows but those that came with an opened map."""
+        return self._count - self.opened
+
+    @property
+    def is_anywhere(self) -> bool:
+        """Whether a map was opened in which no frame was found yet."""
+        return self.opened > 0 and bool(self.lost[self.opened :].all())
 
     def append(
         self,
@@ -134,12 +151,12 @@ class Moments:
     stamps: torch.Tensor
 
     @classmethod
-    def like(cls, parameter: torch.Tensor) -> "Moments":
+    def like(cls, parameter: torch.Tensor) -> Moments:
         """Zero moments for a parameter [rows, columns]."""
         return cls.of(torch.zeros_like(parameter), torch.zeros_like(parameter))
 
     @classmethod
-    def of(cls, first: torch.Tensor, second: torch.Tensor) -> "Moments":
+    def of(cls, first: torch.Tensor, second: torch.Tensor) -> Moments:
         """The given moments, between two iterations."""
         stamps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
         return cls(first, second, ops.new_gradient_sums(first), stamps)
@@ -175,6 +192,32 @@ class Moments:
 
 
 @dataclass
+class Segment:
+    """A map that was begun while the camera is lost; see `spslam.slam.segments`.
+
+    Attributes:
+        first: number of the frame that is its first one.
+        state: of its system. Every frame from `first` on is one of its frames too.
+    """
+
+    first: int
+    state: SlamState
+
+
+@dataclass(frozen=True)
+class UnjoinedFrames:
+    """Frames of a segment of which it is not known where it lies.
+
+    Attributes:
+        rows: int64 [F] numbers of the frames.
+        poses: float32 [F, 7] in the axes of the segment's first frame, on the CPU.
+    """
+
+    rows: torch.Tensor
+    poses: torch.Tensor
+
+
+@dataclass
 class SlamState:
     """Everything the system knows between two frames.
 
@@ -184,10 +227,14 @@ class SlamState:
         pixels: pixel records of every frame.
         noise: of the sensor.
         depth_keyframes: images of some earlier frames; None where tracking does not use them.
+        features: image features of some earlier frames; none where tracking does not use them.
+        graph: keyframes and what was measured between them; None where there is no keyframe graph.
         moments: optimizer state by parameter name.
         steps: Adam steps since the moments were last reset.
         stamp: number of mapping iterations ever done; marks rows touched by the current one.
         unmapped: whether frames came since the map was last optimized.
+        segment: the map of a lost camera; None where there is none.
+        unjoined: frames of segments that ended before it was known where they lie.
     """
 
     scene: Scene
@@ -195,10 +242,14 @@ class SlamState:
     pixels: PixelDatabase
     noise: SensorNoiseEstimate
     depth_keyframes: DepthKeyframeStore | None = None
+    features: FeatureStore = field(default_factory=FeatureStore)
+    graph: KeyframeStore | None = None
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
     stamp: int = 0
     unmapped: bool = False
+    segment: Segment | None = None
+    unjoined: list[UnjoinedFrames] = field(default_factory=list)
 
     @property
     def usable(self) -> torch.Tensor:
@@ -213,11 +264,11 @@ class SlamState:
         first_pose: np.ndarray,
         geometry_decoder: torch.Tensor | None,
         device: torch.device,
-    ) -> "SlamState":
+    ) -> SlamState:
         """The state before the first frame, which will be at `first_pose` (float64 [4, 4])."""
         settings = SceneSettings(
             voxel_size_m=config.scene.voxel_size_m,
-            truncation_m=config.scene.truncation_m,
+            truncation_m=config.scene.truncation,
             plane_cell_m=config.scene.plane_cell_m,
             position_scale=config.scene.position_scale,
             max_voxels=config.scene.max_voxels,
@@ -231,4 +282,30 @@ class SlamState:
         if tracking.depth_keyframes:
             depth_keyframes = DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
         noise = SensorNoiseEstimate(camera, tracking.depth_noise_m, device)
-        return cls(scene, FrameTable(camera, device), pixels, noise, depth_keyframes)
+        graph = None
+        if config.graph.enabled and config.prior.enabled:
+            prior = config.prior
+            graph = KeyframeStore(KeyframeCamera.of(camera, depth_m, prior.normal_step_px, prior.max_jump))
+        return cls(scene, FrameTable(camera, device), pixels, noise, depth_keyframes, graph=graph)
+
+    def has_enough_features(self, number: int) -> bool:
+        """Whether features of enough frames are kept that stand close to where frame `number` stands."""
+        rows = [*self.features.frames, number]
+        poses = pose7_to_matrix(self.frames.poses[rows].cpu().numpy().astype(np.float64))
+        return self.features.has_enough(poses[:-1], poses[-1])
+
+    def replace_volume(self, volume: SparseVolume) -> None:
+        """Puts another volume in the place of the scene's; the planes stay, and grow to cover it."""
+        self.scene.volume = volume
+        self.moments.pop("embeddings", None)
+        if volume.num_voxels == 0:
+            return
+        corners = torch.stack([volume.voxel_coords.amin(0), volume.voxel_coords.amax(0)]).cpu()
+        self.cover_planes(corners * volume.voxel_size_m)
+
+    def cover_planes(self, bounds: torch.Tensor) -> None:
+        """Grows the planes to cover surface within bounds float32 [2, 3], and what optimizes them with them."""
+        margin = torch.tensor([[-1.0], [1.0]]) * self.scene.settings.truncation_m
+        moved = self.scene.planes.cover(bounds + margin)
+        if moved is not None and "texels" in self.moments:
+            self.moments["texels"].move_rows(moved, len(self.scene.planes.texels))

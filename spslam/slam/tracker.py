@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from spslam import ops
@@ -13,6 +14,9 @@ from spslam.slam.constraints import Constraints
 from spslam.slam.fit import Fit, min_eigenvalue, prediction_error
 from spslam.slam.render_options import render_options
 from spslam.slam.state import FrameTable
+
+INDEPENDENT_PIXELS = 300  # as many a frame's pixels are worth: the map's errors are alike for neighbors
+LEAST_DEVIATION_M = 0.003  # of a pixel
 
 
 @dataclass(frozen=True)
@@ -42,11 +46,16 @@ class PoseEstimate:
         pose: float32 [7].
         iterations: how many were made.
         fit: how well it fits.
+        information: float64 [6, 6], inverse covariance of (translation m, rotation rad about the camera's center) in
+            world axes, as surface alone determines the pose.
+        numbers: of the pose, read with its fit; None where they were not.
     """
 
     pose: torch.Tensor
     iterations: int
     fit: Fit
+    information: np.ndarray
+    numbers: tuple[float, ...] | None = None
 
 
 class Tracker:
@@ -66,7 +75,7 @@ class Tracker:
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """The next pose at constant velocity, float32 [7]; the last pose after one frame only, or a lost one."""
-        if len(frames) < 2 or bool(frames.lost[-2:].any()):
+        if frames.processed < 2 or bool(frames.lost[-2:].any()):
             return frames.poses[-1].clone()
         return ops.predict_pose(frames.poses[-2], frames.poses[-1])
 
@@ -99,8 +108,12 @@ class Tracker:
             graph=self._graph,
         )
         # A pose that looks away from the map has no loss either, so its fit to the surface is measured all the same.
-        fitted = self._gauss_newton(problem, best, 1, tracking.kernel_end_m)
-        return replace(fitted, pose=best, iterations=iterations)
+        return replace(self.measure(problem, best), iterations=iterations)
+
+    def measure(self, problem: TrackingProblem, pose: torch.Tensor) -> PoseEstimate:
+        """How well a given pose float32 [7] fits."""
+        estimate = self._gauss_newton(problem, pose, 1, self.config.tracking.kernel_end_m)
+        return replace(estimate, pose=pose, iterations=0, numbers=None)
 
     def _gauss_newton(
         self, problem: TrackingProblem, start: torch.Tensor, iterations: int, kernel_start_m: float
@@ -140,4 +153,6 @@ class Tracker:
             prediction_error_cm=error_cm,
             prediction_error_deg=error_deg,
         )
-        return PoseEstimate(pose, iterations, fit)
+        variance = max(mean_square, LEAST_DEVIATION_M**2) * tracking.pixels / INDEPENDENT_PIXELS
+        information = np.array(numbers[19:]).reshape(6, 6) / variance
+        return PoseEstimate(pose, iterations, fit, information, tuple(numbers[7:14]))

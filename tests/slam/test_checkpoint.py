@@ -157,3 +157,25 @@ def test_fewer_moments_than_texels_are_refused(load):
 )
 def test_a_header_out_of_range_is_refused(load, change, message):
     refused(load, lambda _, header: change(header), message)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "segment", "message"),
+    [
+        ({"unjoined.counts": [3]}, None, "unjoined.counts must add up"),
+        (
+            {"unjoined.counts": [1], "unjoined.rows": [2], "unjoined.poses": [[1.0, 0, 0, 0, 0, 0, 0]]},
+            None,
+            "frames of",
+        ),
+        ({}, "x", "segment must be an object, got"),
+        ({}, {"first": 1}, "tensor scene.origin is missing"),
+    ],
+)
+def test_segments_that_can_not_be_are_refused(load, tensors, segment, message):
+    def change(known, header):
+        known.update({name: torch.tensor(value) for name, value in tensors.items()})
+        if segment is not None:
+            header["segment"] = segment
+
+    refused(load, change, message)

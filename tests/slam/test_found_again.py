@@ -7,7 +7,8 @@ import torch
 
 from spslam.slam.fit import Fit
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
-from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery, TrackedFrame
+from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery
+from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import Tracker
 from tests.system.sequences import Recorded, settings
 

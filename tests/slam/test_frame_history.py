@@ -127,7 +127,7 @@ def free_space_violation(history, pixels, pose, camera):
     vertices, _, intrinsics = surface_maps(pixels, camera)
     rows = history.compared_rows()
     known = history.poses[rows], history.depth_thumbnails[rows]
-    counts = surface_counts(vertices, intrinsics, pose, *known, camera)
+    counts, _ = surface_counts(vertices, intrinsics, pose, *known, camera)
     return surface_shares(*counts.tolist(), UNKNOWN_SHARE)
 
 
@@ -175,7 +175,7 @@ def test_counts_by_the_formula(dataset, pixels, device):
             counts[0] += abs(behind) < tolerance
             counts[1] += behind > 1.5 * tolerance
             counts[2] += behind < -1.5 * tolerance
-    found = surface_counts(
+    found, best = surface_counts(
         vertices.to(device),
         k,
         pose_tensor(pose, device),
@@ -184,6 +184,7 @@ def test_counts_by_the_formula(dataset, pixels, device):
         camera,
     )
     assert min(counts) > 2
+    assert sorted(best.tolist()) == list(range(len(rows)))
     # Single precision moves a point or two over a cell's edge.
     np.testing.assert_allclose(found.tolist(), counts, atol=2)
 
@@ -192,6 +193,6 @@ def test_conflict_of_nothing_is_none(dataset, pixels):
     pose = pose_tensor(np.eye(4), CPU)
     vertices, _, k = surface_maps(pixels[0], dataset.camera)
     depth_thumbnails = pixels[0].depth_thumbnail[None]
-    assert not surface_counts(0 * vertices, k, pose, pose[None], depth_thumbnails, dataset.camera).any()
-    assert not surface_counts(vertices, k, pose, pose[None], 0 * depth_thumbnails, dataset.camera).any()
-    assert not surface_counts(vertices, k, pose, pose[None][:0], depth_thumbnails[:0], dataset.camera).any()
+    assert not surface_counts(0 * vertices, k, pose, pose[None], depth_thumbnails, dataset.camera)[0].any()
+    assert not surface_counts(vertices, k, pose, pose[None], 0 * depth_thumbnails, dataset.camera)[0].any()
+    assert not surface_counts(vertices, k, pose, pose[None][:0], depth_thumbnails[:0], dataset.camera)[0].any()

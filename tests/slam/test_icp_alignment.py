@@ -107,6 +107,9 @@ class Elsewhere(FrameHistory):
     def frame(self, row):
         return EarlierFrame(self._state.pixels.records[row], moved(np.eye(4), 50.0, 90.0))
 
+    def features(self, row):
+        return None
+
 
 def test_what_cannot_be_recovered_stays_lost(dataset, system, pixels):
     """The view of another place: no start helps."""

@@ -94,3 +94,25 @@ def test_a_budget_too_small_is_refused():
     with pytest.raises(SpslamError, match="cannot hold 4 frames of 64 pixels; raise it"):
         database.add(frame(3, 64))
     assert database.num_frames == 3
+
+
+def test_adding_a_frame_moves_no_other_and_thinning_none_out_of_its_memory():
+    database = PixelDatabase(256, budget_mb(200, 256))
+    database.add(frame(0, 256))
+    place = database.records.data_ptr()
+    for number in range(1, 450):
+        database.add(frame(number, 256))
+        assert database.records.data_ptr() == place
+    assert database.pixels_per_frame == 64
+    assert torch.equal(database.records[449], frame(449, 64))
+
+
+def test_without_room_for_the_whole_budget_memory_grows_with_the_frames(monkeypatch):
+    whole, growing = PixelDatabase(256, budget_mb(20, 256)), PixelDatabase(256, budget_mb(20, 256))
+    monkeypatch.setattr(PixelDatabase, "_reserved_budget", lambda self: None)
+    for number in range(50):
+        growing.add(frame(number, 256 if number % 3 else 0))
+    monkeypatch.undo()
+    for number in range(50):
+        whole.add(frame(number, 256 if number % 3 else 0))
+    assert torch.equal(whole.records, growing.records)

@@ -57,7 +57,7 @@ def test_the_robust_weight_is_scaled_by_map_coverage():
 
 
 def test_the_correlation_of_right_poses_makes_no_difference():
-    for brightness_correlation in (0.26, 0.9, math.nan):
+    for brightness_correlation in (0.71, 0.9, math.nan):
         assert error_probability(GOOD, brightness_correlation=brightness_correlation) == error_probability(GOOD)
     # A plain surface before the camera that fits a wall.
     wall = Fit(1.0, 0.95, 0.8, 0.002, math.nan, math.nan, 0.002)

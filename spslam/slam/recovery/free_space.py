@@ -35,7 +35,7 @@ def surface_counts(
     poses: torch.Tensor,
     depth_thumbnails: torch.Tensor,
     camera: Camera,
-) -> torch.Tensor:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """How many surface points of other frames a frame sees, looks through, and has occluded by something nearer.
 
     Points are counted in the `BEST_FRAMES` that share most surface with it.
@@ -49,7 +49,8 @@ def surface_counts(
         camera: of all frames.
 
     Returns:
-        int64 [3] on the device; zeros where nothing is known. For `surface_shares`.
+        int64 [3] on the device; zeros where nothing is known. For `surface_shares`. And int64 [min(F, 8)], the frames
+        that were counted, those that share most surface first.
     """
     points, known = _thumbnail_points(depth_thumbnails, camera)
     x, y, z = _in_camera(points, poses, pose).unbind(-1)
@@ -64,7 +65,7 @@ def surface_counts(
     kinds = torch.stack([behind.abs() < 1, behind > CLEAR_TOLERANCES, behind < -CLEAR_TOLERANCES]) & (depth > 0)
     counts = kinds.sum(2)
     best = (counts[0] + counts[1]).argsort(descending=True, stable=True)[:BEST_FRAMES]
-    return counts[:, best].sum(1)
+    return counts[:, best].sum(1), best
 
 
 def _thumbnail_points(depth_thumbnails: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:

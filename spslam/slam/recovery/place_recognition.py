@@ -1,4 +1,4 @@
-"""Place recognition: earlier frames with a similar depth thumbnail, as candidates for relocalization."""
+"""Place recognition: earlier frames with a similar depth thumbnail or the same image features."""
 
 import math
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from spslam.camera import Camera
 from spslam.geometry import compose, matrix_to_pose7, pose7_to_matrix
 from spslam.slam.frame_history import EarlierFrame, FrameHistory
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, FramePixels
+from spslam.slam.recovery.feature_alignment import FeatureAlignment
 
 # Difference per cell: of the log depths, at most the first; the second where only one thumbnail has depth.
 MAX_LOG_DIFFERENCE, ONE_SIDED_DIFFERENCE = 0.3, 0.15
@@ -19,6 +20,10 @@ TURNED_CANDIDATES = 32  # the best are also compared as if the camera had turned
 TURN_COLUMNS, TURN_ROWS = 0.15, 0.2  # share of the image by which it may have turned, or twice that to the side
 MIN_OVERLAP = 0.4  # share of an image that must remain to be compared
 MIN_DEPTH_M = 0.05
+# Of a frame's image features those of so many stored frames are compared: the newest, and others in turn, so that
+# while a camera is lost all are.
+NEWEST_COMPARED, OTHERS_COMPARED = 16, 32
+MATCHED = 3  # of these, the most alike are matched with all features
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,23 @@ def retrieve(history: FrameHistory, pixels: FramePixels, count: int, camera: Cam
         RelocalizationCandidate(earlier, turned(earlier.pose, shift, camera))
         for earlier, shift in zip(frames, turns, strict=True)
     ]
+
+
+def retrieve_by_features(history: FrameHistory, image: FeatureAlignment, frame: int) -> list[int]:
+    """Rows of stored frames with the most image features of a frame, best first, at most `MATCHED`.
+
+    Args:
+        history: the frames before.
+        image: the frame's features.
+        frame: number of the frame; decides which of many stored frames are compared.
+    """
+    rows = history.feature_rows()
+    newest, others = rows[-NEWEST_COMPARED:], rows[:-NEWEST_COMPARED]
+    begin = frame * OTHERS_COMPARED % max(len(others), 1)
+    compared = [*newest, *[*others, *others][begin : begin + min(OTHERS_COMPARED, len(others))]]
+    alike = [(features, row) for row in compared if (features := history.features(row)) is not None]
+    counts = [(image.likeness(features), row) for features, row in alike]
+    return [row for count, row in sorted(counts, reverse=True)[:MATCHED] if count]
 
 
 def thumbnail_difference(depth_thumbnail: torch.Tensor, others: torch.Tensor) -> torch.Tensor:

@@ -35,6 +35,7 @@ class PoseConfidenceModel:
         expected_map_coverage: map coverage below which the mean robust weight is scaled up.
         min_brightness_correlation: minimum of correct poses.
         max_occluded_share: above it the frame is occluded.
+        min_feature_inliers: with as many the pose is known without the motion model.
     """
 
     intercept: float
@@ -55,6 +56,9 @@ class PoseConfidenceModel:
     expected_map_coverage: float
     min_brightness_correlation: float
     max_occluded_share: float
+    min_feature_inliers: float
+    per_missing_feature_share: float
+    min_feature_share: float
 
     @classmethod
     def load(cls) -> "PoseConfidenceModel":
@@ -83,6 +87,7 @@ class PoseConfidenceModel:
             + self.per_prediction_error * self._prediction_error(fit)
             + self.per_free_space_violation * min(violation, self.max_free_space_violation)
             + self.per_missing_correlation * self._missing_correlation(fit)
+            + self.per_missing_feature_share * self._missing_feature_share(fit)
         )
         return 1 / (1 + math.exp(-ln_odds))
 
@@ -106,9 +111,17 @@ class PoseConfidenceModel:
             fit.prediction_error_cm / self.prediction_error_scale_cm
             + fit.prediction_error_deg / self.prediction_error_scale_deg
         )
-        return self.unknown_prediction_error if math.isnan(error) else error
+        if math.isnan(error):
+            return self.unknown_prediction_error
+        # Features that agree with the pose say nothing of the motion model, which may then be wrong.
+        is_confirmed = fit.feature_inliers >= self.min_feature_inliers
+        return min(error, self.unknown_prediction_error) if is_confirmed else error
 
     def _missing_correlation(self, fit: Fit) -> float:
         if math.isnan(fit.brightness_correlation):
             return 0.0
         return max(self.min_brightness_correlation - fit.brightness_correlation, 0.0)
+
+    def _missing_feature_share(self, fit: Fit) -> float:
+        share = fit.feature_share
+        return 0.0 if math.isnan(share) else max(self.min_feature_share - share, 0.0)

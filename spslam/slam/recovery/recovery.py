@@ -1,18 +1,21 @@
 """Decides whether a tracked pose is trusted, and looks for a better one where it is not."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
+from spslam.slam.image_features import extract_features
 from spslam.slam.pixels import FramePixels
+from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
+from spslam.slam.recovery.feature_alignment import FeatureAlignment
 from spslam.slam.recovery.icp_alignment import IcpAlignment
-from spslam.slam.recovery.place_recognition import retrieve
+from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.recovery.verifier import Verifier
 from spslam.slam.tracker import PoseEstimate, Tracker, TrackingProblem
 
@@ -21,41 +24,12 @@ CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one of th
 LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
 LIKELY_MIN_EIGENVALUE = 0.004  # of each of them at least: poses that slide along a plane are consistent too
 OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
+ANCHORS = 2  # stored frames that hold a pose beside the last one
+WEAK_EIGENVALUE = 0.0015  # below it surface leaves a direction almost free
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight; smaller differences come from the random choice of pixels
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """A frame's pose and whether it is trusted.
-
-    Attributes:
-        pose: float32 [7]; where the frame is lost, a likely pose, the last trusted or the predicted one.
-        iterations: of tracking, summed over all initial poses.
-        fit: of the pose found, also where it is not trusted.
-        error_probability: that the pose is wrong; NaN where it was not tracked.
-        lost: whether the pose is not trusted.
-        occluded: whether something that is not part of the scene is in front of the camera.
-        recovered: whether the pose was tracked from an initial pose that ICP found.
-        relocalized: whether ICP found it against a stored frame that looks alike.
-        consistent_frames: how many lost frames up to this one had likely poses that are consistent; `pose` is the
-            last of them.
-    """
-
-    pose: torch.Tensor
-    iterations: int
-    fit: Fit
-    error_probability: float
-    lost: bool
-    occluded: bool = False
-    recovered: bool = False
-    relocalized: bool = False
-    consistent_frames: int = 0
-
-    @classmethod
-    def untracked(cls, pose: torch.Tensor, lost: bool) -> "TrackedFrame":
-        """A frame at a given pose, of which nothing was measured."""
-        return cls(pose, 0, Fit(), math.nan, lost)
+MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
+MAX_VERIFIED = 4  # poses of a frame
 
 
 class Recovery:
@@ -74,7 +48,16 @@ class Recovery:
 
     def judge(self, estimate: PoseEstimate) -> TrackedFrame:
         """The estimate, trusted or not by its fit alone."""
-        return self._judged(TrackedFrame(estimate.pose, estimate.iterations, estimate.fit, math.nan, lost=True))
+        tracked = TrackedFrame.untracked(estimate.pose, lost=True)
+        return self._judged(
+            replace(
+                tracked,
+                iterations=estimate.iterations,
+                fit=estimate.fit,
+                information=estimate.information,
+                on_host=None if estimate.numbers is None else (estimate.pose, estimate.numbers),
+            )
+        )
 
     def resolve(
         self,
@@ -96,8 +79,12 @@ class Recovery:
         tracked = self.judge(estimate)
         if history.is_lost or self._is_doubtful(tracked):
             tracked = self._recover(problem, tracked, pixels, history)
-        elif to_be_mapped and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT:
-            tracked = self._verify(problem, tracked, IcpAlignment(pixels, self._camera), history, with_colors=False)
+        else:
+            if self._may_have_slid(tracked):
+                tracked = self._held(problem, tracked, pixels, history)
+            is_unchecked = math.isnan(tracked.fit.occluded_share)
+            if to_be_mapped and is_unchecked and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT:
+                tracked = self._check_occlusion(problem, tracked, pixels, history)
         if not tracked.lost or tracked.consistent_frames:
             return tracked
         # A pose predicted from lost frames is not trusted: continue from the last trusted pose.
@@ -122,64 +109,147 @@ class Recovery:
             or tracked.fit.mean_robust_weight < tracking.recovery_min_robust_weight
         )
 
-    def _verify(
-        self,
-        problem: TrackingProblem,
-        tracked: TrackedFrame,
-        alignment: IcpAlignment,
-        history: FrameHistory,
-        with_colors: bool = True,
+    def _may_have_slid(self, tracked: TrackedFrame) -> bool:
+        """Whether surface leaves a direction so free that image features are asked."""
+        tracking = self._config.tracking
+        return tracking.features and tracking.recovery and tracked.fit.min_eigenvalue < WEAK_EIGENVALUE
+
+    def _held(
+        self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
-        records = problem.records if with_colors else None
-        fit = self._verifier.verified(tracked.fit, tracked.pose, problem.scene, alignment, history, records)
+        """The pose held by image features in directions that surface leaves free, where there are enough of them."""
+        row, image = history.last_row(), self._features(pixels)
+        if row is None or image is None or tracked.information is None:
+            return tracked
+        frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
+        matches = frame.matched([row, *self._anchors(history, row)])
+        pose = image.held(tracked.pose, tracked.information, matches)
+        if pose is None:
+            return replace(tracked, features=image.features)
+        estimate = self._tracker.measure(problem, pose)
+        frame = replace(frame, matches=tuple(image.counted(one, pose) for one in matches))
+        held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.features)
+        held = self._judged(held)
+        return held if held.weight > tracked.weight - MAX_LOSS else self._recover(problem, tracked, pixels, history)
+
+    def _check_occlusion(
+        self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
+    ) -> TrackedFrame:
+        alignment = IcpAlignment(pixels, self._camera)
+        fit = self._verifier.verified(tracked.fit, tracked.pose, problem.scene, alignment, history)
         return self._judged(replace(tracked, fit=fit))
+
+    def _verify(self, frame: DoubtfulFrame, tracked: TrackedFrame) -> TrackedFrame:
+        """The pose judged with what other frames have seen: surface, brightness and image features."""
+        scene = frame.problem.scene
+        fit = self._verifier.verified(tracked.fit, tracked.pose, scene, frame.alignment, frame.history, frame.pixels)
+        return self._judged(replace(tracked, fit=frame.with_features(fit, tracked.pose)))
 
     def _recover(
         self, problem: TrackingProblem, first: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
         """The best result from the prediction and the last trusted frame; if that is lost, also from similar frames."""
-        alignment = IcpAlignment(pixels, self._camera)
-        best = self._best(problem, first, self._starts_at_last(problem, first, alignment, history))
+        frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), self._features(pixels))
+        frame, starts = self._starts_at_last(frame, first)
+        candidates, iterations = self._track_from(frame, first, starts), 0
         # After lost frames with consistent poses, the prediction does not come from the last trusted pose.
+        found = None
         if history.consecutive_lost_frames <= SHORT_LOSS and not history.consistent_frames:
-            best = self._verify(problem, best, alignment, history)
-            if not best.lost:
-                return best
-        return self._relocalize(problem, best, alignment, pixels, history)
+            found = self._likeliest(frame, candidates)
+            if found.lost and problem.constraints.reference is not None:
+                # Late colors may be what led tracking astray; these starts need no help of a coarse image.
+                constraints = replace(problem.constraints, reference=None)
+                frame = replace(frame, problem=replace(problem, constraints=constraints))
+                iterations = sum(candidate.iterations for candidate in candidates[1:])
+                candidates = self._track_from(frame, first, starts)
+                found = self._likeliest(frame, candidates)
+        if found is None or found.lost:
+            found = self._relocalize(frame, candidates)
+        iterations += sum(candidate.iterations for candidate in candidates)
+        return replace(found, iterations=iterations, features=frame.image.features if frame.image else None)
 
-    def _starts_at_last(
-        self, problem: TrackingProblem, first: TrackedFrame, alignment: IcpAlignment, history: FrameHistory
-    ) -> list[torch.Tensor]:
-        """Poses by ICP against the last trusted frame, from the predicted pose and from that frame's own."""
+    def _features(self, pixels: FramePixels) -> FeatureAlignment | None:
         tracking = self._config.tracking
+        if not (tracking.features and tracking.recovery):
+            return None
+        features = extract_features(pixels, self._camera, self._config.dataset.max_depth_m)
+        return FeatureAlignment(features, self._camera)
+
+    def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
+        """Poses against the last trusted frame: by image features, by ICP from the predicted pose and from its own."""
+        tracking, history = self._config.tracking, frame.history
         wanted = tracking.recovery and (tracking.optimizer == "gauss_newton" or first.lost)
-        last = history.last() if wanted else None
-        return [] if last is None else [alignment.pose(last, start) for start in (problem.predicted, last.pose)]
+        row = history.last_row() if wanted else None
+        if row is None:
+            return frame, []
+        last = history.frame(row)
+        frame, by_features = self._match(frame, [row, *self._anchors(frame.history, row)])
+        from_poses = (*by_features, frame.problem.predicted, last.pose)
+        return frame, [*by_features, *(frame.alignment.pose(last, start) for start in from_poses)]
 
-    def _best(self, problem: TrackingProblem, best: TrackedFrame, starts: list[torch.Tensor]) -> TrackedFrame:
-        """The result of the largest mean robust weight among a given one and those from other starts."""
-        iterations = best.iterations
-        for start in starts:
-            other = self.judge(self._tracker.track_from(problem, start))
-            iterations += other.iterations
-            if other.fit.mean_robust_weight > best.fit.mean_robust_weight + MIN_GAIN:
-                best = replace(other, recovered=True)
-        return replace(best, iterations=iterations)
+    def _anchors(self, history: FrameHistory, row: int) -> list[int]:
+        """Rows of the newest stored frames with image features before `row`: from frame to frame a pose may slide."""
+        return [known for known in history.feature_rows() if known < row - 1][-ANCHORS:]
 
-    def _relocalize(
-        self,
-        problem: TrackingProblem,
-        best: TrackedFrame,
-        alignment: IcpAlignment,
-        pixels: FramePixels,
-        history: FrameHistory,
-    ) -> TrackedFrame:
-        """The best of a given result and those from stored frames that look alike, if it is certain enough."""
-        candidates = retrieve(history, pixels, self._config.tracking.relocalization_candidates, self._camera)
-        starts = [alignment.pose(candidate.earlier, candidate.start) for candidate in candidates]
-        found = self._verify(problem, self._best(problem, best, starts), alignment, history)
-        found = self._accept_anywhere(found, history.consistent_frames)
-        return replace(found, relocalized=found.pose is not best.pose and not found.lost)
+    def _match(self, frame: DoubtfulFrame, rows: list[int]) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
+        """The frame with its matches with earlier frames' features, and the poses that these give."""
+        if frame.image is None:
+            return frame, []
+        matches, starts = list(frame.matches), []
+        for matched in frame.matched(rows):
+            start = frame.image.pose(matched, frame.problem.predicted.device)
+            if start is not None:
+                matches.append(frame.image.counted(matched, start))
+                starts.append(start)
+        return replace(frame, matches=tuple(matches)), starts
+
+    def _track_from(self, frame: DoubtfulFrame, first: TrackedFrame, starts: list[torch.Tensor]) -> list[TrackedFrame]:
+        """A result, and those from other starts."""
+        others = [self.judge(self._tracker.track_from(frame.problem, start)) for start in starts]
+        return [first, *(replace(other, recovered=True) for other in others)]
+
+    def _likeliest(self, frame: DoubtfulFrame, candidates: list[TrackedFrame], anywhere: bool = False) -> TrackedFrame:
+        """The candidate of the smallest error probability when verified; only the best fits of distinct poses are.
+
+        Args:
+            frame: the frame.
+            candidates: the first is taken among equals.
+            anywhere: whether the camera may be anywhere, so that the predicted pose says nothing.
+        """
+        distinct: list[TrackedFrame] = []
+        weights = [candidate.weight + MIN_GAIN * (i == 0) for i, candidate in enumerate(candidates)]
+        for i in sorted(range(len(candidates)), key=lambda i: -weights[i]):
+            if distinct and weights[i] < distinct[0].weight - MAX_LOSS:
+                break
+            if not any(candidates[i].is_same(other) for other in distinct):
+                distinct.append(candidates[i])
+        verified = [self._verify(frame, candidate) for candidate in distinct[:MAX_VERIFIED]]
+        return min(verified, key=lambda tracked: self._rank(tracked, anywhere))
+
+    def _rank(self, tracked: TrackedFrame, anywhere: bool) -> float:
+        fit = tracked.fit
+        if anywhere:
+            fit = replace(fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
+        probability = self._confidence.error_probability(fit)
+        return math.inf if math.isnan(probability) else probability
+
+    def _relocalize(self, frame: DoubtfulFrame, candidates: list[TrackedFrame]) -> TrackedFrame:
+        """The likeliest of given results and those from stored frames that look alike, if it is certain enough.
+
+        The results from stored frames are appended to `candidates`.
+        """
+        count, known = self._config.tracking.relocalization_candidates, len(candidates)
+        alike = retrieve(frame.history, frame.pixels, count, self._camera)
+        starts = [frame.alignment.pose(candidate.earlier, candidate.start) for candidate in alike]
+        if frame.image is not None and count:
+            rows = retrieve_by_features(frame.history, frame.image, frame.problem.frame)
+            frame, by_features = self._match(frame, rows)
+            starts = [*by_features, *starts]
+        candidates += self._track_from(frame, candidates[0], starts)[1:]
+        found = self._likeliest(frame, candidates, anywhere=True)
+        is_new = not any(found.pose is candidate.pose for candidate in candidates[:known])
+        found = self._accept_anywhere(found, frame.history.consistent_frames)
+        return replace(found, relocalized=is_new and not found.lost)
 
     def _accept_anywhere(self, tracked: TrackedFrame, consistent_before: int) -> TrackedFrame:
         """The result, accepted by stricter thresholds, as the camera may be anywhere and some places look alike.

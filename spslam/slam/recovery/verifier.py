@@ -1,4 +1,4 @@
-"""Verification of a pose where its fit to the map leaves doubt: free space, the map's holes and its colors."""
+"""Verification of a pose where its fit to the map leaves doubt: free space, the map's holes and brightness."""
 
 import math
 from dataclasses import replace
@@ -11,6 +11,7 @@ from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
+from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.appearance import POINTS, brightness_correlation, brightness_sums
 from spslam.slam.recovery.free_space import surface_counts, surface_shares
 from spslam.slam.recovery.icp_alignment import IcpAlignment
@@ -18,7 +19,7 @@ from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 
 
 class Verifier:
-    """Compares poses with other frames' surface and the map's colors.
+    """Compares poses with other frames' surface and brightness.
 
     Args:
         config: options of the run.
@@ -37,9 +38,9 @@ class Verifier:
         scene: Scene,
         alignment: IcpAlignment,
         history: FrameHistory,
-        records: torch.Tensor | None = None,
+        pixels: FramePixels | None = None,
     ) -> Fit:
-        """The fit with free-space violation, occluded share and map coverage, and with records the correlation too.
+        """The fit with free-space violation, occluded share and map coverage, and with pixels the correlation too.
 
         Args:
             fit: of the pose to the map.
@@ -47,10 +48,10 @@ class Verifier:
             scene: the map.
             alignment: with the frame's vertex map.
             history: the frames before.
-            records: int32 [P, 3] the frame's packed pixels in random order.
+            pixels: the frame's, to compare its brightness.
         """
         rows = history.compared_rows()
-        counts = surface_counts(
+        counts, best = surface_counts(
             alignment.vertices,
             alignment.intrinsics,
             pose,
@@ -58,9 +59,9 @@ class Verifier:
             history.depth_thumbnails[rows],
             self._camera,
         )
-        colors = [] if records is None else [brightness_sums(scene, records[:POINTS], pose, self._camera)]
+        brightness = [] if pixels is None else [self._brightness_sums(pixels, pose, rows[best], history)]
         # Waits for the device, once.
-        numbers = torch.cat([counts, self._map_coverage(scene, history), *colors]).tolist()
+        numbers = torch.cat([counts, self._map_coverage(scene, history), *brightness]).tolist()
         seen, through, occluded = numbers[:3]
         unknown = self._confidence.unknown_free_space_violation
         violation, occluded_share = surface_shares(seen, through, occluded, unknown)
@@ -69,8 +70,14 @@ class Verifier:
             free_space_violation=violation,
             occluded_share=occluded_share,
             map_coverage=numbers[3],
-            brightness_correlation=brightness_correlation(*numbers[4:]) if colors else math.nan,
+            brightness_correlation=brightness_correlation(*numbers[4:]) if brightness else math.nan,
         )
+
+    def _brightness_sums(
+        self, pixels: FramePixels, pose: torch.Tensor, rows: torch.Tensor, history: FrameHistory
+    ) -> torch.Tensor:
+        records, poses = history.frames(rows, POINTS)
+        return brightness_sums(pixels, pose, records, poses, self._camera, self._config.dataset.max_depth_m)
 
     def _map_coverage(self, scene: Scene, history: FrameHistory) -> torch.Tensor:
         """Share of the last trusted frame's pixels on mapped surface, float32 [1]; NaN where there is no such frame."""

@@ -1,0 +1,393 @@
+"""What happens to one frame, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from spslam.camera import Camera
+from spslam.config import Config
+from spslam.errors import DatasetError
+from spslam.prior import load_prior
+from spslam.slam.constraints import Constraints, ConstraintSource
+from spslam.slam.device_events import event_recorder, fetch
+from spslam.slam.feature_store import keeps_features
+from spslam.slam.frame_history import FrameHistory
+from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report, pose_matrix
+from spslam.slam.graph.edges import LoopDecision
+from spslam.slam.graph.global_mapping import GlobalMapping
+from spslam.slam.image_features import extract_features
+from spslam.slam.mapper import Mapper, MappingTask
+from spslam.slam.pixels import FramePixels
+from spslam.slam.poses import pose_tensor
+from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.recovery import Recovery
+from spslam.slam.recovery.tracked_frame import TrackedFrame
+from spslam.slam.segments import Segments, segment_config
+from spslam.slam.state import SlamState
+from spslam.slam.tracker import Tracker, TrackingProblem
+from spslam.slam.upload import Upload
+
+# A frame of which a smaller share of pixels lies on mapped surface is mapped out of turn: the camera moves so fast that
+# at its next turn it might see nothing known.
+MIN_MAPPED_SHARE = 0.5
+SETTLED_FRAMES = 3  # trusted frames in a row, this one included, before mapping continues after a lost frame
+MAX_DISTANCE_M = 10_000.0  # a float32 still resolves a millimeter there
+
+# Takes a frame's pose, float64 [4, 4] T_world_camera, or None where it is lost.
+PoseCallback = Callable[[np.ndarray | None], None]
+
+
+class FramePipeline:
+    """Tracks and maps frames that are sampled already; what `SlamSystem` is built on.
+
+    Attributes:
+        config: options of the run.
+        camera: of all frames.
+        device: where the map lives.
+        first_pose: float64 [4, 4] T_world_camera of the first frame.
+        state: everything known between two frames.
+        mapping_loss: float32 [] total loss of the last iteration that `optimize_map` made; None before.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        camera: Camera,
+        first_pose: np.ndarray | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        """A system without a map.
+
+        Args:
+            config: options of the run.
+            camera: pinhole intrinsics of all frames.
+            first_pose: float64 [4, 4] T_world_camera of the first frame; identity where not given.
+            device: where the map lives and the kernels run.
+
+        Raises:
+            DatasetError: the first pose lies too far from the world's origin.
+        """
+        self.config = config
+        self.camera = camera
+        self.device = torch.device(device)
+        prior = load_prior(config.prior.weights, config.prior.neighborhood)
+        self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
+        confidence = PoseConfidenceModel.load()
+        self.tracker = Tracker(config, camera, confidence.score_kernel_m)
+        self.recovery = Recovery(config, camera, self.tracker, confidence)
+        self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
+        self.first_pose = np.eye(4)
+        self._prior = prior
+        self.global_mapping: GlobalMapping | None = None
+        self._segments: Segments | None = None
+        self.reset(first_pose)
+
+    def reset(self, first_pose: np.ndarray | None = None) -> None:
+        """Forgets map and trajectory: the next frame is the first of a new map.
+
+        Args:
+            first_pose: as of `SlamSystem`; where not given, the next frame is where the first one was before.
+
+        Raises:
+            DatasetError: as `SlamSystem`; nothing is forgotten then.
+        """
+        first_pose = self.first_pose if first_pose is None else np.array(first_pose, np.float64)
+        _check_first_pose(first_pose)
+        self.first_pose = first_pose
+        self.adopt(SlamState.start(self.config, self.camera, first_pose, self._decoder, self.device))
+
+    def adopt(self, state: SlamState) -> None:
+        """Goes on from a state of the same options and camera; map and trajectory as they were are forgotten."""
+        self.state = state
+        self.history = FrameHistory(self.state)
+        self.constraints = ConstraintSource(self.config, self.camera)
+        self.close()
+        self.global_mapping = self._segments = None
+        if self.state.graph is not None:
+            self.global_mapping = GlobalMapping(self.config, self._prior, self.state, self.state.graph)
+            after_s = self.config.graph.new_map_after_s
+            if after_s is not None:
+                self._segments = Segments(after_s, self.state, self.global_mapping, self._segment_system)
+        self._task: MappingTask | None = None
+        self.mapping_loss: torch.Tensor | None = None
+
+    def close(self) -> None:
+        """Ends the threads; no frame can follow, unless after `reset`."""
+        if self.global_mapping is not None:
+            self.global_mapping.close()
+        if self._segments is not None:
+            self._segments.close()
+
+    def submit(
+        self, frame: PreparedFrame, on_pose: PoseCallback | None = None, defer_mapping: bool = False
+    ) -> PendingReport:
+        """Tracks and maps the next frame as `process` does, but does not wait for the optimization of the map.
+
+        Args:
+            frame: sampled.
+            on_pose: as of `process`.
+            defer_mapping: leave the optimization to `optimize_map`; what is left of one before is added to it, up to
+                as many iterations as the first frame has.
+        """
+        self._record = event_recorder(self.device)
+        started = self._record()
+        events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
+        number, begins_map = len(self.state.frames), not self._has_map
+        loops = () if defer_mapping else self._update_globally(number)
+        pixels = self._receive(frame, events)
+        constraints = Constraints() if begins_map else self.constraints.gather(self.history, pixels)
+        tracked = self._track(pixels, constraints, number, events)
+        self._store(frame, pixels, constraints, tracked)
+        if not begins_map:
+            self._tell(on_pose)
+        is_mapped = self._integrate(pixels, tracked, number, events)
+        if begins_map:
+            self._tell(on_pose)
+        self._keep_features(frame, pixels, tracked, number)
+        self._follow_segment(frame, pixels)
+        is_keyframe = not tracked.occluded and not self.state.frames.lost[-1] and self.state.segment is None
+        if self.global_mapping is not None and is_keyframe:
+            self.global_mapping.after_frame(number, pixels, tracked.matrix())
+        pose = self._last_pose()
+        iterations, loss = self._optimize(begins_map, defer_mapping, events) if is_mapped else (0, None)
+        if defer_mapping:
+            loops = self._take_up_ready(number)
+        events.finished = self._record()
+        report = frame_report(self.state, frame, pixels, tracked, iterations, loops)
+        return PendingReport(report, events, frame.wait_ms, loss, pose)
+
+    @property
+    def mapping_left(self) -> int:
+        """Iterations of a deferred optimization of the map that are still to be made."""
+        return 0 if self._task is None else self._task.left
+
+    def optimize_map(self, iterations: int | None = None) -> int:
+        """Goes on with a deferred optimization of the map.
+
+        Args:
+            iterations: at most so many; all that is left where not given.
+
+        Returns:
+            Iterations made.
+        """
+        task = self._task
+        if task is None:
+            return 0
+        count = task.left if iterations is None else min(iterations, task.left)
+        if count > 0:
+            self.mapping_loss = self.mapper.advance(self.state, task, count)[0]
+        if task.left == 0:
+            self._task = None
+        return count
+
+    def finish(self) -> None:
+        """Optimizes once more if frames came after the last mapping call. Call it after the last frame."""
+        self.optimize_map()
+        if self._segments is not None:
+            self._segments.end()
+        if self.state.frames.is_anywhere:
+            return
+        iterations = self.config.mapping.iterations if self.state.unmapped else 0
+        if self.global_mapping is not None and self.global_mapping.finish():
+            iterations = self.config.mapping.first_iterations
+        if iterations:
+            self.mapper.optimize(self.state, iterations)
+        self.state.unmapped = False
+
+    def localize(
+        self,
+        pixels: FramePixels,
+        predicted: torch.Tensor,
+        number: int,
+        to_be_mapped: bool = False,
+        constraints: Constraints | None = None,
+    ) -> TrackedFrame:
+        """The pose of a frame against the map and the frames before it; changes nothing.
+
+        Args:
+            pixels: of the frame.
+            predicted: float32 [7], the pose to start from.
+            number: of the frame; keys its random draws.
+            to_be_mapped: whether the frame is to be mapped if its pose is trusted; it is then checked for occlusion.
+            constraints: beside the map's; None gathers them.
+        """
+        if self._has_too_little_depth(pixels):
+            return TrackedFrame.untracked(predicted.clone(), lost=True)
+        constraints = self.constraints.gather(self.history, pixels) if constraints is None else constraints
+        problem = TrackingProblem(self.state.scene, pixels.records, predicted, number, constraints)
+        estimate = self.tracker.track(problem)
+        return self.recovery.resolve(problem, estimate, pixels, self.history, to_be_mapped)
+
+    @property
+    def _has_map(self) -> bool:
+        return self.state.scene.volume.num_voxels > 0
+
+    def _update_globally(self, number: int) -> tuple[LoopDecision, ...]:
+        """Between two frames: adopts what the keyframe graph found; returns what it decided on loops."""
+        if self.global_mapping is None or not self.global_mapping.is_due(number):
+            return ()
+        if self.global_mapping.adopts(number):
+            self.optimize_map()
+        opened = self.state.frames.opened
+        decisions = self.global_mapping.before_frame(number)
+        return tuple(replace(each, source=each.source - opened, target=each.target - opened) for each in decisions)
+
+    def _follow_segment(self, frame: PreparedFrame, pixels: FramePixels) -> None:
+        """While the camera is lost, and until it is known how what it saw then is joined with the map."""
+        if self._segments is None:
+            return
+        place = self._segments.after_frame(frame, pixels, not self._has_too_little_depth(pixels))
+        if place is not None:
+            self.optimize_map()
+            self._segments.join(place)
+
+    def _segment_system(self, state: SlamState | None) -> FramePipeline:
+        """A system for what a lost camera sees, that of a state if one is given."""
+        system = FramePipeline(segment_config(self.config), self.camera, None, self.device)
+        if state is not None:
+            system.adopt(state)
+        return system
+
+    def _take_up_ready(self, number: int) -> tuple[LoopDecision, ...]:
+        """`_update_globally` of a live run, after a frame: waits for nothing."""
+        if self.global_mapping is None:
+            return ()
+        volume = self.state.scene.volume
+        loops = self.global_mapping.take_up_ready(number)
+        if self._task is not None and self.state.scene.volume is not volume:
+            self._task = self.mapper.begin(self.state, self._task.left)  # it was begun for the map before
+        return loops
+
+    def _receive(self, frame: PreparedFrame, events: FrameEvents) -> FramePixels:
+        if not isinstance(frame.pixels, Upload):
+            return frame.pixels.to(self.device)
+        events.upload = (frame.pixels.begin, frame.pixels.end)
+        return frame.pixels.received()
+
+    def _track(self, pixels: FramePixels, constraints: Constraints, number: int, events: FrameEvents) -> TrackedFrame:
+        if not self._has_map:
+            first = pose_tensor(self.first_pose, self.device)
+            return TrackedFrame.untracked(first, lost=self._has_too_little_depth(pixels))
+        begin = self._record()
+        if self.state.frames.is_anywhere:
+            tracked = self._enter(pixels, number)
+        else:
+            predicted = self.tracker.predict(self.state.frames)
+            tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints)
+        events.tracking = (begin, self._record())
+        return tracked
+
+    def _enter(self, pixels: FramePixels, number: int) -> TrackedFrame:
+        """The pose of a frame in the map that was opened, in which none was found yet."""
+        nowhere = TrackedFrame.untracked(self.state.frames.poses[-1].clone(), lost=True)
+        if self.global_mapping is None or self._has_too_little_depth(pixels):
+            return nowhere
+        found = self.global_mapping.find(number, pixels)
+        if found is None:
+            return nowhere
+        start = pose_tensor(found, self.device)
+        problem = TrackingProblem(self.state.scene, pixels.records, start, number, Constraints(self.history.noise))
+        tracked = self.recovery.judge(self.tracker.track_from(problem, start))
+        is_sure = tracked.error_probability <= self.config.tracking.relocalization_threshold and not tracked.lost
+        return replace(tracked, relocalized=True) if is_sure else replace(nowhere, fit=tracked.fit)
+
+    def _store(
+        self, frame: PreparedFrame, pixels: FramePixels, constraints: Constraints, tracked: TrackedFrame
+    ) -> None:
+        """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
+        state, number = self.state, len(self.state.frames)
+        state.frames.append(
+            tracked.pose,
+            frame.timestamp,
+            frame.index,
+            tracked.lost,
+            pixels.depth_thumbnail,
+            tracked.consistent_frames,
+        )
+        state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records)
+        if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:
+            if constraints.depth_keyframes is not None:
+                state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes)
+            state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image)
+
+    def _keep_features(self, frame: PreparedFrame, pixels: FramePixels, tracked: TrackedFrame, number: int) -> None:
+        """Keeps image features of a doubtful frame, and of every 30th one unless there are enough of its view.
+
+        Those that are due and were not extracted ahead are extracted now.
+        """
+        if tracked.occluded or self.state.frames.lost[-1]:
+            return
+        features, processed = tracked.features, self.state.frames.processed - 1
+        if features is None and (frame.features is not None or keeps_features(self.config, processed)):
+            if self.state.has_enough_features(number):
+                return
+            features = frame.features
+            if features is None:
+                features = extract_features(pixels, self.camera, self.config.dataset.max_depth_m)
+        if features is not None:
+            self.state.features.add(number, features)
+
+    def _integrate(self, pixels: FramePixels, tracked: TrackedFrame, number: int, events: FrameEvents) -> bool:
+        """Encodes the newest frame if it is its turn; returns whether the map is to be optimized next."""
+        is_mapped = not tracked.occluded and self._is_mapping_frame(number, tracked)
+        self.state.unmapped = not is_mapped
+        if not is_mapped:
+            return False
+        begin = self._record()
+        self.mapper.integrate(self.state, pixels)
+        events.encode = (begin, self._record())
+        if not self._has_map:
+            # Depth without a surface in it: the map must begin with a later frame, and so must the trajectory.
+            self.state.frames.lost[-1] = True
+        return self._has_map
+
+    def _optimize(self, begins_map: bool, deferred: bool, events: FrameEvents) -> tuple[int, torch.Tensor | None]:
+        """Optimizes the map, or leaves it to `optimize_map`; returns the iterations made and the last total loss."""
+        mapping = self.config.mapping
+        iterations = mapping.first_iterations if begins_map else mapping.iterations
+        if deferred:
+            most = max(mapping.first_iterations, mapping.iterations)
+            self._task = self.mapper.begin(self.state, min(iterations + self.mapping_left, most))
+            return 0, None
+        losses = self.mapper.optimize(self.state, iterations)
+        if events.encode is not None:
+            events.mapping = (events.encode[1], self._record())
+        return iterations, None if losses is None else fetch(losses[0])
+
+    def _last_pose(self) -> torch.Tensor | None:
+        """The newest frame's pose float32 [7], on its way to the CPU; None where it is lost."""
+        return None if self.state.frames.lost[-1] else fetch(self.state.frames.poses[-1])
+
+    def _tell(self, on_pose: PoseCallback | None) -> None:
+        if on_pose is not None:
+            pose = self._last_pose()
+            self._record().wait()
+            on_pose(pose_matrix(pose))
+
+    def _has_too_little_depth(self, pixels: FramePixels) -> bool:
+        """Whether too little of the image has depth to determine a pose."""
+        return len(pixels.records) == 0 or pixels.valid_depth_share < self.config.tracking.min_valid_depth_share
+
+    def _is_mapping_turn(self, number: int) -> bool:
+        return number % self.config.mapping.every == 0
+
+    def _is_mapping_frame(self, number: int, tracked: TrackedFrame) -> bool:
+        """Whether the newest frame is to be mapped: a lost one never, one soon after a lost one not yet."""
+        if not self._has_map:
+            return not bool(self.state.frames.lost[-1])
+        is_wanted = self._is_mapping_turn(number) or tracked.fit.inlier_share < MIN_MAPPED_SHARE
+        return is_wanted and not bool(self.state.frames.lost[-SETTLED_FRAMES:].any())
+
+
+def _check_first_pose(pose: np.ndarray) -> None:
+    distance = float(np.linalg.norm(pose[:3, 3]))
+    if not distance <= MAX_DISTANCE_M:
+        raise DatasetError(
+            f"the first pose must lie within {MAX_DISTANCE_M / 1000:.0f} km of the world's origin, got "
+            f"{distance / 1000:.0f} km; scene.first_pose=identity starts at the origin instead"
+        )

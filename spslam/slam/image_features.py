@@ -1,0 +1,95 @@
+"""Image features of a frame (ORB) with the surface points under them: places known by how they look, not where.
+
+ORB: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, as OpenCV implements it.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spslam.camera import Camera
+from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_unit
+from spslam.slam.pixels import FramePixels
+
+DESCRIPTOR_BYTES = 32
+COUNT = 1000  # features of a frame at most
+DETECTED = 2000  # of which the strongest of each cell are taken first, so that they cover the image
+CELL_COLUMNS = 20  # of the grid over the image
+EDGE_PX = 16  # without keypoints at the image's edge; half a patch, as OpenCV's 31 px leave little of a small image
+FAST_THRESHOLD = 7  # gray levels; ORB-SLAM's lower one: plain walls have faint corners too
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """Features of one frame; of any prefix of them those of the strongest response cover the image.
+
+    Attributes:
+        descriptors: uint8 [N, 32], compared by Hamming distance.
+        positions: float32 [N, 2] in px of the intensity image.
+        points: float32 [N, 3] surface points in camera axes, m; 0 where the depth is unknown.
+    """
+
+    descriptors: np.ndarray
+    positions: np.ndarray
+    points: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.descriptors)
+
+    def with_depth(self) -> "ImageFeatures":
+        """Those of which the depth is known."""
+        known = self.points[:, 2] > 0
+        return ImageFeatures(self.descriptors[known], self.positions[known], self.points[known])
+
+
+def extract_features(pixels: FramePixels, camera: Camera, max_depth_m: float) -> ImageFeatures:
+    """Features of a frame, strongest of each part of the image first; deterministic, waits for the device.
+
+    Args:
+        pixels: of the frame, with images.
+        camera: of all frames.
+        max_depth_m: the largest depth that images hold.
+    """
+    return features_of_images(
+        pixels.intensity_image.cpu().numpy(), pixels.depth_image.cpu().numpy(), camera, max_depth_m
+    )
+
+
+def features_of_images(intensity: np.ndarray, depth: np.ndarray, camera: Camera, max_depth_m: float) -> ImageFeatures:
+    """Features of a frame of which the images are at hand.
+
+    Args:
+        intensity: uint8 [h, w].
+        depth: uint16 [h, w] in units of `depth_unit(max_depth_m)`, 0 where unknown.
+        camera: of all frames.
+        max_depth_m: the largest depth that images hold.
+    """
+    orb = cv2.ORB.create(nfeatures=DETECTED, fastThreshold=FAST_THRESHOLD, edgeThreshold=EDGE_PX)
+    keypoints, descriptors = orb.detectAndCompute(intensity, None)
+    if descriptors is None:
+        empty = np.zeros((0, 3), np.float32)
+        return ImageFeatures(np.zeros((0, DESCRIPTOR_BYTES), np.uint8), empty[:, :2], empty)
+    positions = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
+    response = np.fromiter((keypoint.response for keypoint in keypoints), np.float32, len(keypoints))
+    order = _spread(positions, response, intensity.shape[1])[:COUNT]
+    return ImageFeatures(descriptors[order], positions[order], _points(positions[order], depth, camera, max_depth_m))
+
+
+def _spread(positions: np.ndarray, response: np.ndarray, columns: int) -> np.ndarray:
+    """Order [N] of keypoints: the strongest of each cell of a grid over the image, then the second ones, ..."""
+    column, row = (positions * (CELL_COLUMNS / columns)).astype(np.int64).T
+    cell = row * CELL_COLUMNS + column
+    order = np.lexsort((positions[:, 0], positions[:, 1], -response, cell))
+    _, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, counts)
+    return order[np.lexsort((-response[order], rank))]
+
+
+def _points(positions: np.ndarray, depth: np.ndarray, camera: Camera, max_depth_m: float) -> np.ndarray:
+    """Surface points [N, 3] at positions [N, 2] of the images, by the nearest pixel's depth."""
+    k = depth_image_intrinsics(camera)
+    column, row = np.minimum((positions + 0.5).astype(np.int64), (depth.shape[1] - 1, depth.shape[0] - 1)).T
+    z = depth[row, column] * np.float32(depth_unit(max_depth_m))
+    rays = (positions - np.array([k.cx, k.cy], np.float32)) / np.array([k.fx, k.fy], np.float32)
+    return np.concatenate([rays * z[:, None], z[:, None]], 1).astype(np.float32)

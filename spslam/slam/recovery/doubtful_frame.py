@@ -1,0 +1,60 @@
+"""What is known of a frame whose pose is in doubt."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from spslam.slam.fit import Fit
+from spslam.slam.frame_history import FrameHistory
+from spslam.slam.pixels import FramePixels
+from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches
+from spslam.slam.recovery.icp_alignment import IcpAlignment
+from spslam.slam.tracker import TrackingProblem
+
+REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones features say where colors are, not depth
+
+
+@dataclass(frozen=True)
+class DoubtfulFrame:
+    """What other poses of a frame are found and verified by.
+
+    Attributes:
+        problem: the frame, as tracking takes it.
+        pixels: of the frame.
+        history: the frames before.
+        alignment: by ICP.
+        image: by image features; None where these are not used.
+        matches: of the image's features with those of earlier frames.
+    """
+
+    problem: TrackingProblem
+    pixels: FramePixels
+    history: FrameHistory
+    alignment: IcpAlignment
+    image: FeatureAlignment | None = None
+    matches: tuple[FeatureMatches, ...] = ()
+
+    def matched(self, rows: Sequence[int]) -> list[FeatureMatches]:
+        """Matches with the features of the earlier frames in rows that have some."""
+        if self.image is None:
+            return []
+        known = [(self.history.features(row), self.history.poses[row]) for row in rows]
+        return [self.image.matches(features, pose) for features, pose in known if features is not None]
+
+    def with_features(self, fit: Fit, pose: torch.Tensor) -> Fit:
+        """The fit of a pose float32 [7] with what the matches say of it; the fit where there are no image features."""
+        if self.image is None:
+            return fit
+        inliers = [self.image.inliers(one, pose) for one in self.matches]
+        shares: list[float] = []
+        if self._colors_are_registered:
+            shares = [n / one.agreeing for n, one in zip(inliers, self.matches, strict=True) if one.agreeing]
+        return replace(fit, feature_inliers=max(inliers, default=0), feature_share=min(shares, default=math.nan))
+
+    @property
+    def _colors_are_registered(self) -> bool:
+        """Whether colors are where depth is, as far as was measured: neither late nor of another lens."""
+        noise = self.problem.constraints.noise
+        return noise is None or float(noise[3]) <= REGISTERED_PX**2

@@ -1,0 +1,177 @@
+"""Initial poses for tracking from image features: they need neither a start nor the map.
+
+Features of an earlier frame are matched with the frame's (ratio test, Lowe 2004); the pose is that of a perspective
+three-point solver within RANSAC (OpenCV's `solvePnPRansac`), refined on all inliers.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+
+from spslam.camera import Camera
+from spslam.geometry import inverse
+from spslam.pose_graph import cross_matrices, rotation_matrices, rotation_vectors
+from spslam.slam.depth_keyframes import depth_image_intrinsics
+from spslam.slam.image_features import ImageFeatures
+from spslam.slam.poses import pose_matrix, pose_tensor
+
+MAX_RATIO = 0.8  # of the distances to the best and to the second-best match
+MAX_ERROR_DEG = 0.33  # of a reprojected point, as seen from the camera: 3 px of a Kinect's 640
+MIN_ERROR_PX = 1.0  # which features of a small image have anyway
+MIN_INLIERS = 20  # fewer may agree by chance, or lie on one small thing
+RANSAC_ITERATIONS = 500
+RANSAC_CONFIDENCE = 0.999
+HELD_ITERATIONS = 6
+INDEPENDENT_FEATURES = 50  # as many a frame's are worth: those of one earlier frame are off by the same
+WIDE = 3.0  # times the error of an inlier, the width of the robust kernel
+MIN_DEPTH_M = 0.05
+COMPARED = 250  # of the strongest features, to find out which of many frames look alike
+MIN_ALIKE = 12  # matches of these
+
+
+@dataclass(frozen=True)
+class FeatureMatches:
+    """Surface points of an earlier frame, and where the frame shows them.
+
+    Attributes:
+        points: float64 [M, 3] in the world, m.
+        positions: float64 [M, 2] in px of the intensity image.
+        agreeing: how many of them agree with the pose that they give.
+    """
+
+    points: np.ndarray
+    positions: np.ndarray
+    agreeing: int = 0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+class FeatureAlignment:
+    """Poses of one frame by matching its image features with those of earlier frames.
+
+    Args:
+        features: of the frame.
+        camera: of all frames.
+
+    Attributes:
+        max_error_px: farther from where the frame shows them, points do not agree with a pose.
+    """
+
+    def __init__(self, features: ImageFeatures, camera: Camera):
+        self.features = features
+        k = depth_image_intrinsics(camera)
+        self._matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+        self.max_error_px = max(k.fx * math.tan(math.radians(MAX_ERROR_DEG)), MIN_ERROR_PX)
+
+    def matches(self, earlier: ImageFeatures, pose: torch.Tensor) -> FeatureMatches:
+        """Matches with the features of an earlier frame at a pose float32 [7]."""
+        pairs = ratio_matches(self.features.descriptors, earlier.descriptors)
+        to_world = pose_matrix(pose)
+        points = earlier.points[pairs[:, 1]].astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
+        return FeatureMatches(points, self.features.positions[pairs[:, 0]].astype(np.float64))
+
+    def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
+        """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
+        if len(matches) < MIN_INLIERS:
+            return None
+        found, rotation, translation, inliers = cv2.solvePnPRansac(
+            matches.points,
+            matches.positions,
+            self._matrix,
+            None,
+            iterationsCount=RANSAC_ITERATIONS,
+            reprojectionError=self.max_error_px,
+            confidence=RANSAC_CONFIDENCE,
+            flags=cv2.SOLVEPNP_AP3P,
+        )
+        if not found or inliers is None or len(inliers) < MIN_INLIERS:
+            return None
+        rows = inliers[:, 0]
+        rotation, translation = cv2.solvePnPRefineLM(
+            matches.points[rows], matches.positions[rows], self._matrix, None, rotation, translation
+        )
+        to_camera = np.eye(4)
+        to_camera[:3, :3], to_camera[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+        return pose_tensor(inverse(to_camera), device) if np.isfinite(to_camera).all() else None
+
+    def counted(self, matches: FeatureMatches, pose: torch.Tensor) -> FeatureMatches:
+        """The matches, with how many agree with the pose float32 [7] that they give."""
+        return replace(matches, agreeing=self.inliers(matches, pose))
+
+    def held(
+        self, pose: torch.Tensor, information: np.ndarray, matches: Sequence[FeatureMatches]
+    ) -> torch.Tensor | None:
+        """The pose that surface and image features agree on best; None where fewer than `MIN_INLIERS` agree.
+
+        Gauss-Newton on reprojection errors with Geman-McClure's weights, beside the equations of surface.
+
+        Args:
+            pose: float32 [7], where surface has put the camera.
+            information: float64 [6, 6] of that pose, see `PoseEstimate`.
+            matches: with earlier frames.
+        """
+        points = np.concatenate([np.zeros((0, 3)), *(one.points for one in matches)])
+        positions = np.concatenate([np.zeros((0, 2)), *(one.positions for one in matches)])
+        at = before = pose_matrix(pose)
+        agreeing = 0
+        for _ in range(HELD_ITERATIONS):
+            residuals, jacobians = self._reprojection(points, positions, at)
+            ratio = (residuals**2).sum(1) / self.max_error_px**2
+            agreeing = int((ratio < 1).sum())
+            if agreeing < MIN_INLIERS:
+                return None
+            share = min(1.0, INDEPENDENT_FEATURES / agreeing) / self.max_error_px**2
+            weights = share / (1 + ratio / WIDE**2) ** 2
+            change = np.r_[at[:3, 3] - before[:3, 3], rotation_vectors(at[:3, :3] @ before[:3, :3].T)]
+            normal = information + np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians)
+            gradient = information @ change + np.einsum("n,nki,nk->i", weights, jacobians, residuals)
+            step = -np.linalg.solve(normal + np.eye(6), gradient)
+            at = at.copy()
+            at[:3, 3] += step[:3]
+            at[:3, :3] = rotation_matrices(step[3:]) @ at[:3, :3]
+        return pose_tensor(at, pose.device)
+
+    def _reprojection(
+        self, points: np.ndarray, positions: np.ndarray, pose: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Errors [N, 2] of points in front of the camera, px, and their derivatives [N, 2, 6] by a step of the pose."""
+        arms = points - pose[:3, 3]
+        local = arms @ pose[:3, :3]
+        front = local[:, 2] > MIN_DEPTH_M
+        (x, y, z), (fx, fy) = local[front].T, (self._matrix[0, 0], self._matrix[1, 1])
+        projected = np.stack([fx * x / z + self._matrix[0, 2], fy * y / z + self._matrix[1, 2]], 1)
+        by_point = np.zeros((len(z), 2, 3))
+        by_point[:, 0, 0], by_point[:, 0, 2] = fx / z, -fx * x / z**2
+        by_point[:, 1, 1], by_point[:, 1, 2] = fy / z, -fy * y / z**2
+        by_world = by_point @ pose[:3, :3].T
+        jacobians = np.concatenate([-by_world, by_world @ cross_matrices(arms[front])], 2)
+        return projected - positions[front], jacobians
+
+    def inliers(self, matches: FeatureMatches, pose: torch.Tensor) -> int:
+        """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`."""
+        to_camera = inverse(pose_matrix(pose))
+        points = matches.points @ to_camera[:3, :3].T + to_camera[:3, 3]
+        in_front = points[:, 2] > 0
+        projected = points @ self._matrix.T
+        positions = projected[:, :2] / np.where(in_front, points[:, 2], 1)[:, None]
+        return int((in_front & (np.linalg.norm(positions - matches.positions, axis=1) < self.max_error_px)).sum())
+
+    def likeness(self, earlier: ImageFeatures) -> int:
+        """How many of the strongest features match; 0 below `MIN_ALIKE`."""
+        count = len(ratio_matches(self.features.descriptors[:COMPARED], earlier.descriptors[:COMPARED]))
+        return count if count >= MIN_ALIKE else 0
+
+
+def ratio_matches(descriptors: np.ndarray, earlier: np.ndarray) -> np.ndarray:
+    """Rows of descriptors uint8 [N, 32] and [M, 32] that match plainly better than any others: int64 [K, 2]."""
+    if len(descriptors) == 0 or len(earlier) < 2:
+        return np.zeros((0, 2), np.int64)
+    # Arrays: the thousand objects of a matcher's answer would keep other threads from the interpreter.
+    distances, columns = cv2.batchDistance(descriptors, earlier, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
+    rows = np.flatnonzero(distances[:, 0] < MAX_RATIO * distances[:, 1])
+    return np.stack([rows, columns[rows, 0]], 1).astype(np.int64)

@@ -1,0 +1,69 @@
+"""A frame's pose as tracking and recovery leave it."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from spslam.geometry import pose7_to_matrix
+from spslam.slam.fit import Fit, prediction_error
+from spslam.slam.image_features import ImageFeatures
+
+SAME_CM, SAME_DEG = 1.0, 0.5  # nearer poses are one
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """A frame's pose and whether it is trusted.
+
+    Attributes:
+        pose: float32 [7]; where the frame is lost, a likely pose, the last trusted or the predicted one.
+        iterations: of tracking, summed over all initial poses.
+        fit: of the pose found, also where it is not trusted.
+        error_probability: that the pose is wrong; NaN where it was not tracked.
+        lost: whether the pose is not trusted.
+        occluded: whether something that is not part of the scene is in front of the camera.
+        recovered: whether the pose was tracked from an initial pose that ICP or image features gave.
+        relocalized: whether they found it against a stored frame that looks alike.
+        consistent_frames: how many lost frames up to this one had likely poses that are consistent; `pose` is the
+            last of them.
+        features: of the image, where they were needed.
+        information: of the pose, see `PoseEstimate`; None where it was not tracked.
+        on_host: a pose, and its seven numbers, which were read with its fit; of the frame's if it is the same object.
+    """
+
+    pose: torch.Tensor
+    iterations: int
+    fit: Fit
+    error_probability: float
+    lost: bool
+    occluded: bool = False
+    recovered: bool = False
+    relocalized: bool = False
+    consistent_frames: int = 0
+    features: ImageFeatures | None = None
+    information: np.ndarray | None = field(default=None, compare=False)
+    on_host: tuple[torch.Tensor, tuple[float, ...]] | None = field(default=None, compare=False)
+
+    @classmethod
+    def untracked(cls, pose: torch.Tensor, lost: bool) -> "TrackedFrame":
+        """A frame at a given pose, of which nothing was measured."""
+        return cls(pose, 0, Fit(), math.nan, lost)
+
+    def matrix(self) -> np.ndarray:
+        """The pose float64 [4, 4]; waits for the device if it was not read already."""
+        if self.on_host is not None and self.on_host[0] is self.pose:
+            return pose7_to_matrix(np.array(self.on_host[1]))
+        return pose7_to_matrix(self.pose.cpu().double().numpy())
+
+    @property
+    def weight(self) -> float:
+        """Mean robust weight, 0 to 1; that of a pose of NaN is below all others."""
+        weight = self.fit.mean_robust_weight
+        return -math.inf if math.isnan(weight) else weight
+
+    def is_same(self, other: "TrackedFrame") -> bool:
+        """Whether another result is the same pose up to noise; waits for the device."""
+        error_cm, error_deg = prediction_error(self.pose.tolist(), other.pose.tolist())
+        return error_cm < SAME_CM and error_deg < SAME_DEG
