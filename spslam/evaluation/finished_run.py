@@ -18,6 +18,7 @@ from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.evaluation.trajectory_metrics import Alignment, ate, rpe
 from spslam.geometry import umeyama
 from spslam.io import atomic_write
+from spslam.meshing.render import render_colors
 from spslam.scene import Scene
 
 # Frames used to determine which surface was observed; more of them add time, but hardly any surface.
@@ -91,7 +92,8 @@ def surface_figures(
 def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
     """PSNR and SSIM of the rendered map against the input images, by their names in metrics.json.
 
-    The map is rendered from the estimated poses of frames evenly spaced over the run.
+    The map is rendered from the estimated poses of frames evenly spaced over the run: a mesh that was fused from the
+    frames with its own colors, one that was extracted from the map with the map's.
 
     Args:
         run: a run with a mesh and a map.
@@ -108,14 +110,18 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
     mesh, map_file = _require_mesh(run), run.folder.map
     if not map_file.is_file():
         raise OutputError(f"{run.folder.path}: has no {map_file.name} to render")
-    scene = Scene.load(map_file)
+    scene = None if run.metrics.get("mesh_source") == "tsdf" else Scene.load(map_file)
     scores, coverage = [], []
     for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS, known_only=True), strict=True):
         try:
             frame = dataset[int(index)]
         except DatasetError:
             continue
-        color, depth = render_view(scene, mesh, dataset.camera, run.trajectory.poses[row])
+        pose = run.trajectory.poses[row]
+        if scene is None:
+            color, depth = render_colors(mesh.vertices, mesh.faces, mesh.colors, dataset.camera, pose)
+        else:
+            color, depth = render_view(scene, mesh, dataset.camera, pose)
         shown = depth > 0
         coverage.append(100 * float(shown.mean()))
         if shown.any():

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from spslam.camera import Camera
 from spslam.evaluation.run_output import Mesh
@@ -63,6 +62,8 @@ def novel_poses(
     Yields:
         `T_world_camera` [4, 4] of the candidates in free space.
     """
+    from scipy.spatial.transform import Rotation
+
     generator = np.random.default_rng(seed)
     for _ in range(_CANDIDATES_PER_VIEW * count if len(poses) else 0):
         first, second = generator.integers(len(poses), size=2)

@@ -15,15 +15,24 @@ from spslam.meshing.render import rasterize, render_mesh
 _ELEVATION = np.radians(48)
 _OVERVIEW = Camera(1200, 750, 1350.0, 1350.0, 599.5, 374.5)
 _TRAJECTORY_COLOR = (220, 38, 38)
+# A page has up to 13 images and a limit of its size; noise has 3 bytes per pixel in PNG and 1 in JPEG.
+_MAX_PNG_BYTES_PER_PIXEL, _JPEG_QUALITY = 1.2, 90
 
 
-def png_uri(image: np.ndarray, max_width: int = 480) -> str:
-    """Encodes an RGB image [H, W, 3] as a PNG data URI; images wider than `max_width` px are downscaled to it."""
+def image_uri(image: np.ndarray, max_width: int = 480) -> str:
+    """Encodes an RGB image [H, W, 3] as a data URI: PNG, or JPEG where PNG would need more than 1.2 bytes per pixel.
+
+    Images wider than `max_width` px are downscaled to it.
+    """
     height, width = image.shape[:2]
     if width > max_width:
-        image = cv2.resize(image, (max_width, round(height * max_width / width)), interpolation=cv2.INTER_AREA)
-    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
+        size = max_width, max(round(height * max_width / width), 1)
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    kind, data = "png", cv2.imencode(".png", image)[1]
+    if data.nbytes > _MAX_PNG_BYTES_PER_PIXEL * image.shape[0] * image.shape[1]:
+        kind, data = "jpeg", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
 def colorize_depth(depth: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
@@ -60,7 +69,7 @@ def render_overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndar
     Returns:
         uint8 RGB [H, W, 3], cropped.
     """
-    right, up, back = _axes(poses)
+    right, up, back = upright_axes(poses)
     low, high = np.percentile(mesh.vertices, (1, 99), axis=0)
     center = (low + high) / 2
     away = np.cos(_ELEVATION) * back + np.sin(_ELEVATION) * up
@@ -78,11 +87,11 @@ def render_overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndar
 
 def top_axes(poses: np.ndarray) -> np.ndarray:
     """[3, 2]: two horizontal axes, right and forward of the first camera, for a top view."""
-    right, _, back = _axes(poses)
+    right, _, back = upright_axes(poses)
     return np.stack([right, -back], axis=1)
 
 
-def _axes(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def upright_axes(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Right, up and backward, orthonormal; up is the mean up direction (negative y axis) of the cameras."""
     up = -poses[:, :3, 1].mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else -poses[0, :3, 1]

@@ -1,23 +1,27 @@
 """The HTML report: it shows all files of a run, leaves out missing ones, and is self-contained."""
 
+import base64
+import hashlib
 import json
 import re
+import zlib
 from html.parser import HTMLParser
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
 
-from spslam.camera import Camera
 from spslam.errors import OutputError
 from spslam.evaluation.charts import nice_ticks
 from spslam.evaluation.html_report import write_report
-from spslam.geometry import pose_from
+from spslam.evaluation.report_images import image_uri
+from spslam.evaluation.report_view import MAX_FACES
 from spslam.trajectory import Trajectory
+from tests.evaluation.finished_folder import write_run
 
-CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
-FRAMES = 30
+# What the 3-D view holds, deflated and in base64: any four letters may be in it.
+PICTURES = ("mesh", "previews")  # take most of a report's time
+PAYLOAD = r'<script type="(text/plain|application/json)".*?</script>|data:[^"]*'
 
 
 class Structure(HTMLParser):
@@ -49,44 +53,6 @@ def read(path):
     return page
 
 
-def trajectory_poses():
-    return np.stack([pose_from(np.eye(3), np.array([0.02 * i, 0.01 * np.sin(i), 0.03 * i])) for i in range(FRAMES)])
-
-
-def write_run(folder, mesh=True, ground_truth=True, log=True, previews=True, config=True):
-    folder.mkdir(exist_ok=True)
-    times, poses = np.arange(FRAMES) / 30, trajectory_poses()
-    lost = np.zeros(FRAMES, bool)
-    lost[12:14] = True
-    Trajectory(times, poses, lost).save_tum(folder / "trajectory.txt")
-    metrics = {"frames": FRAMES, "fps": 12.5, "ate_rmse_cm": 1.25, "wall_s": 3.0, "device_name": "<processor & co>"}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    if previews or ground_truth:
-        (folder / "previews").mkdir(exist_ok=True)
-        (folder / "previews" / "camera.json").write_text(json.dumps(vars(CAMERA)))
-    if ground_truth:
-        moved = pose_from(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([1.0, 2, 3])) @ poses
-        Trajectory(times[::2], moved[::2]).save_tum(folder / "previews" / "ground_truth.txt")
-    if previews:
-        for row in (0, FRAMES - 1):
-            cv2.imwrite(str(folder / "previews" / f"frame-{row:06d}.png"), np.full((48, 64, 3), 99, np.uint8))
-        cv2.imwrite(str(folder / "previews" / "depth-000000.png"), np.full((48, 64), 2000, np.uint16))
-    if mesh:
-        room = trimesh.creation.box((8, 6, 8)).subdivide().subdivide()
-        room.visual.vertex_colors = np.full((len(room.vertices), 4), 180, np.uint8)
-        room.export(folder / "mesh.ply")
-    if log:
-        lines = [
-            {"frame": i, "tracking_ms": 9.0, "encode_ms": 0, "mapping_ms": 80.0 * (i % 5 == 0),
-             "residual_cm": None if i == 0 else 0.5, "inlier_share": 0.9}
-            for i in range(FRAMES)
-        ]  # fmt: skip
-        (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    if config:
-        (folder / "config.yaml").write_text("# a <comment>\nseed: 0\n")
-    return folder
-
-
 def test_report_shows_all_sections_and_is_self_contained(tmp_path):
     path = write_report(write_run(tmp_path / "kitchen <1>"))
     assert path == tmp_path / "kitchen <1>" / "report.html"
@@ -95,8 +61,9 @@ def test_report_shows_all_sections_and_is_self_contained(tmp_path):
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert len(page.sources) == 1 + 4 + 3  # overview, a view with input depth, one without
     text = path.read_text()
-    assert "http" not in re.sub('data:[^"]*', "", text)
-    assert "<script" not in text
+    shown = re.sub(PAYLOAD, "", text, flags=re.DOTALL).replace('<meta http-equiv="Content-Security-Policy"', "")
+    assert "http" not in shown
+    assert not re.search(r"<[^>]* on\w+=", shown)
     for word in ("kitchen <1>", "<processor & co>", "Map", "Views", "Trajectory", "Error over time", "Time", "Tracking",
                  "All metrics", "Settings", "# a <comment>", "1.25 cm", "ground truth", "lost"):  # fmt: skip
         assert any(word in part for part in page.text), word
@@ -104,7 +71,7 @@ def test_report_shows_all_sections_and_is_self_contained(tmp_path):
 
 @pytest.mark.parametrize("missing", ["mesh", "ground_truth", "log", "previews", "config"])
 def test_missing_files_are_left_out(tmp_path, missing):
-    path = write_report(write_run(tmp_path, **{missing: False}))
+    path = write_report(write_run(tmp_path, (missing,)))
     headings = re.findall("<h2>(.*?)</h2>", path.read_text())
     removed = {"mesh": "Map", "ground_truth": "Error over time", "log": "Time", "previews": "Views", "config": ""}[
         missing
@@ -114,7 +81,7 @@ def test_missing_files_are_left_out(tmp_path, missing):
 
 
 def test_trajectory_and_metrics_are_sufficient(tmp_path):
-    run = write_run(tmp_path, mesh=False, ground_truth=False, log=False, previews=False, config=False)
+    run = write_run(tmp_path, ("mesh", "ground_truth", "log", "previews", "config"))
     assert re.findall("<h2>(.*?)</h2>", write_report(run).read_text()) == [
         "Trajectory",
         "As in the paper",
@@ -123,7 +90,7 @@ def test_trajectory_and_metrics_are_sufficient(tmp_path):
 
 
 def test_one_frame_is_sufficient(tmp_path):
-    run = write_run(tmp_path, ground_truth=False)
+    run = write_run(tmp_path, ("ground_truth",))
     Trajectory(np.zeros(1), np.eye(4)[None]).save_tum(run / "trajectory.txt")
     (run / "log.jsonl").write_text('{"tracking_ms": 0, "encode_ms": 1, "mapping_ms": 2}\n')
     read(write_report(run))
@@ -173,3 +140,92 @@ def test_ticks_are_round_and_span_the_range(low, high):
     assert ticks[0] <= low + 1e-12
     assert ticks[-1] >= high - 1e-9 * abs(high)
     assert 2 <= len(ticks) <= 12
+
+
+def scripts(text):
+    """What the page runs: its own scripts, and the library that they inflate."""
+    library = re.search(r'<script type="text/plain" id="view-library">(.*?)</script>', text)[1]
+    own = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    return [*own, zlib.decompress(base64.b64decode(library)).decode()]
+
+
+def test_policy_allows_the_scripts_of_the_page_alone(tmp_path):
+    text = write_report(write_run(tmp_path, PICTURES)).read_text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    allowed = re.search(r"script-src ([^;]*)", policy)[1].split()
+    found = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts(text)]
+    assert allowed == [f"'sha256-{digest}'" for digest in found]
+    assert policy.startswith("default-src 'none';")
+    assert "The MIT License" in scripts(text)[-1]
+
+
+def test_what_a_run_brings_cannot_leave_its_element(tmp_path):
+    evil = "</script></pre><script>alert(1)</script>"
+    run = write_run(tmp_path / "x", PICTURES)
+    (run / "config.yaml").write_text(f"# {evil}\n")
+    metrics = json.loads((run / "metrics.json").read_text()) | {"command": evil, evil: evil, "version": evil}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    text = write_report(run).read_text()
+    assert evil not in text
+    assert "alert(1)" not in "".join(scripts(text))
+    read(run / "report.html")
+
+
+def test_report_has_command_and_changed_options(tmp_path):
+    run = write_run(tmp_path, PICTURES)
+    (run / "config.yaml").write_text("preset: fast\nresolved: true\ndataset:\n  type: folder\n  path: my data\n")
+    command = "spslam run folder --data 'my data' --preset fast"
+    metrics = json.loads((run / "metrics.json").read_text()) | {"command": command}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    page = read(write_report(run))
+    text = "|".join(page.text)
+    assert command in text
+    assert "dataset.path|my data|null" in text
+    assert "preset|fast|balanced" in text
+    assert "tracking." not in text.partition("Command and options")[2].partition("All metrics")[0]
+
+
+@pytest.mark.parametrize("value", ["text", None, [1], {}, 1e999, True])
+def test_metrics_and_log_of_another_type_are_no_error(tmp_path, value):
+    run = write_run(tmp_path, PICTURES)
+    metrics = {key: value for key in ("frames", "fps", "ate_rmse_cm", "wall_s", "command", "tracking_iterations",
+                                      "first_mapping_s", "mesh_s", "skipped_frames")}  # fmt: skip
+    (run / "metrics.json").write_text(json.dumps(metrics).replace("Infinity", "1e999"))
+    line = {key: value for key in ("tracking_ms", "encode_ms", "residual_cm", "error_probability", "inlier_share")}
+    (run / "log.jsonl").write_text((json.dumps(line).replace("Infinity", "1e999") + "\n") * 30)
+    read(write_report(run))
+
+
+def test_page_of_a_large_mesh_and_a_long_run_stays_below_8_megabytes(tmp_path):
+    run = write_run(tmp_path, ("previews",), frames=5000, losses=tuple((i, i + 1) for i in range(10, 4990, 7)))
+    rows, columns = np.mgrid[:500, :500]
+    generator = np.random.default_rng(0)
+    points = np.stack([columns / 100, rows / 100, 3 + 0.05 * generator.random((500, 500))], axis=-1).reshape(-1, 3)
+    colors = generator.integers(0, 256, (250_000, 4), dtype=np.uint8)
+    corner = (500 * rows + columns)[:-1, :-1].reshape(-1, 1)
+    faces = np.concatenate([corner + (0, 1, 500), corner + (1, 501, 500)])
+    trimesh.Trimesh(points, faces, vertex_colors=colors, process=False).export(run / "mesh.ply")
+    text = write_report(run).read_text()
+    mesh = json.loads(re.search(r'id="view-data">(.*?)</script>', text)[1])["mesh"]
+    assert len(text.encode()) < 8_000_000
+    assert 100_000 < mesh["faces"] <= MAX_FACES
+    values = [json.loads(data) for data in re.findall(r'<script type="application/json">(.*?)</script>', text)]
+    assert len(values) == 6
+    assert all(len(chart["frames"]) <= 10 * 500 for chart in values)
+
+
+def test_what_no_page_can_hold_is_no_error(tmp_path):
+    run = write_run(tmp_path, PICTURES)
+    metrics = json.loads((run / "metrics.json").read_text()) | {"device_name": "\ud800", "fps": 1e308}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    lines = (run / "trajectory.txt").read_text().splitlines()
+    lines[5] = "0.133333 1e39 -1e39 1e39 0 0 0 1"
+    (run / "trajectory.txt").write_text("\n".join(lines) + "\n")
+    read(write_report(run))
+
+
+def test_pictures_that_png_does_not_suit_are_jpeg():
+    noise = np.random.default_rng(0).integers(0, 256, (400, 640, 3), dtype=np.uint8)
+    assert image_uri(noise).startswith("data:image/jpeg;base64,")
+    assert len(image_uri(noise)) < 300_000
+    assert image_uri(np.zeros((400, 640, 3), np.uint8)).startswith("data:image/png;base64,")
