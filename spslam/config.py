@@ -73,6 +73,11 @@ def dump_config(config: Config, header: Mapping[str, Any] | None = None) -> str:
     return comments + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 
+def restore_config(values: Mapping[str, Any]) -> Config:
+    """The configuration of `Config.model_dump(mode="json")`; raises ConfigError as `load_config`."""
+    return _validate(dict(values))
+
+
 def resolve_config_path(path: str | os.PathLike) -> Path:
     """The file that a path or a shipped configuration's name stands for; `configs/NAME.yaml` is found anywhere."""
     given = Path(path)

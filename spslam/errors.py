@@ -30,6 +30,10 @@ class DatasetError(SpslamError):
     """A file or a folder of a dataset is missing, unreadable or inconsistent; the message names it."""
 
 
+class SourceError(SpslamError):
+    """A live camera is missing, refuses a setting, or ends unexpectedly."""
+
+
 class OutputError(SpslamError):
     """A result cannot be written, or the output folder belongs to another run."""
 

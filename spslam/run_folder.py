@@ -31,10 +31,23 @@ class RunFolder:
         """Estimated trajectory in the TUM format."""
         return self.path / "trajectory.txt"
 
+    def segment(self, number: int) -> Path:
+        """Trajectory in the TUM format of what a lost camera saw, in axes of its own; `number` is from 1."""
+        return self.path / f"segment-{number}.txt"
+
+    def trajectory_of(self, recording: int) -> Path:
+        """Trajectory of one of the recordings of a merged map, counted from 0; its name counts from 1."""
+        return self.path / f"trajectory-{recording + 1}.txt"
+
     @property
     def map(self) -> Path:
         """The map: sparse volume, feature planes and decoders."""
         return self.path / "map.safetensors"
+
+    @property
+    def keyframes(self) -> Path:
+        """Keyframes and trajectories, by which the map is opened again; absent without a keyframe graph."""
+        return self.path / "keyframes.safetensors"
 
     @property
     def mesh(self) -> Path:
@@ -107,4 +120,9 @@ class RunFolder:
         """All files that a run or a later command may leave directly in the folder; `previews` is not among them."""
         meshes = [self.mesh_as(file_format) for file_format in MESH_FORMATS]
         others = [self.metrics, self.report, self.config, self.log, self.skipped, self.checkpoint]
-        return [self.trajectory, self.map, *meshes, *others]
+        return [self.trajectory, *sorted(self.path.glob("segment-*.txt")), self.map, self.keyframes, *meshes, *others]
+
+
+def is_merged(folder: RunFolder) -> bool:
+    """Whether a folder is of `spslam merge`: it has a trajectory of each recording, and none of its own."""
+    return not folder.trajectory.is_file() and folder.trajectory_of(0).is_file()

@@ -13,6 +13,7 @@ import numpy as np
 from spslam.errors import DatasetError, brief
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 from spslam.io import atomic_write
+from spslam.notebook import trajectory_html
 from spslam.reading import read_lines
 
 MAX_POSES = 1 << 20  # of a file: an hour of motion capture at 300 Hz
@@ -22,7 +23,7 @@ _SHORTEST, _LONGEST = 1e-100, 1e100  # of a quaternion
 _NO_POSE = " 0 0 0 0 0 0 1"
 
 
-@dataclass
+@dataclass(repr=False)
 class Trajectory:
     """Camera poses over time.
 
@@ -57,6 +58,14 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    def __repr__(self) -> str:
+        seconds = float(self.timestamps[-1] - self.timestamps[0]) if len(self) else 0.0
+        return f"Trajectory({len(self)} poses, {int(self.lost.sum())} lost, {seconds:.1f} s)"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the path from where it is widest, and its figures."""
+        return trajectory_html(self.timestamps, self.poses, self.lost)
 
     def mask_lost(self, ground_truth: np.ndarray) -> np.ndarray:
         """Ground-truth poses, float64 [F, 4, 4], set to NaN for the lost frames, to measure errors against."""

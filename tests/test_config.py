@@ -167,7 +167,7 @@ def test_wrong_file_is_one_clear_line(tmp_path, text, message):
     [
         ("7scene", "7scene: no such configuration; did you mean 7scenes?"),
         ("mine/7scenes.yaml", "mine/7scenes.yaml: no such configuration; did you mean 7scenes?"),
-        ("nothing.yaml", "nothing.yaml: no such configuration; shipped are 7scenes, demo,"),
+        ("nothing.yaml", "nothing.yaml: no such configuration; shipped are 7scenes, arkitscenes, azure_kinect,"),
         (".", ".: a configuration must be a YAML file, got a folder"),
     ],
 )

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from spslam.cli.parser import UsageError
 from spslam.config import config_names
 from spslam.errors import OutputError
 from spslam.options import PRESETS
@@ -29,21 +30,43 @@ def at_least_one(text: str) -> int:
 
 def positive_meters(text: str) -> float:
     """A length above 0."""
+    return _positive(text, "a length in meters")
+
+
+def positive_seconds(text: str) -> float:
+    """A time above 0."""
+    return _positive(text, "a time in seconds")
+
+
+def positive_hertz(text: str) -> float:
+    """A rate above 0."""
+    return _positive(text, "a rate in Hz")
+
+
+def _positive(text: str, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = 0.0
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a length in meters above 0, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be {what} above 0, got {text!r}")
     return value
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """CONFIG and what changes it."""
     parser.add_argument(
-        "config", metavar="CONFIG", help=f"a configuration file, or a shipped one: {', '.join(config_names())}"
+        "config",
+        metavar="CONFIG|PATH",
+        help="a recording (a folder, a ROS bag, ...), whose format is found out; or a configuration file, or a shipped "
+        f"one: {', '.join(config_names())}",
     )
-    parser.add_argument("--data", metavar="DIR", type=Path, help="folder of the data")
+    parser.add_argument("--data", metavar="PATH", type=Path, help="folder or file of the data, with CONFIG")
+    add_changes(parser)
+
+
+def add_changes(parser: argparse.ArgumentParser) -> None:
+    """Options that are changed on the command line."""
     parser.add_argument(
         "--set",
         metavar="SECTION.KEY=VALUE",
@@ -52,6 +75,41 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="change an option; may be given several times",
     )
+
+
+def choose_config(args: argparse.Namespace, quiet: bool = False) -> str:
+    """The configuration to load; of a recording in its place the one that reads it, with `args.data` set to it.
+
+    Args:
+        args: with `config` and `data`, as `add_config` gives them.
+        quiet: don't print what a recording was taken for.
+
+    Raises:
+        UsageError: a recording and `--data`.
+        DatasetError: a path that is of no format known, or none at all.
+    """
+    path = Path(args.config)
+    if not _names_recording(path):
+        return args.config
+    if args.data is not None:
+        raise UsageError(f"--data {args.data} needs a configuration, got the recording {path}")
+    from spslam.datasets.identify import identify_recording
+
+    found = identify_recording(path)
+    if not quiet:
+        print(f"{path}: taken for {found.description}, as with: {found.config} --data {path}", flush=True)
+    args.data = path
+    return found.config
+
+
+def _names_recording(path: Path) -> bool:
+    """Whether CONFIG is a recording: a folder, or what ends like one. A shipped configuration's name never is."""
+    if str(path) in config_names() or path.suffix in (".yaml", ".yml"):
+        return False
+    # Imported late: OpenCV and others take a while, which --help need not wait for.
+    from spslam.datasets.identify import RECORDING_SUFFIXES
+
+    return path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES
 
 
 def add_preset(parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from spslam.cli.arguments import add_device, add_quiet, at_least_one, overrides
@@ -44,7 +45,7 @@ def execute(args: argparse.Namespace) -> None:
     _remove_earlier_demo(RunFolder(args.output))
     frames = None if args.frames is None else slice(0, args.frames, 1)
     command = f"{command_name()} run demo" + ("" if frames is None else f" --frames 0:{args.frames}")
-    run(make_request(config, args.output, frames), args.quiet, command)
+    run(replace(make_request(config, args.output, frames), command=args.command_line), args.quiet, command)
     if not args.quiet:
         print("comparing the mesh with the room's exact surface", file=sys.stderr, flush=True)
     metrics = _evaluate(RunFolder(args.output))

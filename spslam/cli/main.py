@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -20,9 +21,13 @@ EXIT_INTERRUPTED = 130
 COMMANDS = {
     "run": "track and map an RGB-D sequence",
     "demo": "track and map a generated room with known ground truth; needs no data",
+    "live": "track and map a camera as its frames come, or a recording played back at its own pace",
     "eval": "evaluate a finished run against ground truth",
+    "view": "show a finished run in a browser",
+    "merge": "join the maps of finished runs that share a place",
     "mesh": "extract a mesh from the map of a finished run",
     "download": "download a public dataset",
+    "import": "copy a recording of any format into a folder of images",
     "check-data": "check a dataset for problems before running on it",
     "bench": "run a benchmark suite and compare the results with the paper",
     "pretrain": "train the scene prior on procedurally generated solids",
@@ -60,6 +65,7 @@ def _run(arguments: list[str]) -> None:
     if args.command is None:
         parser.print_help()
         return
+    args.command_line = shlex.join(["spslam", *arguments])
     _module(args.command).execute(args)
 
 
@@ -91,7 +97,8 @@ def _add_debug(parser: Parser) -> None:
 
 
 def _module(command: str):
-    return importlib.import_module(f"spslam.cli.{command.replace('-', '_')}")
+    name = {"import": "import_recording"}.get(command, command.replace("-", "_"))  # `import` is a keyword
+    return importlib.import_module(f"spslam.cli.{name}")
 
 
 def _fail(text: str, code: int, arguments: Sequence[str]) -> int:

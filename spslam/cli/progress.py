@@ -98,13 +98,17 @@ def print_summary(metrics: Mapping[str, Any], output: Path) -> None:
     """Prints the most important metrics and the paths of the results."""
     for name, value in summarize(metrics, output):
         print(f"{name:<14}{value}")
+    for warning in metrics.get("warnings", ()):
+        print(f"! {warning}")
 
 
 def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]:
     """Rows (name, value) of the summary of a run; metrics that were not measured are left out."""
-    rows = [("frames", _frames(metrics))]
+    rows = [("frames", _frames(metrics)), *_verdict(metrics)]
     for name, key, form in (
         ("speed", "fps", "{:.1f} frames/s"),
+        ("latency", "latency_p50_ms", "{:.0f} ms"),
+        ("latency p99", "latency_p99_ms", "{:.0f} ms"),
         ("ATE RMSE", "ate_rmse_cm", "{:.2f} cm"),
         ("RPE", "rpe_cm", "{:.2f} cm/frame"),
         ("accuracy", "accuracy_cm", "{:.2f} cm"),
@@ -125,10 +129,22 @@ def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]
     return rows
 
 
+def _verdict(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    if "verdict" not in metrics:
+        return []
+    unknown = "" if "ate_rmse_cm" in metrics else "; scale and error unknown, as there is no ground truth"
+    return [("verdict", f"{metrics['verdict']}{unknown}")]
+
+
 def _frames(metrics: Mapping[str, Any]) -> str:
     details = [
         f"{metrics[key]} {word}"
-        for key, word in (("lost_frames", "lost"), ("skipped_frames", "skipped"))
+        for key, word in (
+            ("lost_frames", "lost"),
+            ("skipped_frames", "skipped"),
+            ("dropped_frames", "dropped"),
+            ("unrecorded_frames", "not recorded"),
+        )
         if metrics.get(key)
     ]
     return f"{metrics.get('frames', 0)}" + (f" ({', '.join(details)})" if details else "")

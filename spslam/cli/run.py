@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from spslam.cli.arguments import add_config, add_device, add_preset, add_quiet, frame_range, overrides
+from spslam.cli.arguments import add_config, add_device, add_preset, add_quiet, choose_config, frame_range, overrides
 from spslam.cli.parser import UsageError
 from spslam.cli.progress import make_progress, print_summary
-from spslam.config import Config, load_config, resolve_config_path
+from spslam.cli.viewing import add_view, opened_viewer
+from spslam.config import Config, load_config
 from spslam.errors import DeviceError
 from spslam.run.reader_launch import end_standby, launch_standby
 from spslam.run.request import RunRequest
 from spslam.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from spslam.run.observer import RunObserver
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,20 +28,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", metavar="DIR", type=Path, help="output folder; runs/CONFIG-TIME if not given")
     add_device(parser)
     parser.add_argument("--frames", metavar="START:STOP[:STEP]", type=frame_range, help="only these frames")
+    parser.add_argument(
+        "--map", metavar="OUTPUT", type=Path, help="go on in the map of a finished run: find the camera in it first"
+    )
     parser.add_argument("--seed", metavar="N", type=int, help="seed of all random draws")
     parser.add_argument("--resume", action="store_true", help="continue the interrupted run in --output")
     parser.add_argument("--no-mesh", action="store_true", help="leave out the mesh")
+    add_view(parser)
     add_quiet(parser)
 
 
 def execute(args: argparse.Namespace) -> None:
-    config = load_config(args.config, args.preset, overrides(args))
     if args.resume and args.output is None:
         raise UsageError("--resume needs the interrupted run's folder as --output")
     output = args.output or default_output(args.config)
+    config = load_config(choose_config(args, args.quiet), args.preset, overrides(args))
     folder = RunFolder(output)
     was_finished = args.resume and folder.metrics.is_file() and not folder.checkpoint.is_file()
-    metrics = run(make_request(config, output, args.frames, args.resume, not args.no_mesh), args.quiet)
+    request = make_request(config, output, args.frames, args.resume, not args.no_mesh)
+    request = replace(request, map=args.map, command=args.command_line)
+    with opened_viewer(args, f"spslam run {args.config}") as viewer:
+        metrics = run(request, args.quiet, observer=viewer)
     if not args.quiet:
         if was_finished:
             print("this run had finished before; nothing was left to do")
@@ -51,13 +63,16 @@ def make_request(
     return RunRequest(config, data, output, frames, resume, mesh)
 
 
-def run(request: RunRequest, quiet: bool, command: str = "the same command with") -> dict[str, Any]:
+def run(
+    request: RunRequest, quiet: bool, command: str = "the same command with", observer: RunObserver | None = None
+) -> dict[str, Any]:
     """Runs a request with a progress display.
 
     Args:
         request: what to run.
         quiet: show no progress.
         command: how to run it again; with `--resume` after it, it continues an interrupted run.
+        observer: watches the run.
 
     Returns:
         What is written to metrics.json.
@@ -77,7 +92,7 @@ def run(request: RunRequest, quiet: bool, command: str = "the same command with"
     progress = make_progress(quiet)
     resume = f"{command} --output {request.output_dir} --resume continues"
     try:
-        return run_sequence(request, progress)
+        return run_sequence(request, progress, observer)
     except KeyboardInterrupt:
         if _can_resume(request.output_dir):
             raise KeyboardInterrupt(resume) from None
@@ -97,5 +112,10 @@ def _can_resume(output: Path) -> bool:
 
 
 def default_output(config: str) -> Path:
-    """`runs/<configuration>-<time>`."""
-    return Path("runs") / f"{resolve_config_path(config).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    """`runs/<name>-<time>`, the name being that of the configuration or of the recording."""
+    return timed_output(Path(config).resolve().stem)
+
+
+def timed_output(name: str) -> Path:
+    """`runs/<name>-<time>`."""
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"

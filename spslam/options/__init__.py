@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
+from spslam.options.graph import GraphOptions
 from spslam.options.mapping import LossOptions, MappingOptions, PixelOptions, SamplingOptions
 from spslam.options.reading import DATASET_TYPES, DatasetOptions, RunOptions
 from spslam.options.scene import MeshOptions, PriorOptions, SceneOptions
@@ -22,6 +23,7 @@ __all__ = [
     "PRESETS",
     "Config",
     "DatasetOptions",
+    "GraphOptions",
     "LossOptions",
     "MappingOptions",
     "MeshOptions",
@@ -55,5 +57,6 @@ class Config(Section):
     mapping: MappingOptions
     pixels: PixelOptions
     prior: PriorOptions
+    graph: GraphOptions
     mesh: MeshOptions
     run: RunOptions

@@ -4,15 +4,45 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-from spslam.options.needs import is_, is_not, need
+from spslam.options.needs import Need, is_, is_not, need
 from spslam.options.section import Section, option
 
-DatasetType = Literal["generated", "places", "7scenes", "tum", "replica", "synthetic_rgbd", "scannet", "folder"]
+# Color and depth are of two cameras, or of two sizes.
+TwoCameras = Literal[
+    "rosbag",
+    "realsense",
+    "azure_kinect",
+    "stray_scanner",
+    "record3d",
+    "scannetpp",
+    "arkitscenes",
+    "open3d",
+    "video",
+]
+DatasetType = Literal[
+    "generated",
+    "places",
+    "7scenes",
+    "tum",
+    "replica",
+    "synthetic_rgbd",
+    "scannet",
+    "folder",
+    TwoCameras,
+    "bonn",
+    "icl_nuim",
+]
 DATASET_TYPES: tuple[str, ...] = get_args(DatasetType)
 
 _GENERATED = need(is_("dataset.type", "generated"))
 _PLACES = need(is_("dataset.type", "places"))
 _RENDERED = need(is_("dataset.type", "generated"), is_("dataset.type", "places"))
+
+
+def _of(*types: str) -> tuple[Need, ...]:
+    return (need(*(is_("dataset.type", name) for name in types)),)
+
+
 _READ_FROM_FILES = (need(is_not("dataset.type", "generated")), need(is_not("dataset.type", "places")))
 PlaceName = Literal["room", "apartment", "stairwell", "arcade", "desk", "hall"]
 MotionName = Literal["handheld", "walking", "fast_turns", "stop_and_go"]
@@ -42,8 +72,42 @@ class DatasetOptions(Section):
     depth_scale: float | None = option(
         "depth units per meter; null takes the value from the files",
         "1/m",
-        needs=(need(is_("dataset.type", "folder")),),
+        needs=_of("folder", "rosbag", "realsense", "open3d", "video"),
+        ge=1e-3,
+        le=1e9,
+    )
+    register_to: Literal["depth", "color"] = option(
+        "the camera to whose view color and depth of two cameras, or of two sizes, are brought; the trajectory is that "
+        "camera's. `depth` leaves depth as it was measured",
+        needs=_of("folder", *get_args(TwoCameras)),
+    )
+    registered: bool | None = option(
+        "whether depth is in the color camera's view already; null finds out by the recording's frames",
+        needs=_of("rosbag", "realsense"),
+    )
+    pair_tolerance_s: float = option(
+        "color and depth images are one frame if they are less apart in time; the nearest are paired first",
+        "s",
+        needs=_of("rosbag", "realsense", "azure_kinect", "arkitscenes", "video"),
         gt=0,
+        le=10,
+    )
+    min_confidence: int = option(
+        "depth of lower confidence is treated as missing: 0 none, 1 low, 2 low and medium (phones: ARKit's levels)",
+        needs=_of("folder", "stray_scanner", "record3d", "arkitscenes"),
+        ge=0,
+        le=255,
+    )
+    color_topic: str | None = option("topic of color images; null finds it", needs=_of("rosbag"))
+    depth_topic: str | None = option("topic of depth images; null finds it", needs=_of("rosbag"))
+    pose_topic: str | None = option(
+        "topic of reference poses (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped); null takes the "
+        "transforms",
+        needs=_of("rosbag"),
+    )
+    world_frame: str | None = option(
+        "frame in which the transforms give the reference poses; null is the root of the color camera's frame",
+        needs=_of("rosbag"),
     )
     frames: int = option(
         "length of the sequence; the path is a loop (300 frames for `generated`), which is repeated as needed",
@@ -106,5 +170,9 @@ class RunOptions(Section):
     )
     prefetch_ahead: int | None = option(
         "maximum number of frames read ahead; null is two per thread, at least 8", "frames", ge=1
+    )
+    data_check: Literal["stop", "warn", "skip"] = option(
+        "what to do if the first frames plainly do not fit together (intrinsics, scale, pairing, order): `stop` ends "
+        "the run before it begins, `warn` only says so, `skip` does not look"
     )
     previews: int = option("input frames saved as images for the report", "frames", ge=0)

@@ -10,12 +10,19 @@ from spslam.options.section import Section, option
 _ENABLED = is_("prior.enabled", True)
 _PRIOR = need(_ENABLED)
 
+TRUNCATION_VOXELS = 2  # the truncation in voxels that the shipped prior was trained for
+
 
 class SceneOptions(Section):
     """The map: sparse volume, tri-planes and world frame."""
 
     voxel_size_m: float = option("edge length of a voxel of the sparse volume", "m", gt=0, le=1)
-    truncation_m: float = option("truncation distance tr of the signed distance", "m", gt=0, le=4)
+    truncation_m: float | None = option(
+        "truncation distance tr of the signed distance; null is two voxels, which the pretrained decoder needs",
+        "m",
+        gt=0,
+        le=4,
+    )
     plane_cell_m: float = option("edge length of a tri-plane cell", "m", gt=0, le=4)
     position_scale: float = option("scale of the position that the geometry decoder takes as input", "1/m", gt=0)
     first_pose: Literal["dataset", "identity"] = option(
@@ -24,8 +31,13 @@ class SceneOptions(Section):
     max_voxels: int = option("maximum number of voxel vertices in the volume", "vertices", ge=1000)
     max_texels: int = option("maximum number of texels in the tri-planes", "texels", ge=1000)
 
+    @property
+    def truncation(self) -> float:
+        """The truncation distance in use, m."""
+        return TRUNCATION_VOXELS * self.voxel_size_m if self.truncation_m is None else self.truncation_m
+
     def check(self) -> None:
-        if self.truncation_m < self.voxel_size_m:
+        if self.truncation < self.voxel_size_m:
             raise ValueError(f"scene.truncation_m must be at least scene.voxel_size_m, got {self.truncation_m}")
 
 
@@ -57,4 +69,16 @@ class PriorOptions(Section):
 class MeshOptions(Section):
     """The mesh written at the end."""
 
-    resolution_m: float = option("edge length of a marching-cubes cell", "m", gt=0, le=1)
+    source: Literal["tsdf", "neural"] = option(
+        "`tsdf` reads all frames again and fuses them at their final poses into a truncated signed distance field, the "
+        "map filling in where no frame measured anything; `neural` extracts the map alone, which needs no frames"
+    )
+    resolution_m: float = option(
+        "edge length of a voxel of `tsdf`, or of a marching-cubes cell of `neural`", "m", gt=0, le=1
+    )
+    max_memory_mb: int = option(
+        "memory of the voxels; where they would need more, voxels 1.5 times as large are taken",
+        "MB",
+        needs=(need(is_("mesh.source", "tsdf")),),
+        ge=1,
+    )

@@ -74,6 +74,11 @@ class TrackingOptions(Section):
         "repeat tracking from poses found by projective ICP if a frame fits the map badly; with `adam` only if "
         "tracking failed"
     )
+    features: bool = option(
+        "keep image features (ORB) of every 30th frame, and track a doubtful or lost frame also from the poses that "
+        "they give",
+        needs=(need(is_("tracking.recovery", True)),),
+    )
     recovery_min_robust_weight: float = option(
         "recover and verify when the mean robust weight of the pixels is below this", ge=0, le=1
     )

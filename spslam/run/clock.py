@@ -28,6 +28,10 @@ class RunClock:
         """Starts timing the frame loop; to be called once."""
         self._loop_started = time.perf_counter()
 
+    def leave_out(self, seconds: float) -> None:
+        """Leaves out time in which the loop waited for its user."""
+        self._loop_started += seconds
+
     def update(self, frames: int, decode_s: float) -> None:
         """Sets the totals: those of earlier sessions plus this one's.
 

@@ -8,6 +8,7 @@ from spslam.errors import DatasetError
 from spslam.run.checkpoint_writer import CheckpointWriter
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.interruption import Interruption
+from spslam.run.observer import RunObserver
 from spslam.run.output_folder import RunLog
 from spslam.run.session import RunSession
 from spslam.slam.frame_report import FrameReport, PendingReport
@@ -26,10 +27,19 @@ class RunLoop:
         session: of the run; its clock is kept up to date.
         progress: called after each frame with (frames done, total frames, report of the frame or None if the frame
             could not be read).
+        observer: watches the run and may pause it between two frames.
     """
 
-    def __init__(self, system: SlamSystem, feed: FrameFeed, session: RunSession, progress: Progress | None):
+    def __init__(
+        self,
+        system: SlamSystem,
+        feed: FrameFeed,
+        session: RunSession,
+        progress: Progress | None,
+        observer: RunObserver | None = None,
+    ):
         self.system, self.feed, self.session, self.progress = system, feed, session, progress
+        self.observer = observer or RunObserver()
         self._pending: deque[tuple[int, PendingReport | None]] = deque()
 
     def run(self) -> None:
@@ -66,6 +76,9 @@ class RunLoop:
             if done < self.session.total and _is_checkpoint_due(every, last_saved, done) and not writer.is_busy:
                 self._save(done, log, writer)
                 last_saved = done
+            self._wait_while_paused(log, interruption)
+            if interruption.requested:
+                break
         if interruption.requested:
             if every > 0:
                 self._save(done, log, writer)
@@ -73,6 +86,13 @@ class RunLoop:
         self.system.finish()
         self._flush_reports(log, wait=True)
         self._update_clock(done)
+        self.observer.finish()
+
+    def _wait_while_paused(self, log: RunLog, interruption: Interruption) -> None:
+        """Waits where the observer wants it; that time is not the run's."""
+        if self.observer.is_paused():
+            self._flush_reports(log, wait=True)
+            self.session.clock.leave_out(self.observer.wait(lambda: interruption.requested))
 
     def _submit(self, item: PreparedFrame | DatasetError, position: int) -> PendingReport | None:
         if isinstance(item, DatasetError):
@@ -87,6 +107,7 @@ class RunLoop:
             report = pending.result() if pending else None
             if report:
                 log.append(report.log_row())
+                self.observer.observe(report)
             if self.progress:
                 self.progress(done, self.session.total, report)
 

@@ -5,8 +5,7 @@ import errno
 import fcntl
 import json
 import os
-import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,13 +14,11 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.base import RgbdDataset
+from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.html_report import write_report
 from spslam.io import atomic_write, writing
-from spslam.meshing import extract_mesh, save_mesh
 from spslam.run_folder import RunFolder
-from spslam.scene import Scene
 from spslam.trajectory import Trajectory
 
 # Error codes of flock on file systems without locks.
@@ -158,41 +155,22 @@ class OutputFolder(RunFolder):
         """Position and error of the frames that could not be read, in order."""
         return [json.loads(line) for line in _complete_lines(self.skipped)]
 
-    def write_mesh(self, scene: Scene, resolution_m: float, camera: Camera, poses: np.ndarray) -> float:
-        """Extracts and writes the mesh.
-
-        Args:
-            scene: the map.
-            resolution_m: edge of a marching-cubes cell, in meters.
-            camera: intrinsics of the frames.
-            poses: float64 [F, 4, 4] T_world_camera; surface that none of them sees is left out.
-
-        Returns:
-            Seconds taken.
-        """
-        started = time.perf_counter()
-        save_mesh(extract_mesh(scene, resolution_m, camera, poses), self.mesh)
-        return time.perf_counter() - started
-
     def write_previews(
-        self, dataset: RgbdDataset, indices: list[int], ground_truth: np.ndarray | None, count: int
+        self, camera: Camera, frames: Iterable[tuple[int, RgbdFrame]], ground_truth: Trajectory | None
     ) -> None:
         """Writes what the report shows of the input: camera, ground truth and some frames.
 
         Args:
-            dataset: of the run.
-            indices: index in the dataset of each row of the trajectory.
-            ground_truth: float64 [len(dataset), 4, 4], NaN where unknown; None if there is none.
-            count: number of frames, spread evenly over the run.
+            camera: of the frames.
+            frames: row in the trajectory and frame, for each image that is wanted.
+            ground_truth: poses where they are known; None if none is.
         """
         with writing(self.previews):
             self.previews.mkdir(exist_ok=True)
-        atomic_write(self.preview_camera, json.dumps(vars(dataset.camera)) + "\n")
+        atomic_write(self.preview_camera, json.dumps(vars(camera)) + "\n")
         if ground_truth is not None:
-            known = np.isfinite(ground_truth).all((1, 2))
-            Trajectory(dataset.timestamps()[known], ground_truth[known]).save_tum(self.preview_ground_truth)
-        for row in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int)).tolist():
-            frame = dataset[indices[row]]
+            ground_truth.save_tum(self.preview_ground_truth)
+        for row, frame in frames:
             millimeters = np.nan_to_num(np.rint(1000 * frame.depth), nan=0.0)
             depth = np.clip(millimeters, 0, np.iinfo(np.uint16).max).astype(np.uint16)
             _write_png(self.color_preview(row), cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))

@@ -165,7 +165,9 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         if message.slot is None:
             raise StopIteration
         pixels = self._take(message.slot, message.valid_depth_share)
-        return PreparedFrame(message.index, message.timestamp, pixels, message.decode_ms, signature=message.signature)
+        prepared = PreparedFrame(message.index, message.timestamp, pixels, message.decode_ms)
+        prepared.signature, prepared.features = message.signature, message.features
+        return prepared
 
     def _take(self, slot: int, valid_depth_share: float) -> FramePixels | Upload:
         """A copy of the pixels in a slot, or their upload."""

@@ -19,6 +19,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
+from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import FramePreparation
 
@@ -56,7 +57,7 @@ class Message:
     Attributes:
         read_ms: time that a reading thread spent on the frame.
         slot: slot that holds the frame's pixels; None where there is no frame.
-        index, timestamp, decode_ms, signature: as in `PreparedFrame`.
+        index, timestamp, decode_ms, signature, features: as in `PreparedFrame`.
         valid_depth_share: as in `FramePixels`.
         error: of a frame that can't be read.
         failure: traceback of an exception that is not the data's fault; the process then ends.
@@ -69,6 +70,7 @@ class Message:
     decode_ms: float = 0.0
     valid_depth_share: float = 0.0
     signature: FrameSignature | None = None
+    features: ImageFeatures | None = None
     error: DatasetError | None = None
     failure: str | None = None
 
@@ -125,8 +127,8 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
                 continue
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
-            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, frame.signature)
-            connection.send(Message(read_ms, slot, *described))
+            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
+            connection.send(Message(read_ms, slot, *described, frame.signature, frame.features))
     connection.send(Message())
     # Stay until the loop closes the connection: it still returns slots.
     with contextlib.suppress(*DISCONNECTED):

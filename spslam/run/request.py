@@ -21,6 +21,8 @@ class RunRequest:
         frames: which frames of the dataset to process; None for all.
         resume: continue from the checkpoint in `output_dir` if there is one.
         mesh: whether to extract the mesh.
+        map: output folder of a finished run in whose map the run goes on; None begins a new one.
+        command: the command line of the run, for metrics.json and the report; empty where there was none.
     """
 
     config: Config
@@ -29,6 +31,8 @@ class RunRequest:
     frames: slice | None = None
     resume: bool = False
     mesh: bool = True
+    map: Path | None = None
+    command: str = ""
 
 
 def parse_frames(text: str) -> slice:

@@ -1,33 +1,35 @@
 """SLAM over a sequence: from a dataset to an output folder."""
 
-import contextlib
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
-from spslam import ops
 from spslam.config import Config
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
+from spslam.notebook import RunProgress, in_notebook
+from spslam.run.data_check import check_data
 from spslam.run.device import explained_failures, resolve_device
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.loop import Progress, RunLoop
+from spslam.run.observer import ObservedRun, RunObserver
 from spslam.run.output_folder import OutputFolder
 from spslam.run.request import RunRequest
-from spslam.run.results import write_results
-from spslam.run.session import finished_metrics, open_session
+from spslam.run.results import RunInput, write_results
+from spslam.run.session import RunSession, finished_metrics, open_session
+from spslam.run.threads import kernel_threads_limited, library_threads_limited
 from spslam.run.warm_up import warm_up
 from spslam.slam.system import SlamSystem
 
-__all__ = ["Progress", "RunRequest", "run_sequence"]
+__all__ = ["Progress", "RunRequest", "first_pose", "run_sequence"]
 
 
-def run_sequence(request: RunRequest, progress: Progress | None = None) -> dict[str, Any]:
+def run_sequence(
+    request: RunRequest, progress: Progress | None = None, observer: RunObserver | None = None
+) -> dict[str, Any]:
     """Runs SLAM over a sequence and writes trajectory, map, mesh, metrics, log and report.
 
     A request that resumes a finished run returns its metrics and changes nothing.
@@ -35,13 +37,15 @@ def run_sequence(request: RunRequest, progress: Progress | None = None) -> dict[
     Args:
         request: options, data and output folder.
         progress: called after each frame with (frames done, total frames, report of the frame or None if the frame
-            could not be read).
+            could not be read). In a notebook, None shows a progress bar in the cell.
+        observer: watches the run, as the viewer does (`spslam.viewer`); results are the same without it.
 
     Returns:
         What is written to metrics.json.
 
     Raises:
-        SpslamError: one line about what is wrong with the data, the options, the device or the output folder.
+        SpslamError: one line about what is wrong with the data, the options, the device or the output folder; with
+            `run.data_check: stop` also where the first frames plainly do not fit together.
         KeyboardInterrupt: after Ctrl-C, between two frames.
 
     Example:
@@ -50,60 +54,53 @@ def run_sequence(request: RunRequest, progress: Progress | None = None) -> dict[
         30
     """
     device = resolve_device(request.config.device)
-    with _library_threads_limited(), explained_failures(device):
-        return _run(request, device, progress)
+    if progress is None and in_notebook():
+        progress = RunProgress()
+    with library_threads_limited(), explained_failures(device):
+        return _run(request, device, progress, observer or RunObserver())
 
 
-@contextlib.contextmanager
-def _library_threads_limited() -> Iterator[None]:
-    """Restricts torch and OpenCV to one thread each: theirs would compete with the kernels and the reading threads."""
-    threads, decoder_threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(decoder_threads)
-
-
-@contextlib.contextmanager
-def _kernel_threads_limited(device: torch.device) -> Iterator[None]:
-    """On CUDA, restricts the CPU kernels to one thread: they only sample frames, one on each reading thread."""
-    threads = ops.get_num_threads()
-    if device.type == "cuda":
-        ops.set_num_threads(1)
-    try:
-        yield
-    finally:
-        ops.set_num_threads(threads)
-
-
-def _run(request: RunRequest, device: torch.device, progress: Progress | None) -> dict[str, Any]:
+def _run(request: RunRequest, device: torch.device, progress: Progress | None, observer: RunObserver) -> dict[str, Any]:
     started = time.perf_counter()
     dataset = open_sequence(request.config.dataset, request.data_dir, request.frames)
-    system = SlamSystem(request.config, dataset.camera, _first_pose(request.config, dataset), device)
+    warnings = check_data(request, dataset)
+    system = SlamSystem(request.config, dataset.camera, first_pose(request.config, dataset), device)
+    if request.map is not None:
+        system.open_map(request.map)
     with OutputFolder(Path(request.output_dir)).locked():
         finished = finished_metrics(request, dataset)
-        return _process(request, dataset, system, progress, started) if finished is None else finished
+        if finished is not None:
+            return finished
+        session = open_session(request, dataset, system, warnings)
+        earlier = session.folder.read_log() if session.start else []
+        observer.begin(ObservedRun.of(request, dataset, earlier), system.state)
+        with FrameFeed(dataset, request.config, device, session.start) as feed:
+            _process(feed, system, session, progress, observer, started)
+        frames = system.state.frames
+        indices = frames.indices[frames.opened :].tolist()
+        source = RunInput.of_dataset(dataset, indices, request.config.run.previews)
+        return write_results(system, source, request, session)
 
 
 def _process(
-    request: RunRequest, dataset: RgbdDataset, system: SlamSystem, progress: Progress | None, started: float
-) -> dict[str, Any]:
-    config, device = request.config, system.device
-    session = open_session(request, dataset, system)
-    with FrameFeed(dataset, config, device, session.start) as feed:
-        if device.type == "cuda":
-            warm_up(config, dataset.camera, device)
-            torch.cuda.reset_peak_memory_stats(device)
-        feed.prepare()
-        session.clock.start_s = time.perf_counter() - started
-        with _kernel_threads_limited(device):
-            RunLoop(system, feed, session, progress).run()
-    return write_results(system, dataset, request, session)
+    feed: FrameFeed,
+    system: SlamSystem,
+    session: RunSession,
+    progress: Progress | None,
+    observer: RunObserver,
+    started: float,
+) -> None:
+    device = system.device
+    if device.type == "cuda":
+        warm_up(system.config, system.camera, device)
+        torch.cuda.reset_peak_memory_stats(device)
+    feed.prepare()
+    session.clock.start_s = time.perf_counter() - started
+    with kernel_threads_limited(device):
+        RunLoop(system, feed, session, progress, observer).run()
 
 
-def _first_pose(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
+def first_pose(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
+    """The pose that a run over a dataset begins at, float64 [4, 4]; None where it is to be the identity."""
     poses = dataset.poses() if config.scene.first_pose == "dataset" else None
     return poses[0] if poses is not None and bool(np.isfinite(poses[0]).all()) else None

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from spslam.run.clock import RunClock
 from spslam.run.output_folder import OutputFolder
 from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest
+from spslam.run_folder import RunFolder
 from spslam.slam.checkpoint import fingerprint, load_checkpoint
 from spslam.slam.system import SlamSystem
 
@@ -28,6 +30,7 @@ class RunSession:
         total: number of frames of the whole run.
         start: position of the first frame to process.
         clock: continues the earlier sessions'.
+        warnings: doubts about the data, from a look at the first frames.
     """
 
     folder: OutputFolder
@@ -35,30 +38,34 @@ class RunSession:
     total: int
     start: int
     clock: RunClock
+    warnings: Sequence[str] = ()
 
 
-def open_session(request: RunRequest, dataset: RgbdDataset, system: SlamSystem) -> RunSession:
+def open_session(
+    request: RunRequest, dataset: RgbdDataset, system: SlamSystem, warnings: Sequence[str] = ()
+) -> RunSession:
     """Creates the output folder, or restores the system from the folder's checkpoint.
 
     Args:
         request: of the run.
         dataset: its frames.
         system: new; its state is restored from the checkpoint if the request resumes one.
+        warnings: doubts about the data.
 
     Raises:
         OutputError: the folder can't be used, or its checkpoint belongs to another run.
     """
-    folder, identity = OutputFolder(Path(request.output_dir)), identity_of(dataset, request.data_dir)
+    folder, identity = OutputFolder(Path(request.output_dir)), identity_of(dataset, request)
     if request.resume and folder.checkpoint.exists():
         saved = load_checkpoint(folder.checkpoint, system.state, system.config)
         if saved["data"] != identity:
             raise OutputError(f"{folder.path}: belongs to a run over other data or frames; use another --output")
         folder.remove_temporaries()
-        folder.truncate_log(len(system.state.frames), saved["next"])
-        return RunSession(folder, identity, len(dataset), saved["next"], RunClock(**saved["clock"]))
+        folder.truncate_log(system.state.frames.processed, saved["next"])
+        return RunSession(folder, identity, len(dataset), saved["next"], RunClock(**saved["clock"]), warnings)
     folder.create(request.resume)
     atomic_write(folder.config, dump_config(system.config, provenance(system.config, system.device)))
-    return RunSession(folder, identity, len(dataset), 0, RunClock())
+    return RunSession(folder, identity, len(dataset), 0, RunClock(), warnings)
 
 
 def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any] | None:
@@ -73,7 +80,7 @@ def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any
     try:
         metrics = json.loads(folder.metrics.read_text(encoding="utf-8"))
         same = fingerprint(load_config(folder.config)) == fingerprint(request.config)
-        same = same and metrics["data"] == identity_of(dataset, request.data_dir)
+        same = same and metrics["data"] == identity_of(dataset, request)
     except (OSError, ValueError, KeyError, TypeError, ConfigError):
         same = False
     if not same:
@@ -81,10 +88,20 @@ def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any
     return metrics
 
 
-def identity_of(dataset: RgbdDataset, data_dir: Path | None) -> dict[str, Any]:
-    """JSON object that identifies the frames of a run."""
+def identity_of(dataset: RgbdDataset, request: RunRequest) -> dict[str, Any]:
+    """JSON object that identifies the frames of a run, and the map that it goes on in."""
+    opened = {} if request.map is None else {"map": _digest(RunFolder(request.map).keyframes)}
     return {
-        "folder": str(Path(data_dir).resolve()) if data_dir else "",
+        **opened,
+        "folder": str(Path(request.data_dir).resolve()) if request.data_dir else "",
         "frames": len(dataset),
         "timestamps": hashlib.sha256(dataset.timestamps().tobytes()).hexdigest()[:16],
     }
+
+
+def _digest(path: Path) -> str:
+    """Identifies the content of a file."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise OutputError(f"{path}: can't be read: {error.strerror or error}") from None

@@ -22,25 +22,31 @@ WAVES = 6  # across the image
 def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameReport]:
     """Processes a few synthetic frames of a wall with a system that is then discarded.
 
+    On CUDA the wall also vanishes and comes back, so that a frame that is lost late in a run need not wait for what
+    finds it again to be loaded.
+
     Args:
         config: of the run; used with few iterations.
         camera: intrinsics of the run's frames.
         device: of the run.
 
     Returns:
-        The reports of those frames. Loaded kernels and reserved memory are all that remains; results don't change.
+        The reports of the frames before. Loaded kernels and reserved memory are all that remains; results don't change.
     """
     shortened = _shortened(config)
     system = SlamSystem(shortened, camera, device=device)
     uploader = Uploader(device) if device.type == "cuda" else None
     reports = []
-    for index in range(FRAMES):
-        pixels = sample_frame(_wall_frame(camera, config, index), camera, shortened)
+    frames = [_wall_frame(camera, config, index) for index in range(FRAMES + (2 if uploader else 0))]
+    if uploader:
+        frames[-2] = _other_frame(frames[-2])
+    for frame in frames:
+        pixels = sample_frame(frame, camera, shortened)
         sent = uploader.send(pixels) if uploader else pixels
-        reports.append(system.submit(PreparedFrame(index, float(index), sent)).result())
+        reports.append(system.submit(PreparedFrame(frame.index, frame.timestamp, sent)).result())
     system.finish()
     event_recorder(device)().wait()
-    return reports
+    return reports[:FRAMES]
 
 
 def _shortened(config: Config) -> Config:
@@ -60,3 +66,10 @@ def _wall_frame(camera: Camera, config: Config, index: int) -> RgbdFrame:
     depth = (depth_m * (1 + RELIEF_M / DEPTH_M / 2 * relief)).astype(np.float32)
     color = np.repeat((127 + 100 * relief).astype(np.uint8)[..., None], 3, axis=2)
     return RgbdFrame(index, float(index), color, depth)
+
+
+def _other_frame(frame: RgbdFrame) -> RgbdFrame:
+    """A frame of another place: mirrored, and steeply inclined."""
+    slope = np.linspace(0.6, 1.0, frame.depth.shape[1], dtype=np.float32)
+    depth, color = (np.ascontiguousarray(image[:, ::-1]) for image in (slope * frame.depth, frame.color))
+    return RgbdFrame(frame.index, frame.timestamp, 255 - color, depth)

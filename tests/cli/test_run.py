@@ -1,5 +1,6 @@
 """End-to-end tests of the commands, on a few small frames of the generated room."""
 
+import html
 import json
 import re
 import shutil
@@ -11,8 +12,11 @@ from functools import partial
 
 import pytest
 
+from experiments.wrong_recordings import FAULTS, WrongRecording
 from spslam.cli.progress import ProgressBar, ProgressLines, summarize
 from spslam.config import load_config
+from spslam.datasets import export_folder
+from spslam.datasets.generated import GeneratedDataset
 from spslam.evaluation import finished_run
 from spslam.slam.fit import Fit
 from tests.cli.command import ROOT, assert_refused, spslam, spslam_process
@@ -26,7 +30,8 @@ SMALL = [
     "--set=run.checkpoint_every=2",
     "--device=cpu",
 ]
-FILES = {"config.yaml", "log.jsonl", "map.safetensors", "metrics.json", "previews", "report.html", "trajectory.txt"}
+FILES = {"config.yaml", "keyframes.safetensors", "log.jsonl", "map.safetensors", "metrics.json", "previews"}
+FILES |= {"report.html", "trajectory.txt"}
 
 
 def run(cwd, *arguments):
@@ -61,6 +66,8 @@ def test_run_writes_all_files_and_prints_their_paths(finished):
     metrics = json.loads((folder / "out" / "metrics.json").read_text())
     assert metrics["frames"] == 8
     assert metrics["ate_rmse_cm"] < 3
+    assert metrics["command"].startswith("spslam run demo --set=")
+    assert html.escape(metrics["command"]) in (folder / "out" / "report.html").read_text()
     page = (ROOT / "docs" / "outputs.md").read_text()
     assert not [key for key in metrics if f"`{key}`" not in page]
 
@@ -199,3 +206,39 @@ def test_summary_leaves_out_missing_metrics(tmp_path):
         ("frames", "5 (1 lost, 2 skipped)"),
         ("speed", "3.2 frames/s"),
     ]
+
+
+def test_first_frames_that_do_not_fit_stop_a_run_unless_told_otherwise(tmp_path):
+    """A recording whose depth is mirrored: refused with what is wrong, nothing left behind; overruled, it runs."""
+    export_folder(WrongRecording(GeneratedDataset(12, 160, 120), FAULTS["depth mirrored"]), tmp_path / "data")
+    arguments = ["run", "folder", "--data", "data", "--output", "out", "--quiet", "--no-mesh", *SMALL[2:]]
+    assert_refused(
+        spslam(*arguments, cwd=tmp_path), "the first frames do not fit together: depth does not belong to color"
+    )
+    assert not (tmp_path / "out").exists()
+    overruled = spslam(*arguments, "--set=run.data_check=warn", cwd=tmp_path)
+    assert overruled.returncode == 0, overruled.stderr
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert any("depth does not belong to color" in warning for warning in metrics["warnings"])
+    assert "Doubts about the data" in (tmp_path / "out" / "report.html").read_text()
+    skipped = spslam(*arguments[:5], "other", *arguments[6:], "--set=run.data_check=skip", cwd=tmp_path)
+    assert skipped.returncode == 0, skipped.stderr
+    assert "warnings" not in json.loads((tmp_path / "other" / "metrics.json").read_text())
+
+
+def test_mesh_command_makes_the_runs_own_mesh_again(tmp_path):
+    run(tmp_path, "--frames", "0:3", "--output", "out", "--quiet")
+    own = (tmp_path / "out" / "mesh.ply").read_bytes()
+    result = spslam("mesh", "out", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "tsdf at 0.01 m" in result.stdout and "MB of voxels" in result.stdout
+    assert (tmp_path / "out" / "mesh.ply").read_bytes() == own
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["mesh_source"] == "tsdf" and metrics["mesh_resolution_m"] == 0.01
+
+
+def test_mesh_command_extracts_the_map_alone(finished):
+    folder, _ = finished
+    result = spslam("mesh", "out", "--source", "neural", "--resolution", "0.05", "--format", "obj", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert "neural at 0.05 m" in result.stdout

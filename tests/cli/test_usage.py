@@ -58,7 +58,7 @@ def test_version(tmp_path):
     ("arguments", "message"),
     [
         (["fly"], "invalid choice: 'fly'"),
-        (["run"], "the following arguments are required: CONFIG; see spslam run --help"),
+        (["run"], "the following arguments are required: CONFIG|PATH; see spslam run --help"),
         (["run", "7scenes", "--sed", "3"], "unrecognized arguments: --sed 3"),
         (["run", "7scenes", "--seed", "x"], "--seed: invalid int value: 'x'"),
         (["run", "7scenes", "--preset", "best"], "--preset: invalid choice: 'best'"),

@@ -35,3 +35,12 @@ def test_resumed_run_continues_the_saved_clock(now):
     now["s"] += 10.0
     resumed.update(4, decode_s=1.0)
     assert resumed == RunClock(frames=6, wall_s=14.0, decode_s=1.5, start_s=3.0)
+
+
+def test_time_that_the_user_took_is_left_out(now):
+    clock = RunClock()
+    clock.start_loop()
+    now["s"] += 10.0
+    clock.leave_out(7.0)
+    clock.update(1, decode_s=0.0)
+    assert clock.wall_s == 3.0

@@ -61,6 +61,7 @@ def test_a_run_leaves_every_file(monkeypatch, tmp_path):
     names = {path.name for path in output.iterdir()}
     assert names == {
         "config.yaml",
+        "keyframes.safetensors",
         "log.jsonl",
         "map.safetensors",
         "mesh.ply",

@@ -43,7 +43,7 @@ def pages(path):
 def outputs(path):
     """The files of a run in the order in which they are written."""
     folder = RunFolder(path)
-    first = [folder.config, folder.log, folder.trajectory, folder.map, folder.mesh, folder.metrics]
+    first = [folder.config, folder.log, folder.trajectory, folder.map, folder.keyframes, folder.mesh, folder.metrics]
     return [*first, folder.preview_camera, *sorted(folder.previews.glob("*.png")), folder.report]
 
 
