@@ -22,7 +22,7 @@ PYTEST = OMP_WAIT_POLICY=passive $(PYTHON) -m pytest -n $(JOBS) --dist loadfile
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
 
-.PHONY: help demo test test-all test-gpu dev lint example-cpp test-numpy test-asan
+.PHONY: help demo test test-all test-sweeps test-gpu dev lint example-cpp test-numpy test-asan
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -33,8 +33,11 @@ demo: dev ## track and map a generated room with exact ground truth, into runs/d
 test: dev ## build, then run the tests on the CPU, without the slow sweeps
 	$(PYTEST)
 
-test-all: dev ## the same with the slow sweeps, as CI does
-	$(PYTEST) -m ""
+test-all: dev ## the same with the slow tests, as CI does
+	$(PYTEST) -m "not sweep"
+
+test-sweeps: dev ## the long sweeps that CI leaves out
+	$(PYTEST) -m sweep
 
 test-gpu: ## run the tests that need a CUDA device, with the kernels that are there: built in place, or a wheel's
 	$(PYTHON) tests/run_on_gpu.py

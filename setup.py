@@ -20,6 +20,7 @@ ROOT = pathlib.Path(__file__).parent.resolve()
 DATA_PACKAGES = {
     "spslam.benchmark.data": ["*.yaml"],
     "spslam.benchmark.data.suites": ["*.yaml"],
+    "spslam.evaluation.web": ["*.js", "*.css", "*.LICENSE"],
     "spslam.prior.data": ["*.safetensors"],
 }
 REPOSITORY = load_file(ROOT / "pyproject.toml")["project"]["urls"]["Homepage"]

@@ -33,10 +33,13 @@ GROUND = {
     "errors",
     "geometry",
     "io",
+    "notebook",
     "options",
+    "pose_graph",
     "reading",
     "run_folder",
     "tensor_file",
+    "tensor_rules",
     "tensor_schema",
     "trajectory",
 }
@@ -49,11 +52,14 @@ IMPORTS = {
     "prior": GROUND | {"ops"},
     "meshing": GROUND | {"ops", "scene", "datasets"},
     "evaluation": GROUND | {"ops", "scene", "datasets", "meshing"},
-    "slam": GROUND | {"ops", "scene", "prior", "datasets"},
+    "slam": GROUND | {"ops", "scene", "prior", "datasets", "meshing"},
     "run": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
+    "viewer": GROUND | {"ops", "scene", "datasets", "meshing", "evaluation", "slam", "run"},
     "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run"},
+    "live": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run"},
     "cli": GROUND
-    | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "benchmark"},
+    | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "live", "viewer"}
+    | {"benchmark"},
 }
 
 

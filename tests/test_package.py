@@ -55,3 +55,12 @@ def test_cuda_kernels_are_built_for_a_cuda_build_of_torch(build, tmp_path, chose
 @pytest.mark.parametrize("chosen", ["ON", "OFF"])
 def test_a_choice_of_cuda_is_kept(build, tmp_path, chosen):
     assert build.cuda_setting(tmp_path, chosen) == (chosen, None)
+
+
+def test_the_ops_alone_are_of_the_same_version():
+    """The distribution spslam-ops has spslam's ops under its own version number."""
+    text = (ROOT / "bindings/ops/pyproject.toml").read_text(encoding="utf-8")
+    own = (ROOT / "bindings/ops/python/spslam/__init__.py").read_text(encoding="utf-8")
+    assert f'version = "{spslam.__version__}"' in text
+    assert f'__version__ = "{spslam.__version__}"' in own
+    assert 'dependencies = ["torch>=2.11"]' in text
