@@ -99,6 +99,10 @@ class Page(Protocol):
             assert time.monotonic() < deadline, f"not true after {timeout_s} s: {condition}; errors: {self.errors}"
             time.sleep(0.05)
 
+    def draw(self) -> None:
+        """Returns once two frames were drawn: the second one shows all that the first one was asked to."""
+        self.evaluate(_TWO_FRAMES)
+
     def element(self, selector: str, number: int = 0) -> Element:
         """The element of a CSS selector, of several the one of that number."""
         return Element(self, f"document.querySelectorAll({json.dumps(selector)})[{number}]")
@@ -239,7 +243,7 @@ class Element:
     def picture(self) -> np.ndarray:
         """Its pixels, uint8 [H, W, 3] RGB, once two frames were drawn."""
         self.ask("it.scrollIntoViewIfNeeded()")
-        self.page.evaluate(_TWO_FRAMES)
+        self.page.draw()
         x, y, width, height = self._box()
         left, top = self.page.evaluate("[visualViewport.pageLeft, visualViewport.pageTop]")
         # Chromium draws from whole pixels of the window on, rounded likewise.
