@@ -1,6 +1,7 @@
 """Pixels of all processed frames, within a memory budget (section III.D)."""
 
-import numpy as np
+import mmap
+
 import torch
 
 from spslam.errors import SpslamError
@@ -19,7 +20,8 @@ class PixelDatabase:
     order, keeping a prefix keeps an even sample. So memory does not grow past the budget, while frames do.
 
     On the CPU addresses for the budget are reserved at once, and memory comes as records are written: adding
-    a frame never moves the others, for which a live camera would not wait. Thinning moves them within that memory.
+    a frame never moves the others, for which a live camera would not wait. Thinning moves them within that memory, and
+    gives back what is left of it.
 
     Attributes:
         pixels_per_frame: P, what each frame holds now.
@@ -27,7 +29,12 @@ class PixelDatabase:
     """
 
     def __init__(
-        self, pixels_per_frame: int, budget_mb: float, device: torch.device | str = "cpu", keyframe_every: int = 1
+        self,
+        pixels_per_frame: int,
+        budget_mb: float,
+        device: torch.device | str = "cpu",
+        keyframe_every: int = 1,
+        bytes_beside: int = 0,
     ):
         """An empty database.
 
@@ -37,16 +44,19 @@ class PixelDatabase:
             device: where the records are.
             keyframe_every: frames whose number is not a multiple of this are dropped when the next one is added, as in
                 keyframe-based systems; 1 keeps all.
+            bytes_beside: what is kept of every frame elsewhere, but counts within the budget.
         """
         self.pixels_per_frame = pixels_per_frame
         self.keyframe_every = keyframe_every
         self.budget_bytes = int(budget_mb * 2**20)
         self.num_frames = 0
-        if self.budget_bytes < pixels_per_frame * RECORD_BYTES:
+        self._bytes_beside = bytes_beside
+        if self.budget_bytes < self._bytes_of(1, pixels_per_frame):
             raise SpslamError(
                 f"pixels.budget_mb must hold at least one frame of {pixels_per_frame} pixels "
-                f"({pixels_per_frame * RECORD_BYTES / 2**20:.2f} MB), got {budget_mb}"
+                f"({self._bytes_of(1, pixels_per_frame) / 2**20:.2f} MB), got {budget_mb}"
             )
+        self._memory: mmap.mmap | None = None  # that the words are in, where addresses for all of them are reserved
         self._words = torch.zeros(0, dtype=torch.int32, device=device)
         self._has_pixels = torch.zeros(0, dtype=torch.bool)
 
@@ -68,6 +78,10 @@ class PixelDatabase:
     @property
     def _words_per_frame(self) -> int:
         return self.pixels_per_frame * RECORD_WORDS
+
+    def _bytes_of(self, frames: int, pixels: int) -> int:
+        """What so many frames of so many pixels take of the budget."""
+        return frames * (pixels * RECORD_BYTES + self._bytes_beside)
 
     def add(self, records: torch.Tensor) -> None:
         """Appends a frame.
@@ -97,7 +111,7 @@ class PixelDatabase:
         """Replaces the content by that of `state_dict()`."""
         records = state["records"]
         self.num_frames, self.pixels_per_frame = records.shape[0], records.shape[1]
-        self._words = records.to(self._words.device, copy=True).view(-1)
+        self._words, self._memory = records.to(self._words.device, copy=True).view(-1), None
         self._has_pixels = state["has_pixels"].clone()
 
     def _reserve(self, frames: int) -> None:
@@ -106,18 +120,18 @@ class PixelDatabase:
             flags = torch.zeros(max(frames, _FIRST_CAPACITY, 2 * len(self._has_pixels)), dtype=torch.bool)
             flags[: self.num_frames] = self.has_pixels
             self._has_pixels = flags
-        if frames * self._words_per_frame <= len(self._words):
-            return
         pixels = self._affordable_pixels(frames)
-        if pixels < self.pixels_per_frame and len(self._words) == self._budget_words:
-            self._thin_in_place(pixels)
+        if pixels == self.pixels_per_frame and frames * self._words_per_frame <= len(self._words):
+            return
+        if pixels < self.pixels_per_frame and self._memory is not None:
+            self._thin_in_place(pixels, self._memory)
         else:
             self._move(frames, pixels)
 
     def _affordable_pixels(self, frames: int) -> int:
         """P halved until the budget holds so many frames; raises SpslamError where it can't."""
         pixels = self.pixels_per_frame
-        while frames * pixels * RECORD_BYTES > self.budget_bytes:
+        while self._bytes_of(frames, pixels) > self.budget_bytes:
             if pixels // 2 < MIN_PIXELS_PER_FRAME:
                 raise SpslamError(
                     f"pixels.budget_mb of {self.budget_bytes / 2**20:.0f} cannot hold {frames} frames of "
@@ -126,34 +140,38 @@ class PixelDatabase:
             pixels //= 2
         return pixels
 
-    @property
-    def _budget_words(self) -> int | None:
-        """Length of the buffer that holds the whole budget; None on a GPU, where a snapshot may share the buffer."""
-        return self.budget_bytes // 4 if self._words.device.type == "cpu" else None
-
-    def _thin_in_place(self, pixels: int) -> None:
+    def _thin_in_place(self, pixels: int, memory: mmap.mmap) -> None:
+        end = 0
         for first in range(0, self.num_frames, _FRAMES_AT_ONCE):
             kept = self.records[first : first + _FRAMES_AT_ONCE, :pixels].reshape(-1)
             begin = first * pixels * RECORD_WORDS
-            self._words[begin : begin + len(kept)] = kept.clone()
+            end = begin + len(kept)
+            self._words[begin:end] = kept.clone()
         self.pixels_per_frame = pixels
+        unused = -(-4 * end // mmap.PAGESIZE) * mmap.PAGESIZE
+        if unused < len(memory):
+            memory.madvise(mmap.MADV_DONTNEED, unused, len(memory) - unused)
 
     def _move(self, frames: int, pixels: int) -> None:
         """Brings the first `pixels` records of every frame to a larger buffer."""
         kept, self.pixels_per_frame = self.records[:, :pixels], pixels
-        affordable = self.budget_bytes // (pixels * RECORD_BYTES)
-        grown = self._reserved_budget()
-        if grown is None:
+        self._memory = self._reserved_budget() if self._words.device.type == "cpu" else None
+        if self._memory is not None:
+            grown = torch.frombuffer(self._memory, dtype=torch.int32)
+        else:
+            affordable = self.budget_bytes // self._bytes_of(1, pixels)
             capacity = min(max(frames, _FIRST_CAPACITY, 2 * self.num_frames), affordable)
             grown = torch.zeros(capacity * self._words_per_frame, dtype=torch.int32, device=self._words.device)
         grown[: kept.numel()].view(kept.shape).copy_(kept)
         self._words = grown
 
-    def _reserved_budget(self) -> torch.Tensor | None:
-        """Zeros that take memory only where they are written; None on a GPU and where the system refuses so many."""
-        if self._budget_words is None:
-            return None
+    def _reserved_budget(self) -> mmap.mmap | None:
+        """Zeros that take memory only where they are written; None where the system refuses so many.
+
+        Not on a GPU, where a snapshot may share the buffer.
+        """
+        private = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
         try:
-            return torch.from_numpy(np.zeros(self._budget_words, dtype=np.int32))
-        except MemoryError:
+            return mmap.mmap(-1, self.budget_bytes // 4 * 4, flags=private)
+        except (OSError, OverflowError):
             return None

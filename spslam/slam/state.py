@@ -84,6 +84,12 @@ class FrameTable:
         return self._columns["depth_thumbnails"][: self._count]
 
     @property
+    def thumbnail_bytes(self) -> int:
+        """Bytes of a frame's depth thumbnail."""
+        one = self._columns["depth_thumbnails"]
+        return one.element_size() * one.shape[1:].numel()
+
+    @property
     def processed(self) -> int:
         """How many frames were processed: all rows but those that came with an opened map."""
         return self._count - self.opened
@@ -276,7 +282,8 @@ class SlamState:
         )
         origin = torch.from_numpy(np.asarray(first_pose)[:3, 3].copy())
         scene = Scene(settings, config.seed, origin, geometry_decoder, device)
-        pixels = PixelDatabase(config.pixels.per_frame, config.pixels.budget_mb, device, config.pixels.keyframe_every)
+        frames, kept = FrameTable(camera, device), config.pixels
+        pixels = PixelDatabase(kept.per_frame, kept.budget_mb, device, kept.keyframe_every, frames.thumbnail_bytes)
         tracking, depth_m = config.tracking, config.dataset.max_depth_m
         depth_keyframes = None
         if tracking.depth_keyframes:
@@ -286,7 +293,7 @@ class SlamState:
         if config.graph.enabled and config.prior.enabled:
             prior = config.prior
             graph = KeyframeStore(KeyframeCamera.of(camera, depth_m, prior.normal_step_px, prior.max_jump))
-        return cls(scene, FrameTable(camera, device), pixels, noise, depth_keyframes, graph=graph)
+        return cls(scene, frames, pixels, noise, depth_keyframes, graph=graph)
 
     def has_enough_features(self, number: int) -> bool:
         """Whether features of enough frames are kept that stand close to where frame `number` stands."""

@@ -1,5 +1,8 @@
 """The pixel database: what it keeps, and that it keeps within its budget."""
 
+import mmap
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -116,3 +119,30 @@ def test_without_room_for_the_whole_budget_memory_grows_with_the_frames(monkeypa
     for number in range(50):
         whole.add(frame(number, 256 if number % 3 else 0))
     assert torch.equal(whole.records, growing.records)
+
+
+def test_what_is_kept_beside_the_pixels_counts_within_the_budget():
+    beside = 64 * RECORD_BYTES
+    database = PixelDatabase(256, budget_mb(20, 256), bytes_beside=beside)
+    for number in range(40):
+        database.add(frame(number, 256))
+        assert database.nbytes + beside * database.num_frames <= budget_mb(20, 256) * 2**20
+    assert database.pixels_per_frame == 64
+    with pytest.raises(SpslamError, match="must hold at least one frame"):
+        PixelDatabase(100, budget_mb(1, 150), bytes_beside=beside)
+
+
+def resident_bytes():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+
+def test_thinning_gives_memory_back():
+    database = PixelDatabase(4096, budget_mb(1000, 4096))
+    content = frame(0, 4096)
+    for _ in range(1000):
+        database.add(content)
+    full = resident_bytes()
+    database.add(content)
+    assert database.pixels_per_frame == 2048
+    assert full - resident_bytes() > 0.45 * database.budget_bytes
+    assert all(torch.equal(database.records[number], content[:2048]) for number in (0, 500, 1000))
