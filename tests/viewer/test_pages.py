@@ -34,7 +34,7 @@ def view(page):
 
 
 def is_drawn(page):
-    """Whether a part of the view is not white, and nothing moves any more: the page fades in, a turned view runs out."""
+    """Whether a part of the view is not white, and nothing moves any more: pages fade in, turned views run out."""
     page.evaluate(CLOSE_NOTICE)
     image = view(page)
     if (image.min(axis=2) < 200).mean() < 0.02:
