@@ -113,4 +113,6 @@ class PixelOptions(Section):
     keyframe_every: int = option(
         "keep only every n-th frame and the newest one; 1 keeps all, as in the paper", "frames", ge=1
     )
-    budget_mb: float = option("memory for these pixels and the frames' depth thumbnails; beyond it all pixels are thinned evenly", "MB", gt=0)
+    budget_mb: float = option(
+        "memory for these pixels and the frames' depth thumbnails; beyond it all pixels are thinned evenly", "MB", gt=0
+    )

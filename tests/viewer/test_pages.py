@@ -15,9 +15,7 @@ from tests.system.sequences import Recorded, settings
 from tests.viewer.test_run_viewer import wait_for
 from tests.viewer.worlds import FRAMES, SIZES, finished_run, replay
 
-transforms = pytest.importorskip(
-    "viser.transforms", reason="viser is not installed: pip install 'spslam[viewer]'"
-)
+transforms = pytest.importorskip("viser.transforms", reason="viser is not installed: pip install 'spslam[viewer]'")
 
 # A small window, which software draws fast; of the 3-D view, what lies beside the panel.
 WINDOW = {"width": 800, "height": 480, "scale": 0.5}
