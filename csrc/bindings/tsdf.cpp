@@ -59,13 +59,15 @@ void check_blocks(const char* name, const Tensor& sdf, const Tensor& weights, co
 
 void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colors, Tensor planes,
                     std::vector<Tensor> image, Tensor pose, std::vector<double> intrinsics, double voxel_size,
-                    double truncation, double max_weight) {
+                    std::vector<double> truncations, std::vector<double> noise, double max_weight) {
   constexpr char kName[] = "tsdf_integrate_";
   check_blocks(kName, sdf, weights, colors);
   SPS_CHECK(block_coords.dim() == 2 && block_coords.size(1) == 3 && block_coords.size(0) <= sdf.size(0), kName,
             ": block_coords must have shape [B, 3] and at most as many rows as sdf");
-  SPS_CHECK(voxel_size > 0.0 && truncation > 0.0 && max_weight > 0.0, kName,
-            ": voxel_size, truncation and max_weight must be positive");
+  SPS_CHECK(truncations.size() == 2 && noise.size() == 2, kName, ": truncations and noise must be two numbers each");
+  SPS_CHECK(voxel_size > 0.0 && truncations[0] > 0.0 && truncations[1] > 0.0 && max_weight > 0.0, kName,
+            ": voxel_size, truncations and max_weight must be positive");
+  SPS_CHECK(noise[0] >= 0.0 && noise[1] >= 0.0, kName, ": noise must not be negative");
   DeviceScope scope(sdf);
   block_coords = contiguous(block_coords);
   planes = contiguous(planes);
@@ -82,8 +84,11 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
       data<std::int32_t>(block_coords),    mutable_data<float>(sdf), mutable_data<float>(weights),
       mutable_data<std::uint16_t>(colors), block_coords.size(0),     static_cast<float>(voxel_size)};
   const Tensor workspace = empty(sdf, {tsdf_integrate_workspace_bytes(frame)}, ScalarType::Byte);
-  spslam::tsdf_integrate(scope.context, blocks, frame, {static_cast<float>(truncation), static_cast<float>(max_weight)},
-                         mutable_data<std::uint8_t>(workspace));
+  const TsdfOptions options{static_cast<float>(truncations[0]),
+                            static_cast<float>(truncations[1]),
+                            {static_cast<float>(noise[0]), static_cast<float>(noise[1])},
+                            static_cast<float>(max_weight)};
+  spslam::tsdf_integrate(scope.context, blocks, frame, options, mutable_data<std::uint8_t>(workspace));
 }
 
 // The tensors of a field that is read, contiguous; they must outlive the launch.
@@ -162,7 +167,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "int step) -> Tensor");
   m.def(
       "tsdf_integrate_(Tensor block_coords, Tensor(a!) sdf, Tensor(b!) weights, Tensor(c!) colors, Tensor planes, "
-      "Tensor[] image, Tensor pose, float[] intrinsics, float voxel_size, float truncation, float max_weight) -> ()");
+      "Tensor[] image, Tensor pose, float[] intrinsics, float voxel_size, float[] truncations, float[] noise, "
+      "float max_weight) -> ()");
   m.def(
       "tsdf_query(Tensor hash_keys, Tensor hash_values, Tensor sdf, Tensor weights, Tensor colors, Tensor points, "
       "float voxel_size, float min_weight) -> (Tensor, Tensor, Tensor)");

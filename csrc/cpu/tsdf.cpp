@@ -139,17 +139,17 @@ void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const Bl
   PlaneLanes planes;
   planes.load(frame.planes, pixels);
   alignas(64) float sdf[kVoxelLanes], weight[kVoxelLanes];
-  const float truncation = options.truncation;
-  float most = 0.0f, nearest = truncation;
+  const TsdfOptions seen_with = options;
+  float most = 0.0f, nearest = options.truncation;
 #pragma omp simd reduction(max : most) reduction(min : nearest)
   for (int m = 0; m < kVoxelLanes; ++m) {
     const MeasuredPlane plane{{planes.x[m], planes.y[m], planes.z[m]}, planes.distance[m], planes.weight[m]};
-    const TsdfObservation seen = observe_voxel(plane, {at.x[m], at.y[m], at.z[m]}, truncation, 0);
+    const TsdfObservation seen = observe_voxel(plane, {at.x[m], at.y[m], at.z[m]}, seen_with, 0);
     const float seen_sdf = seen.sdf, seen_weight = seen.weight;
     sdf[m] = seen_sdf;
     weight[m] = seen_weight;
     most = seen_weight > most ? seen_weight : most;
-    const float near = seen_weight > 0.0f ? std::fabs(seen_sdf) : truncation;
+    const float near = seen_weight > 0.0f ? std::fabs(seen_sdf) : seen_with.truncation;
     nearest = near < nearest ? near : nearest;
   }
   if (!(most > 0.0f)) return;

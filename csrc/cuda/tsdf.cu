@@ -22,7 +22,7 @@ __global__ void __launch_bounds__(kIntegrateThreads)
       const std::int32_t pixel = pixel_at(frame, at);
       if (pixel < 0) continue;
       const MeasuredPlane plane = load_plane(frame.planes + static_cast<std::int64_t>(kPlaneSize) * pixel);
-      const TsdfObservation seen = observe_voxel(plane, at, options.truncation, pixel);
+      const TsdfObservation seen = observe_voxel(plane, at, options, pixel);
       if (!(seen.weight > 0.0f)) continue;
       const std::int64_t place = kTsdfBlockVoxels * row + m;
       update_voxel(seen, options.max_weight, blocks.sdf[place], blocks.weights[place]);

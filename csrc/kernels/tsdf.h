@@ -164,19 +164,29 @@ SPS_INLINE std::int32_t pixel_at(const PlaneFrame& frame, const Vec3<float>& at)
   return inside ? pixel : -1;
 }
 
-// What a voxel learns from a frame: its distance from the plane of the pixel that it falls on, at most the truncation;
-// weight 0 where nothing was measured, or the voxel lies farther behind.
+// Behind the surface a voxel's weight is full up to so many deviations of the noise, but no farther than this share of
+// the truncation, from where on it falls to 0: what lies there may be the other side of a thin board. A weight that
+// fell from the surface on would favor what lies before it, and move the surface back by more than half the variance
+// over the truncation.
+constexpr float kFullWeightDeviations = 1.2f, kMostFullWeight = 0.7f;
+
+// What a voxel learns from a frame: its distance from the plane of the pixel that it falls on, at most the pixel's
+// truncation; weight 0 where nothing was measured, or the voxel lies farther behind.
 struct TsdfObservation {
   float sdf, weight;
   std::int32_t pixel;
 };
 
-SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, const Vec3<float>& at, float truncation,
+SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, const Vec3<float>& at, const TsdfOptions& options,
                                          std::int32_t pixel) {
+  const float deviation = std::sqrt(depth_noise_variance(options.noise, at.z));
+  const float wanted = options.near_truncation + deviation;
+  const float truncation = wanted < options.truncation ? wanted : options.truncation;
   const float sdf = plane.distance - dot(plane.normal, at);
   const bool known = (plane.weight > 0.0f) & (sdf > -truncation);
-  // Behind the surface the weight falls to 0: it may be a thin board's, and what lies there is another side's.
-  const float fall = 1.0f + sdf / truncation;
+  const float noisy = kFullWeightDeviations * deviation / truncation;
+  const float full = noisy < kMostFullWeight ? noisy : kMostFullWeight;
+  const float fall = (1.0f + sdf / truncation) / (1.0f - full);
   const float weight = plane.weight * (fall < 1.0f ? fall : 1.0f);
   return {sdf < truncation ? sdf : truncation, known ? weight : 0.0f, pixel};
 }

@@ -16,7 +16,7 @@ from spslam.errors import DatasetError, SpslamError
 from spslam.geometry import matrix_to_pose7
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.sdf_sampling import near_surface
-from spslam.ops.tsdf_volume import BLOCK_BYTES, TRUNCATION_VOXELS
+from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
 
 # Where the blocks do not fit into the memory allowed, all frames are fused again with voxels that much larger.
@@ -43,8 +43,15 @@ class FusionOptions:
 
     def truncation_m(self, voxel_size_m: float) -> float:
         """Three voxels, or more where all depth is noisy: what lies farther off must not be taken for free space."""
-        wide = min(NOISE_DEVIATIONS * math.sqrt(self.noise[0]), MOST_TRUNCATION_M)
-        return max(TRUNCATION_VOXELS * voxel_size_m, wide)
+        return max(TRUNCATION_VOXELS * voxel_size_m, self._noise_reach_m)
+
+    def near_truncation_m(self, voxel_size_m: float) -> float:
+        """Of depth whose noise does not grow, m."""
+        return max(NEAR_SHARE * TRUNCATION_VOXELS * voxel_size_m, self._noise_reach_m)
+
+    @property
+    def _noise_reach_m(self) -> float:
+        return min(NOISE_DEVIATIONS * math.sqrt(self.noise[0]), MOST_TRUNCATION_M)
 
     @property
     def max_blocks(self) -> int:
@@ -107,8 +114,8 @@ def fuse_frames(
     parts = [frames] if isinstance(frames, PosedFrames) else frames
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
-        truncation_m = options.truncation_m(voxel_size_m)
-        volume = ops.TsdfVolume(voxel_size_m, truncation_m, options.max_blocks, device)
+        truncations = options.truncation_m(voxel_size_m), options.near_truncation_m(voxel_size_m)
+        volume = ops.TsdfVolume(voxel_size_m, truncations[0], options.max_blocks, device, truncations[1])
         try:
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))

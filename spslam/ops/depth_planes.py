@@ -52,8 +52,13 @@ def measure_planes(
     name = "measure_planes"
     check_tensor(name, "depth", depth, ("H", "W"), torch.float32)
     check_intrinsics(name, intrinsics)
-    check(len(noise) == 2 and min(noise) >= 0, name, "noise", "be two numbers of at least 0", noise)
+    check_noise(name, noise)
     return torch.ops.spslam.measure_planes(depth, list(intrinsics), *noise)
+
+
+def check_noise(name: str, noise: tuple[float, float]) -> None:
+    """Raises ValueError where `noise` is not floor and growth of a variance."""
+    check(len(noise) == 2 and min(noise) >= 0, name, "noise", "be two numbers of at least 0", noise)
 
 
 @torch.library.register_fake("spslam::measure_planes")

@@ -10,7 +10,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
-from spslam.ops.depth_planes import PLANE_SIZE
+from spslam.ops.depth_planes import PLANE_SIZE, check_noise
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 from spslam.ops.voxel_hash import check_table
 
@@ -77,14 +77,18 @@ def tsdf_integrate_(
     *,
     voxel_size: float,
     truncation: float,
+    near_truncation: float | None = None,
+    noise: tuple[float, float] = (0.0, 0.0),
     color: torch.Tensor | None = None,
     max_weight: float = 1e4,
 ) -> None:
     """Adds a frame to the voxels that it sees, in place (Curless and Levoy 1996).
 
-    A voxel learns its distance from the plane of the pixel that it falls on, at most `truncation`, and weighs it by the
-    plane's weight, less by 1 + sdf / truncation behind the surface; voxels farther behind learn nothing. Those in front
-    learn that they are free, which removes what has moved away. Colors within 1.5 voxels of the surface are averaged
+    A voxel learns its distance from the plane of the pixel that it falls on, at most the pixel's truncation: that is
+    `near_truncation` and a deviation s of the noise at the voxel's depth, at most `truncation`. It weighs the distance
+    by the plane's weight. Behind the surface that stays up to 1.2 s, at most 0.7 of the truncation, and then falls to 0
+    at the truncation; voxels farther behind learn nothing. Those in front learn that they are free, which removes what
+    has moved away. Colors within 1.5 voxels of the surface are averaged
     with the plane's weight squared, less where a pixel is larger than a voxel.
 
     Args:
@@ -96,7 +100,9 @@ def tsdf_integrate_(
         pose: float32 [7] of the frame, T_world_camera: unit quaternion (w, x, y, z) and translation (m).
         intrinsics: of the image, px.
         voxel_size: m.
-        truncation: m.
+        truncation: the largest, m.
+        near_truncation: where there is no noise, m; `truncation` where not given.
+        noise: floor (m^2) and growth (1/m^2) of the variance of depth, see `measure_planes`.
         color: uint8 [H, W, 3]; None leaves the colors.
         max_weight: a voxel's weight is cut to this: a smaller one forgets earlier frames sooner.
 
@@ -120,6 +126,9 @@ def tsdf_integrate_(
     check(len(block_coords) <= len(sdf), name, "block_coords", f"have at most {len(sdf)} rows", len(block_coords))
     _check_frame(name, planes, pose, intrinsics, like=sdf)
     _check_sizes(name, voxel_size, truncation)
+    near = truncation if near_truncation is None else near_truncation
+    check(0 < near <= truncation, name, "near_truncation", "be positive and at most truncation", near)
+    check_noise(name, noise)
     check(max_weight > 0, name, "max_weight", "be positive", max_weight)
     if color is not None:
         check_tensor(name, "color", color, (*planes.shape[:2], 3), torch.uint8, like=sdf)
@@ -135,7 +144,8 @@ def tsdf_integrate_(
         pose,
         list(intrinsics),
         voxel_size,
-        truncation,
+        [truncation, near],
+        list(noise),
         max_weight,
     )
 

@@ -13,6 +13,8 @@ from spslam.ops.scene_view import Intrinsics
 from spslam.ops.tsdf import BLOCK_SIDE, BLOCK_VOXELS, COLOR_SIZE, tsdf_integrate_, tsdf_query, tsdf_touched_blocks
 
 TRUNCATION_VOXELS = 3.0
+# Of the truncation, where there is no noise: little of a surface reaches around its edges.
+NEAR_SHARE = 2 / 3
 # Bytes of a block: distance and weight as float32, color in 4 x 16 bits, coordinates and table.
 BLOCK_BYTES = BLOCK_VOXELS * 16 + 100
 _MOST_TOUCH_STEP = 3  # px; larger steps miss thin things
@@ -25,16 +27,17 @@ class TsdfVolume:
 
     Args:
         voxel_size: m.
-        truncation: m; three voxels where not given.
+        truncation: the largest, of noisy depth, m; three voxels where not given.
         max_blocks: most blocks of 8 x 8 x 8 voxels, 8.3 kB each; None for as many as memory holds.
         device: where it lives.
+        near_truncation: of depth without noise, m; two thirds of `truncation` where not given. See `tsdf_integrate_`.
 
     Raises:
         ValueError: a number out of range.
 
     Attributes:
         blocks: the `VoxelHash` of block coordinates.
-        voxel_size, truncation: m.
+        voxel_size, truncation, near_truncation: m.
 
     Example:
         >>> volume = TsdfVolume(0.05)
@@ -52,11 +55,15 @@ class TsdfVolume:
         truncation: float | None = None,
         max_blocks: int | None = None,
         device: torch.device | str = "cpu",
+        near_truncation: float | None = None,
     ):
         check(voxel_size > 0, "TsdfVolume", "voxel_size", "be positive", voxel_size)
         self.voxel_size = voxel_size
         self.truncation = TRUNCATION_VOXELS * voxel_size if truncation is None else truncation
         check(self.truncation >= voxel_size, "TsdfVolume", "truncation", "be at least voxel_size", truncation)
+        near = NEAR_SHARE * self.truncation if near_truncation is None else near_truncation
+        check(0 < near <= self.truncation, "TsdfVolume", "near_truncation", "be positive and at most truncation", near)
+        self.near_truncation = near
         self.blocks = VoxelHash(device=device, max_voxels=max_blocks)
         self._sdf = torch.zeros(0, BLOCK_VOXELS, device=device)
         self._weights = torch.zeros(0, BLOCK_VOXELS, device=device)
@@ -146,7 +153,17 @@ class TsdfVolume:
         touched = tsdf_touched_blocks(planes, pose, intrinsics, voxel_size=size, truncation=truncation, step=step)
         self.add_blocks(touched)
         arrays = self.block_coords, self._sdf, self._weights, self._colors
-        tsdf_integrate_(*arrays, planes, pose, intrinsics, voxel_size=size, truncation=truncation, color=color)
+        tsdf_integrate_(
+            *arrays,
+            planes,
+            pose,
+            intrinsics,
+            voxel_size=size,
+            truncation=truncation,
+            near_truncation=self.near_truncation,
+            noise=noise,
+            color=color,
+        )
 
     def query(self, points: torch.Tensor, min_weight: float = 1e-3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Distance (m), color and whether both are known, at points float32 [N, 3]; see `tsdf_query`."""

@@ -111,7 +111,7 @@ class FrameTable:
         """Adds a row."""
         if self._count == len(self._columns["poses"]):
             capacity = max(2 * self._count, _FIRST_CAPACITY)
-            self._columns = {name: resize_rows(column, capacity) for name, column in self._columns.items()}
+            self._columns = {name: _with_capacity(column, capacity) for name, column in self._columns.items()}
         values: dict[str, Any] = {
             "poses": pose,
             "timestamps": timestamp,
@@ -139,6 +139,15 @@ class FrameTable:
 
     def __len__(self) -> int:
         return self._count
+
+
+def _with_capacity(column: torch.Tensor, rows: int) -> torch.Tensor:
+    """A column with room for so many rows, zero. On the CPU they take memory only once they are written."""
+    if column.device.type != "cpu":
+        return resize_rows(column, rows)
+    grown = torch.from_numpy(np.zeros((rows, *column.shape[1:]), column.numpy().dtype))
+    grown[: len(column)] = column
+    return grown
 
 
 @dataclass

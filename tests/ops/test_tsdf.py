@@ -134,7 +134,7 @@ def test_integration_is_that_of_numpy(device):
         for i, (image, pose) in enumerate(zip(planes, matrices, strict=True)):
             if i == 0 and tuple(coords[block]) not in _first_blocks(depths[0]):
                 continue
-            sdf, weight, _ = reference.observe(point, image, CAMERA, pose, 3 * VOXEL)
+            sdf, weight, _ = reference.observe(point, image, CAMERA, pose, (3 * VOXEL, 2 * VOXEL), NOISE)
             total += weight
             mean += (sdf - mean) * weight / total if weight else 0.0
         got = volume.weights[block, voxel].item()
@@ -277,6 +277,8 @@ def test_blocks_without_rows_are_refused():
     [
         (dict(voxel_size=0.0), ValueError, "tsdf_integrate_: voxel_size must be positive, got 0.0"),
         (dict(truncation=0.01), ValueError, "tsdf_integrate_: truncation must be at least voxel_size, got 0.01"),
+        (dict(near_truncation=0.07), ValueError, "tsdf_integrate_: near_truncation must be positive and at most trunc"),
+        (dict(noise=(1e-6, -1.0)), ValueError, "tsdf_integrate_: noise must be two numbers of at least 0"),
         (dict(max_weight=0.0), ValueError, "tsdf_integrate_: max_weight must be positive, got 0.0"),
         (dict(sdf=torch.zeros(1, 8)), ValueError, r"tsdf_integrate_: sdf must have shape \[B, 512\], got \[1, 8\]"),
         (dict(planes=torch.zeros(4, 4)), ValueError, r"tsdf_integrate_: planes must have shape \[H, W, 5\]"),
@@ -297,3 +299,15 @@ def test_wrong_arguments_are_refused(changes, error, message):
     )
     with pytest.raises(error, match=message):
         ops.tsdf_integrate_(**(call | changes))
+
+
+def test_noise_does_not_move_a_surface(device):
+    deviation = 0.01
+    quantiles = torch.distributions.Normal(0.0, deviation).icdf((torch.arange(41) + 0.5) / 41)
+    volume = ops.TsdfVolume(0.01, device=device)
+    for offset in quantiles.tolist():
+        depth = torch.full(SIZE, 1.0 + offset, device=device)
+        volume.integrate(depth, IDENTITY.to(device), CAMERA, noise=(deviation**2, 0.0))
+    vertices, _ = volume.extract()
+    # A weight that fell from the surface on would move it by 0.24 deviations.
+    assert abs(vertices[:, 2].mean().item() - 1) < 0.1 * deviation

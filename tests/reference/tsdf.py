@@ -6,6 +6,7 @@ RADIUS = 2
 GATE, GATE_DEVIATIONS, STEEPEST, PRIOR = 0.015, 4.0, 15.0, 0.005
 LEAST_SUPPORT, FULL_SUPPORT, FULL_WEIGHT, LEAST_COSINE = 0.2, 0.5, 0.67, 0.06
 SHAPE_VARIANCES, POSE_VARIANCE = 2.0, 0.003**2
+FULL_WEIGHT_DEVIATIONS, MOST_FULL_WEIGHT = 1.2, 0.7
 
 
 def window_weight(du, dv):
@@ -79,7 +80,7 @@ def _plane(depth, camera, noise, u, v):
     return np.array([*(m / np.linalg.norm(m)), 1 / np.linalg.norm(m), weight])
 
 
-def observe(point, plane_image, camera, pose, truncation):
+def observe(point, plane_image, camera, pose, truncations, noise):
     """Distance and weight that a frame gives a world point; weight 0 where it says nothing."""
     fx, fy, cx, cy = camera
     x, y, z = np.linalg.inv(pose)[:3] @ np.append(point, 1)
@@ -90,6 +91,9 @@ def observe(point, plane_image, camera, pose, truncation):
         return 0.0, 0.0, None
     plane = plane_image[v, u]
     sdf = plane[3] - plane[:3] @ (x, y, z)
+    deviation = np.sqrt(noise[0] + noise[1] * z**4)
+    truncation = min(truncations[0], truncations[1] + deviation)
+    full = min(FULL_WEIGHT_DEVIATIONS * deviation, MOST_FULL_WEIGHT * truncation)
     if plane[4] == 0 or sdf <= -truncation:
         return 0.0, 0.0, None
-    return min(sdf, truncation), plane[4] * min(1 + sdf / truncation, 1), (u, v)
+    return min(sdf, truncation), plane[4] * np.interp(sdf, [-truncation, -full], [0, 1]), (u, v)

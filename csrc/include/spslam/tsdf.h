@@ -51,8 +51,10 @@ struct TsdfBlocks {
   float voxel_size;
 };
 
+// A pixel's truncation is `near_truncation` and a deviation of its noise, at most `truncation`, m.
 struct TsdfOptions {
-  float truncation;  // m
+  float truncation, near_truncation;
+  DepthNoise noise;
   float max_weight;
 };
 

@@ -1,0 +1,38 @@
+"""The table of all processed frames: what it keeps as it grows, and in how much memory."""
+
+import mmap
+from pathlib import Path
+
+import torch
+
+from spslam.camera import Camera
+from spslam.slam.state import FrameTable
+
+
+def add(table, number, thumbnail=None):
+    pose = torch.tensor([1.0, 0, 0, 0, number, 0, 0])
+    plain = torch.full(table.depth_thumbnails.shape[1:], float(number), dtype=torch.float16)
+    table.append(pose, 0.1 * number, 2 * number, number % 3 == 0, plain if thumbnail is None else thumbnail, number)
+
+
+def test_rows_stay_as_the_table_grows(device):
+    table = FrameTable(Camera(64, 48, 50.0, 50.0, 31.5, 23.5), device)
+    for number in range(300):
+        add(table, number)
+    assert len(table) == 300
+    assert table.poses[:, 4].tolist() == list(range(300))
+    assert table.indices.tolist() == list(range(0, 600, 2))
+    assert table.lost.tolist() == [number % 3 == 0 for number in range(300)]
+    assert torch.equal(table.depth_thumbnails[:, 0, 0].float().cpu(), torch.arange(300.0))
+
+
+def test_rows_to_come_take_no_memory():
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+    table = FrameTable(Camera(4096, 4096, 4000.0, 4000.0, 2047.5, 2047.5))
+    thumbnail = torch.ones(table.depth_thumbnails.shape[1:], dtype=torch.float16)
+    before = resident()
+    for number in range(257):  # with room for 512
+        add(table, number, thumbnail)
+    assert resident() - before < 1.3 * table.depth_thumbnails.nbytes
