@@ -38,6 +38,10 @@ class OutputError(SpslamError):
     """A result cannot be written, or the output folder belongs to another run."""
 
 
+class ClusterError(SpslamError):
+    """A cluster can't be reached, or a node of it can't run what it is sent."""
+
+
 class DeviceError(SpslamError):
     """The requested device is not available, or this build has no kernels for it."""
 

@@ -46,6 +46,7 @@ GROUND = {
 IMPORTS = {
     **{name: GROUND for name in GROUND},
     "ops": set(),
+    "tasks": GROUND,
     "datasets": GROUND,
     "download": GROUND,
     "scene": GROUND | {"ops"},
@@ -53,13 +54,13 @@ IMPORTS = {
     "meshing": GROUND | {"ops", "scene", "datasets"},
     "evaluation": GROUND | {"ops", "scene", "datasets", "meshing"},
     "slam": GROUND | {"ops", "scene", "prior", "datasets", "meshing"},
-    "run": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam"},
+    "run": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "tasks"},
     "viewer": GROUND | {"ops", "scene", "datasets", "meshing", "evaluation", "slam", "run"},
-    "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run"},
+    "benchmark": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "tasks"},
     "live": GROUND | {"ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run"},
     "cli": GROUND
     | {"download", "ops", "scene", "prior", "datasets", "meshing", "evaluation", "slam", "run", "live", "viewer"}
-    | {"benchmark"},
+    | {"benchmark", "tasks"},
 }
 
 

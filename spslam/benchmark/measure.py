@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ from spslam import ops
 from spslam.benchmark.environment import describe_environment
 from spslam.benchmark.jobs import Job
 from spslam.benchmark.measure_baseline import measure_gicp, measure_orb_slam3
+from spslam.benchmark.records import RECORD
 from spslam.benchmark.suites import GICP, ORB_SLAM3
 from spslam.datasets import open_dataset
 from spslam.datasets.base import RgbdDataset
@@ -17,9 +21,35 @@ from spslam.evaluation.finished_run import NOVEL_VIEWS, surface_figures, view_fi
 from spslam.evaluation.mesh_metrics import SAMPLES
 from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.surface import Surface, TriangleSurface
+from spslam.io import atomic_write
 from spslam.run.device import resolve_device
 from spslam.run.request import parse_frames
 from spslam.run.sequence import RunRequest, run_sequence
+from spslam.tasks.task import TaskCall
+
+
+def run_job(call: TaskCall) -> None:
+    """The task of a job: runs it and writes its record; called in the processes of `run_jobs`.
+
+    Args:
+        call: `job` as text, and `keep`, whether the run's other files are kept in the folder.
+
+    Raises:
+        SpslamError: as `measure`.
+    """
+    job, folder = Job.from_json(call.arguments["job"]), call.output
+    _empty(folder)  # of an attempt that was killed
+    record = measure(replace(job, data=call.local(job.data), mesh=call.local(job.mesh)), folder, call.threads)
+    record["job"] = vars(job)
+    record["environment"]["runs_at_a_time"] = call.simultaneous
+    if not call.arguments["keep"]:
+        _empty(folder)
+    atomic_write(folder / RECORD, json.dumps(record) + "\n")
+
+
+def _empty(folder: Path) -> None:
+    for each in folder.iterdir():
+        shutil.rmtree(each) if each.is_dir() else each.unlink()
 
 
 def measure(job: Job, folder: Path, threads: int | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from spslam.benchmark.figures import Statistic
 from spslam.benchmark.jobs import Plan
-from spslam.benchmark.pool import Outcome
+from spslam.benchmark.records import Outcome
 from spslam.benchmark.suites import Study, Suite
 
 Cell = tuple[str, str, str]

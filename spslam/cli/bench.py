@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
 from spslam.cli.arguments import add_quiet, at_least_one
+from spslam.cli.cluster import add_cluster, check_cluster, open_executor
 from spslam.cli.parser import UsageError
 from spslam.errors import SpslamError
 from spslam.options import PRESETS
@@ -37,22 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="only these frames of every sequence; : for all")
     parser.add_argument("--sequences", metavar="NAME", nargs="+", help="only these sequences")
     parser.add_argument("--studies", metavar="NAME", nargs="+", help="only these studies of the ablation")
-    parser.add_argument("--workers", metavar="N", type=at_least_one, help="parallel runs (default: one per GPU)")
-    parser.add_argument("--threads", metavar="N", type=at_least_one, help="CPU threads per run")
+    add_cluster(parser)
     parser.add_argument("--no-baseline", action="store_true", help="skip the baselines, ORB-SLAM3 and GICP odometry")
     parser.add_argument("--keep", action="store_true", help="keep trajectory, mesh and report of each run")
     parser.add_argument("--report", metavar="PAGE", type=Path, help="also update the tables in a Markdown page")
     parser.add_argument("--list", action="store_true", help="list the runs without starting them")
-    parser.add_argument("--job", help=argparse.SUPPRESS)
-    parser.add_argument("--key", help=argparse.SUPPRESS)
     add_quiet(parser)
 
 
 def execute(args: argparse.Namespace) -> None:
-    if args.job is not None:
-        _run_job(args)
-        return
-
     from spslam.benchmark.suites import load_suite, suite_names
 
     if args.suite is None:
@@ -61,6 +53,7 @@ def execute(args: argparse.Namespace) -> None:
         for name in suite_names():
             print(f"{name:<16}{load_suite(name).title}")
         return
+    check_cluster(args)
     if args.frames is not None:
         _check_frames(args.frames)
     suite = load_suite(
@@ -81,23 +74,34 @@ def _in_folders(suite: Any, args: argparse.Namespace) -> Any:
 
 def _run_suite(suite: Any, args: argparse.Namespace) -> None:
     from spslam.benchmark.jobs import make_plan
-    from spslam.benchmark.pool import PoolOptions, run_jobs
-    from spslam.benchmark.suite_report import describe_gaps, update_page, write_results
+    from spslam.benchmark.records import run_jobs
     from spslam.benchmark.summary import summarize
-    from spslam.benchmark.tables import to_text
     from spslam.run.device import resolve_device
 
     if args.data is not None and not args.data.is_dir():
         raise UsageError(f"--data must be a folder that contains the datasets, got {args.data}")
-    plan = make_plan(suite, args.data, resolve_device(args.device).type)
     if args.list:
-        _print_plan(plan)
+        _print_plan(make_plan(suite, args.data, resolve_device(args.device).type))
         return
     output = args.output or Path("runs") / f"bench-{suite.name}"
-    outcomes = run_jobs(
-        plan.jobs, output, PoolOptions(args.workers, args.threads, args.keep), None if args.quiet else _print_progress
-    )
+    executor, device = open_executor(args, args.device)
+    with executor:
+        plan = make_plan(suite, args.data, device)
+        outcomes = run_jobs(plan.jobs, output, executor, args.keep, None if args.quiet else _print_progress)
     summary = summarize(suite, plan, outcomes)
+    _write_results(summary, output, args)
+    if summary.failed:
+        raise SpslamError(f"{len(summary.failed)} of {len(plan.jobs)} runs failed; the first: {summary.failed[0]}")
+    if not plan.jobs:
+        raise SpslamError(
+            f"no run of {suite.name} is possible: no data found; --data names the folder that contains it"
+        )
+
+
+def _write_results(summary: Any, output: Path, args: argparse.Namespace) -> None:
+    from spslam.benchmark.suite_report import describe_gaps, update_page, write_results
+    from spslam.benchmark.tables import to_text
+
     tables = write_results(summary, output)
     if not args.quiet:
         for table in tables:
@@ -109,28 +113,6 @@ def _run_suite(suite: Any, args: argparse.Namespace) -> None:
             print(f"page    {args.report}: {', '.join(filled) or 'nothing to fill'}")
     for line in describe_gaps(summary):
         print(line, file=sys.stderr)
-    if summary.failed:
-        raise SpslamError(f"{len(summary.failed)} of {len(plan.jobs)} runs failed; the first: {summary.failed[0]}")
-    if not plan.jobs:
-        raise SpslamError(
-            f"no run of {suite.name} is possible: no data found; --data names the folder that contains it"
-        )
-
-
-def _run_job(args: argparse.Namespace) -> None:
-    """Executes one run as a child process of `run_jobs`; exits when the parent process ends."""
-    from spslam.benchmark.jobs import Job
-    from spslam.benchmark.pool import run_here
-
-    threading.Thread(target=_exit_at_end_of_input, daemon=True).start()
-    run_here(Job.from_json(args.job), args.key, args.output, args.workers, args.threads, args.keep)
-
-
-def _exit_at_end_of_input() -> None:
-    # os.read instead of sys.stdin.read, which would hold the lock of sys.stdin at the exit of the interpreter.
-    while os.read(0, 1):
-        pass
-    os._exit(1)
 
 
 def _check_frames(text: str) -> None:

@@ -8,7 +8,7 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from spslam.cli.parser import Parser
 from spslam.errors import SpslamError
@@ -38,8 +38,13 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for what the user can put right, 130 interrupted, 1 unexpected."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    return exit_code(lambda: _run(arguments), arguments)
+
+
+def exit_code(run: Callable[[], None], arguments: Sequence[str]) -> int:
+    """The exit code of what `run` does, as of `main`; errors are printed in one line."""
     try:
-        _run(arguments)
+        run()
         sys.stdout.flush()
     except KeyboardInterrupt as interrupt:
         return _fail("interrupted" + "".join(f"; {hint}" for hint in interrupt.args), EXIT_INTERRUPTED, arguments)

@@ -6,6 +6,9 @@ from pathlib import Path
 
 from spslam.config import Config
 
+# Of a run's process beside what options bound: libraries, model, map, frames read ahead, and results being written.
+_PROCESS_MB = 1500
+
 _FRAMES = re.compile(r"(-?\d*):(-?\d*)(?::(\d+))?")
 
 
@@ -33,6 +36,16 @@ class RunRequest:
     mesh: bool = True
     map: Path | None = None
     command: str = ""
+
+
+def memory_needed_mb(config: Config, mesh: bool) -> int:
+    """Main memory in MB that a run is given on a shared machine: `pixels.budget_mb` and `mesh.max_memory_mb` count.
+
+    Args:
+        config: of the run.
+        mesh: whether it makes one.
+    """
+    return round(_PROCESS_MB + config.pixels.budget_mb + (config.mesh.max_memory_mb if mesh else 0))
 
 
 def parse_frames(text: str) -> slice:

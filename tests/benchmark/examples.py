@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from spslam.benchmark.jobs import Job, Plan
-from spslam.benchmark.pool import Outcome
+from spslam.benchmark.records import Outcome
 from spslam.benchmark.suites import SPSLAM, Sequence, Study, Suite, Variant
 from spslam.benchmark.summary import Summary, summarize
 

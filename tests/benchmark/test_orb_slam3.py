@@ -10,10 +10,11 @@ import pytest
 from spslam.benchmark.jobs import make_plan
 from spslam.benchmark.measure import measure
 from spslam.benchmark.orb_slam3 import VOCABULARY, OrbSlam3, orb_slam3_off_reason, orb_slam3_settings
-from spslam.benchmark.pool import PoolOptions, run_jobs
+from spslam.benchmark.records import run_jobs
 from spslam.benchmark.suites import ORB_SLAM3, load_suite
 from spslam.camera import Camera
 from spslam.errors import SpslamError
+from spslam.tasks.local import LocalExecutor
 from tests.benchmark.examples import tiny_job
 from tests.system.sequences import Recorded
 
@@ -61,7 +62,7 @@ def test_figures_of_a_run(fake_orb_slam3, tmp_path):
 
 def test_run_in_the_pool(fake_orb_slam3, tmp_path):
     tiny = job()
-    outcome = run_jobs({tiny.key(): tiny}, tmp_path / "out", PoolOptions(threads=1))[tiny.key()]
+    outcome = run_jobs({tiny.key(): tiny}, tmp_path / "out", LocalExecutor(threads=1))[tiny.key()]
     assert outcome.record is not None, outcome.error
     assert outcome.record["figures"]["frames"] == 4
 

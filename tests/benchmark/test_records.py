@@ -9,9 +9,10 @@ import time
 
 import pytest
 
-from spslam.benchmark.pool import RECORDS, RUNS, WORK, PoolOptions, record_path, run_jobs
+from spslam.benchmark.records import RECORDS, RUNS, WORK, record_path, run_jobs
 from spslam.benchmark.suites import GICP
 from spslam.errors import OutputError
+from spslam.tasks.local import LocalExecutor
 from tests.benchmark.examples import tiny_job
 from tests.cli.command import ROOT, assert_refused, spslam
 
@@ -23,7 +24,7 @@ def by_key(*jobs):
 def test_runs_leave_records_once(tmp_path):
     jobs = by_key(tiny_job(), tiny_job(GICP))
     reports = []
-    outcomes = run_jobs(jobs, tmp_path, PoolOptions(workers=2, threads=1, keep=True), lambda *r: reports.append(r))
+    outcomes = run_jobs(jobs, tmp_path, LocalExecutor(workers=2, threads=1), True, lambda *r: reports.append(r))
     assert [(done, total) for done, total, _ in reports] == [(1, 2), (2, 2)]
     for key in jobs:
         record = json.loads(record_path(tmp_path, key).read_text())
@@ -36,14 +37,14 @@ def test_runs_leave_records_once(tmp_path):
     assert not list((tmp_path / WORK).glob("*"))
 
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / RECORDS).iterdir()}
-    again = run_jobs(jobs, tmp_path, PoolOptions())
+    again = run_jobs(jobs, tmp_path, LocalExecutor())
     assert all(outcome.earlier for outcome in again.values())
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / RECORDS).iterdir()} == before
 
 
 def test_failed_run_is_reported_and_tried_again(tmp_path):
     job = tiny_job(config="7scenes", options=(), data=str(tmp_path / "nothing"), sequence="kitchen")
-    outcome = run_jobs(by_key(job), tmp_path / "out", PoolOptions())[job.key()]
+    outcome = run_jobs(by_key(job), tmp_path / "out", LocalExecutor())[job.key()]
     assert outcome.record is None
     assert "nothing" in outcome.error
     assert not list((tmp_path / "out" / RECORDS).glob("*.json"))
@@ -53,18 +54,19 @@ def test_damaged_record_is_run_again(tmp_path):
     job = tiny_job(GICP)
     record_path(tmp_path, job.key()).parent.mkdir()
     record_path(tmp_path, job.key()).write_text('{"figures"')
-    outcome = run_jobs(by_key(job), tmp_path, PoolOptions())[job.key()]
+    outcome = run_jobs(by_key(job), tmp_path, LocalExecutor())[job.key()]
     assert outcome.record is not None and not outcome.earlier
 
 
 LONG = """
 import sys
 from pathlib import Path
-from spslam.benchmark.pool import PoolOptions, run_jobs
+from spslam.benchmark.records import run_jobs
+from spslam.tasks.local import LocalExecutor
 from tests.benchmark.examples import tiny_job
 
 job = tiny_job(frames="0:3000", options=(*tiny_job().options, ("dataset.frames", 3000)))
-run_jobs({job.key(): job}, Path(sys.argv[1]), PoolOptions(threads=1))
+run_jobs({job.key(): job}, Path(sys.argv[1]), LocalExecutor(threads=1))
 """
 
 
@@ -75,7 +77,7 @@ def test_kill_leaves_nothing_half_written(tmp_path):
     )
     log = wait_for(output / WORK, "*/log.jsonl")
     with pytest.raises(OutputError, match="out: another spslam bench is running in it; use another --output"):
-        run_jobs(by_key(job), output, PoolOptions())
+        run_jobs(by_key(job), output, LocalExecutor())
     process.send_signal(signal.SIGKILL)
     process.wait()
     size = settled_size(log)
@@ -83,7 +85,7 @@ def test_kill_leaves_nothing_half_written(tmp_path):
     assert log.stat().st_size == size, "the run continues after its parent was killed"
     assert not list((output / RECORDS).iterdir())
 
-    assert run_jobs(by_key(job), output, PoolOptions())[job.key()].record
+    assert run_jobs(by_key(job), output, LocalExecutor())[job.key()].record
     assert [path.name for path in (output / RECORDS).iterdir()] == [f"{job.key()}.json"]
     assert not list((output / WORK).glob("*"))
 
@@ -152,4 +154,4 @@ def test_nothing_to_run_is_reported(tmp_path):
 def test_output_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file: can't be used for results"):
-        run_jobs({}, tmp_path / "file", PoolOptions())
+        run_jobs({}, tmp_path / "file", LocalExecutor())
