@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spslam.cli.arguments import add_config, add_device, add_preset, add_quiet, choose_config, frame_range, overrides
+from spslam.cli.chunks import add_chunks, check_chunks, run_in_chunks
 from spslam.cli.parser import UsageError
 from spslam.cli.progress import make_progress, print_summary
 from spslam.cli.viewing import add_view, opened_viewer
@@ -35,10 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="continue the interrupted run in --output")
     parser.add_argument("--no-mesh", action="store_true", help="leave out the mesh")
     add_view(parser)
+    add_chunks(parser)
     add_quiet(parser)
 
 
 def execute(args: argparse.Namespace) -> None:
+    check_chunks(args)
     if args.resume and args.output is None:
         raise UsageError("--resume needs the interrupted run's folder as --output")
     output = args.output or default_output(args.config)
@@ -47,8 +50,11 @@ def execute(args: argparse.Namespace) -> None:
     was_finished = args.resume and folder.metrics.is_file() and not folder.checkpoint.is_file()
     request = make_request(config, output, args.frames, args.resume, not args.no_mesh)
     request = replace(request, map=args.map, command=args.command_line)
-    with opened_viewer(args, f"spslam run {args.config}") as viewer:
-        metrics = run(request, args.quiet, observer=viewer)
+    if args.chunks is not None:
+        metrics = run_in_chunks(request, args)
+    else:
+        with opened_viewer(args, f"spslam run {args.config}") as viewer:
+            metrics = run(request, args.quiet, observer=viewer)
     if not args.quiet:
         if was_finished:
             print("this run had finished before; nothing was left to do")

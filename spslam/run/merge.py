@@ -82,8 +82,8 @@ def _merge(request: MergeRequest, config: Config, device: torch.device) -> dict[
     _check_output(request.output_dir)
     archives = _archives(request, config)
     joined = _joined(request.folders, archives, config)
-    state = _state(RunFolder(request.folders[0]), joined, config, device)
-    _make_map(state, config)
+    state = joined_state(RunFolder(request.folders[0]), joined, config, device)
+    make_map(state, config)
     archive = archive_of(state, None, joined.settings)
     temporary = OutputFolder(request.output_dir.parent / f".{request.output_dir.name}.merging")
     with temporary.locked():
@@ -143,8 +143,15 @@ def _joined(folders: Sequence[Path], archives: Sequence[KeyframeArchive], config
     return joined
 
 
-def _state(folder: RunFolder, joined: KeyframeArchive, config: Config, device: torch.device) -> SlamState:
-    """A state of all keyframes, with the map of the first run."""
+def joined_state(folder: RunFolder, joined: KeyframeArchive, config: Config, device: torch.device) -> SlamState:
+    """A state of all keyframes of several runs, with the map of the first one.
+
+    Args:
+        folder: of the first run.
+        joined: keyframes of all runs.
+        config: of the first run.
+        device: to work on.
+    """
     camera = joined.recordings[0].camera
     state = SlamState.start(config, camera, np.eye(4), None, device)
     state.scene.load_state_dict(Scene.load(folder.map, device).state_dict())
@@ -152,8 +159,8 @@ def _state(folder: RunFolder, joined: KeyframeArchive, config: Config, device: t
     return state
 
 
-def _make_map(state: SlamState, config: Config) -> None:
-    """Makes the map again from all keyframes, and optimizes it over all of them, some at a time."""
+def make_map(state: SlamState, config: Config) -> None:
+    """Makes the map of a state again from all keyframes, and optimizes it over all of them, some at a time."""
     prior = load_prior(config.prior.weights, config.prior.neighborhood)
     remake_map(state, prior, config)
     mapper = Mapper(config, state.frames.camera, prior)

@@ -111,14 +111,14 @@ def write_results(
         "data": session.identity,
         "frames": frames,
         **_speed(clock),
-        **_timings(log, clock),
+        **timings(log, clock),
         **(figures or {}),
         "lost_frames": int(lost.sum()),
         "unjoined_frames": sum(map(len, segments)),
         "tracking_failures": int((lost[1:] & ~lost[:-1]).sum()) + int(lost[0]),
         "recovered_frames": sum(line["recovered"] for line in log),
         "relocalized_frames": sum(line["relocalized"] for line in log),
-        **_max_error_probability(log),
+        **max_error_probability(log),
         "skipped_frames": len(skipped),
         **_sizes(system),
     }
@@ -182,7 +182,7 @@ def _nothing_known(name: str, config: Config) -> str:
     )
 
 
-def _max_error_probability(log: list[dict[str, Any]]) -> dict[str, float]:
+def max_error_probability(log: list[dict[str, Any]]) -> dict[str, float]:
     """The highest error probability of the accepted poses; empty where none was judged."""
     error_probabilities = [
         line["error_probability"] for line in log if not line["lost"] and line["error_probability"] is not None
@@ -215,8 +215,13 @@ def _sizes(system: SlamSystem) -> dict[str, float]:
     return sizes
 
 
-def _timings(log: list[dict[str, Any]], clock: RunClock) -> dict[str, float]:
-    """Timings of metrics.json from the log: the stages' share of the loop, and time per iteration."""
+def timings(log: list[dict[str, Any]], clock: RunClock) -> dict[str, float]:
+    """Timings of metrics.json from the log: the stages' share of the loop, and time per iteration.
+
+    Args:
+        log: the lines of log.jsonl.
+        clock: of the run.
+    """
     tracked = [line for line in log if line["tracking_iterations"]]
     mapped = [line for line in log if line["mapping_iterations"]]
     later = mapped[1:]

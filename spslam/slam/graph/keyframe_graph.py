@@ -15,7 +15,7 @@ from spslam.slam.graph.keyframe import Keyframe
 from spslam.slam.graph.loops import LoopFinder, Proposal
 from spslam.slam.graph.overlap import Surfaces
 from spslam.slam.graph.redundancy import RECENT, moved_edges, redundant_keyframes
-from spslam.slam.graph.registration import Registrar
+from spslam.slam.graph.registration import Registrar, Registration
 from spslam.slam.poses import pose_tensor
 
 NEIGHBORS = 3  # keyframes before, which each is registered with
@@ -103,26 +103,47 @@ class KeyframeGraph:
             poses: float64 [K, 4, 4] T_world_camera as they are known.
             spacing: of two keyframes that follow each other, m (less where surface is near) and rad.
         """
-        decisions: list[LoopDecision] = []
-        loops: list[GraphEdge] = []
-        content, first = self.content, self.content.done
-        lengths = np.append(0.0, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).cumsum())
+        first = self.content.done
         self._join(keyframes, first, links, poses)
-        for one in range(first, len(keyframes)):
-            known = {edge.target for edge in content.edges if edge.source == one}
-            found, tried = self._loops.find(keyframes, one, known, poses, lengths, content.waiting)
-            loops += found
-            decisions += tried
-        content.done = len(keyframes)
+        loops, decisions = self.find_loops(keyframes, first, poses)
+        self.content.done = len(keyframes)
         poses, refused = self.close(keyframes, poses, loops)
-        if refused:
-            decisions = [
-                replace(decision, accepted=False, reason=refused) if decision.accepted else decision
-                for decision in decisions
-            ]
-        elif loops:
+        decisions = after_refusal(decisions, refused)
+        if loops and not refused:
             first = 0
         return GraphUpdate(poses, tuple(decisions), self._left_out(first, poses, spacing))
+
+    def find_loops(
+        self, keyframes: Sequence[Keyframe], first: int, poses: np.ndarray
+    ) -> tuple[list[GraphEdge], list[LoopDecision]]:
+        """Loops from the keyframes from `first` on to those before, and what was decided on all that were tried.
+
+        Args:
+            keyframes: K of the graph.
+            first: number of the first new one.
+            poses: float64 [K, 4, 4] T_world_camera as they are known.
+        """
+        loops: list[GraphEdge] = []
+        decisions: list[LoopDecision] = []
+        lengths = np.append(0.0, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).cumsum())
+        for one in range(first, len(keyframes)):
+            known = {edge.target for edge in self.content.edges if edge.source == one}
+            found, tried = self._loops.find(keyframes, one, known, poses, lengths, self.content.waiting)
+            loops += found
+            decisions += tried
+        return loops, decisions
+
+    def connect(self, keyframes: Sequence[Keyframe], first: int, poses: np.ndarray) -> None:
+        """Registers the keyframes from `first` on with those just before them, and with all that share surface.
+
+        Args:
+            keyframes: K of the graph.
+            first: number of the first one, 1 at least.
+            poses: float64 [K, 4, 4] T_world_camera as they are known.
+        """
+        ones = range(first, len(keyframes))
+        pairs = [(one, other) for one in ones for other in range(max(one - NEIGHBORS, 0), one)]
+        self._register(keyframes, [*pairs, *self._covisible(ones, poses)], poses)
 
     def close(self, keyframes: Sequence[Keyframe], poses: np.ndarray, loops: list[GraphEdge]) -> tuple[np.ndarray, str]:
         """Solves with loops that were found, and with the edges between what they bring together.
@@ -157,11 +178,10 @@ class KeyframeGraph:
         tracked = _tensors([links[one].pose for one in ones])
         measured = self._registrar.measure_all([(keyframes[one], keyframes[one - 1]) for one in ones], tracked)
         for one, found in zip(ones, measured, strict=True):
-            information = WEAK_INFORMATION if found is None else TRACKED_IMAGES * found.information
+            information = tracked_information(found)
             kind: EdgeKind = "relocalized" if links[one].relocalized else "tracked"
             self.content.edges.append(GraphEdge(kind, one, one - 1, links[one].pose, information))
-        pairs = [(one, other) for one in ones for other in range(max(one - NEIGHBORS, 0), one)]
-        self._register(keyframes, [*pairs, *self._covisible(ones, poses)], poses)
+        self.connect(keyframes, ones.start, poses)
 
     def _covisible(self, ones: Iterable[int], poses: np.ndarray) -> list[tuple[int, int]]:
         """Keyframes with those that share most surface with them."""
@@ -221,6 +241,19 @@ class KeyframeGraph:
         if not near:
             return 1.0
         return max(float(np.median(squared_errors(poses, pose_edges(near)))) / MEDIAN_SQUARE, 1.0)
+
+
+def after_refusal(decisions: Sequence[LoopDecision], refused: str) -> list[LoopDecision]:
+    """Decisions on loops, of which the accepted ones were refused after all for a reason; empty where they were not."""
+    return [
+        replace(decision, accepted=False, reason=refused) if refused and decision.accepted else decision
+        for decision in decisions
+    ]
+
+
+def tracked_information(measured: Registration | None) -> np.ndarray:
+    """float64 [6, 6] of a tracked pose, by how the keyframes compare there; None where they share no surface."""
+    return WEAK_INFORMATION if measured is None else TRACKED_IMAGES * measured.information
 
 
 def _scaled(edges: Sequence[GraphEdge], variance_scale: float) -> PoseEdges:
