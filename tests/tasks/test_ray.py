@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+import spslam
 from spslam.benchmark.records import run_jobs
 from spslam.config import load_config
 from spslam.errors import ClusterError
@@ -150,6 +151,13 @@ def test_what_is_sent_comes_back(cluster, tmp_path):
     assert (tmp_path / "sent" / "below" / "text").read_text() == "sent"
     assert (tmp_path / "sent" / "empty").read_bytes() == b""
     assert not (tmp_path / "wrong").exists()
+
+
+def test_another_version_is_refused(cluster, tmp_path, monkeypatch):
+    monkeypatch.setattr(spslam, "__version__", "9.9")
+    with executor(cluster) as on_cluster:
+        end = next(run_tasks([task(tmp_path, "new")], on_cluster, tmp_path / "log"))
+    assert "is installed there, 9.9 where the tasks come from" in end.error
 
 
 def test_a_node_that_comes_later_is_used(cluster, tmp_path):
