@@ -180,7 +180,8 @@ def _run_all(
 
 def _task(request: RunRequest, chunk: Chunk, device: str) -> Task:
     config = request.config
-    changes: dict[str, dict[str, Any]] = {"run": {"previews": 0}}
+    # By a keyword, as the folder of previews has the option's name, and names of files stand in `run_folder` alone.
+    changes: dict[str, dict[str, Any]] = {"run": dict(previews=0)}
     if chunk.number:
         # The first one defines the world, and what a look at the first frames finds is found there.
         changes["run"]["data_check"] = "warn"
