@@ -144,5 +144,5 @@ def test_thinning_gives_memory_back():
     full = resident_bytes()
     database.add(content)
     assert database.pixels_per_frame == 2048
-    assert full - resident_bytes() > 0.45 * database.budget_bytes
+    assert full - resident_bytes() > 0.4 * database.budget_bytes
     assert all(torch.equal(database.records[number], content[:2048]) for number in (0, 500, 1000))
