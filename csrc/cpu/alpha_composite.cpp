@@ -2,34 +2,15 @@
 
 #include <algorithm>
 #include <limits>
-#include <type_traits>
 #include <vector>
 
 #include "core/parallel.h"
+#include "cpu/channels.h"
 
 namespace spslam {
 namespace {
 
 constexpr std::int64_t kRayGrain = 32;
-
-// Calls f with the number of channels as a constant where it is a common one, else as 0.
-template <class F>
-void with_color_channels(std::int64_t channels, const F& f) {
-  switch (channels) {
-    case 1:
-      return f(std::integral_constant<int, 1>{});
-    case 3:
-      return f(std::integral_constant<int, 3>{});
-    case 4:
-      return f(std::integral_constant<int, 4>{});
-    case 16:
-      return f(std::integral_constant<int, 16>{});
-    case 32:
-      return f(std::integral_constant<int, 32>{});
-    default:
-      return f(std::integral_constant<int, 0>{});
-  }
-}
 
 // Opacities and transmittances of one ray at a time.
 template <class T>
@@ -144,7 +125,7 @@ void composite_ray_backward(const CompositeInputs<T>& in, const T* all_weights, 
 
 template <class Device, class T>
 void alpha_composite(Device, const CompositeInputs<T>& inputs, const CompositeOutputs<T>& out) {
-  with_color_channels(inputs.channels, [&](auto constant) {
+  with_channels<1, 3, 4, 16, 32>(inputs.channels, [&](auto constant) {
     parallel_for(inputs.spans.num_rays, kRayGrain, [&](std::int64_t begin, std::int64_t end) {
       RayOpacities<T> opacities(inputs);
       for (std::int64_t r = begin; r < end; ++r) {
@@ -157,7 +138,7 @@ void alpha_composite(Device, const CompositeInputs<T>& inputs, const CompositeOu
 template <class Device, class T>
 void alpha_composite_backward(Device, const CompositeInputs<T>& inputs, const T* weights,
                               const CompositeOutputGradients<T>& grad, const CompositeInputGradients<T>& out) {
-  with_color_channels(inputs.channels, [&](auto constant) {
+  with_channels<1, 3, 4, 16, 32>(inputs.channels, [&](auto constant) {
     parallel_for(inputs.spans.num_rays, kRayGrain, [&](std::int64_t begin, std::int64_t end) {
       RayOpacities<T> opacities(inputs);
       for (std::int64_t r = begin; r < end; ++r) {

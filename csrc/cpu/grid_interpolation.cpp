@@ -8,19 +8,6 @@ namespace {
 
 constexpr std::int64_t kFillGrain = 1 << 16;
 
-// As with_channels, with the small widths of hashed grids too.
-template <class F>
-void with_level_channels(std::int64_t channels, const F& f) {
-  switch (channels) {
-    case 2:
-      return f(std::integral_constant<int, 2>{});
-    case 4:
-      return f(std::integral_constant<int, 4>{});
-    default:
-      return with_channels(channels, f);
-  }
-}
-
 // Calls f with a field of level `level`.
 template <class T, class F>
 void with_level(const GridLevels<T>& grid, std::int32_t level, const T* points, const F& f) {
@@ -61,7 +48,7 @@ void scatter_levels(const GridLevels<T>& grid, const GridTable<T>& table, const 
       const auto level = static_cast<std::int32_t>(region / parts);
       const T* g = grad + (grid.concatenated ? level * channels : 0) + first;
       with_level(grid, level, points, [&](const auto& field) {
-        with_level_channels(count, [&](auto constant) {
+        with_channels<2, 4, 8, 16, 32>(count, [&](auto constant) {
           scatter_part<decltype(constant)::value>(field, static_cast<int>(region % parts), g, stride, channels, count,
                                                   num_points, out + first);
         });
@@ -74,7 +61,7 @@ template <class T>
 void gather_level_gradients(const GridLevels<T>& grid, const GridTable<T>& table, const T* points,
                             std::int64_t num_points, const T* grad, T* out) {
   const std::int64_t channels = table.channels, stride = output_width(grid, channels);
-  with_level_channels(channels, [&](auto constant) {
+  with_channels<2, 4, 8, 16, 32>(channels, [&](auto constant) {
     constexpr int kChannels = decltype(constant)::value;
     parallel_for(num_points, kPointGrain, [&](std::int64_t begin, std::int64_t end) {
       for (std::int32_t level = 0; level < grid.count; ++level) {
@@ -102,7 +89,7 @@ template <class Device, class T>
 void grid_interpolate(Device, const GridLevels<T>& grid, const GridTable<T>& table, const T* points,
                       std::int64_t num_points, T* out) {
   const std::int64_t channels = table.channels, stride = output_width(grid, channels);
-  with_level_channels(channels, [&](auto constant) {
+  with_channels<2, 4, 8, 16, 32>(channels, [&](auto constant) {
     constexpr int kChannels = decltype(constant)::value;
     parallel_for(num_points, kPointGrain, [&](std::int64_t begin, std::int64_t end) {
       for (std::int32_t level = 0; level < grid.count; ++level) {
@@ -129,7 +116,7 @@ void grid_interpolate_backward(Device, const GridLevels<T>& grid, const GridTabl
 template <class Device, class T>
 void row_gather(Device, const RowLists& lists, const T* table, const T* weights, T* out) {
   const RowLists l = lists;
-  with_level_channels(l.channels, [&](auto constant) {
+  with_channels<2, 4, 8, 16, 32>(l.channels, [&](auto constant) {
     const std::int64_t count = decltype(constant)::value ? decltype(constant)::value : l.channels;
     parallel_for(l.num_lists, kPointGrain, [&](std::int64_t begin, std::int64_t end) {
       for (std::int64_t n = begin; n < end; ++n) {
@@ -153,7 +140,7 @@ void row_scatter(Device, const RowLists& lists, const T* grad, const T* weights,
   const std::int64_t width = slice_width<T>(l.channels, get_num_threads());
   parallel_for(width > 0 ? chunk_count(l.channels, width) : 0, 1, [&](std::int64_t begin, std::int64_t end) {
     const std::int64_t first = begin * width, count = std::min(end * width, l.channels) - first;
-    with_level_channels(count, [&](auto constant) {
+    with_channels<2, 4, 8, 16, 32>(count, [&](auto constant) {
       const std::int64_t columns = decltype(constant)::value ? decltype(constant)::value : count;
       for (std::int64_t n = 0; n < l.num_lists; ++n) {
         const T* g = grad + n * l.channels + first;
@@ -171,7 +158,7 @@ void row_scatter(Device, const RowLists& lists, const T* grad, const T* weights,
 template <class Device, class T>
 void row_dot(Device, const RowLists& lists, const T* grad, const T* table, T* out) {
   const RowLists l = lists;
-  with_level_channels(l.channels, [&](auto constant) {
+  with_channels<2, 4, 8, 16, 32>(l.channels, [&](auto constant) {
     const std::int64_t count = decltype(constant)::value ? decltype(constant)::value : l.channels;
     parallel_for(l.num_lists, kPointGrain, [&](std::int64_t begin, std::int64_t end) {
       for (std::int64_t n = begin; n < end; ++n) {

@@ -16,7 +16,7 @@ struct InterpolationLoops<Cpu> {
 
   template <class Field, class T>
   static void gather(Cpu, const Field& field, const T* table, std::int64_t channels, std::int64_t num_points, T* out) {
-    with_channels(channels, [&](auto constant) {
+    with_channels<8, 16, 32>(channels, [&](auto constant) {
       parallel_for(num_points, kPointGrain, [&](std::int64_t begin, std::int64_t end) {
         gather_points<decltype(constant)::value>(field, table, channels, begin, end, out, channels);
       });
@@ -26,7 +26,7 @@ struct InterpolationLoops<Cpu> {
   template <class Field, class T>
   static void gather_gradient(Cpu, const Field& field, const T* grad, const T* table, std::int64_t channels,
                               std::int64_t num_points, T* out) {
-    with_channels(channels, [&](auto constant) {
+    with_channels<8, 16, 32>(channels, [&](auto constant) {
       parallel_for(num_points, kPointGrain, [&](std::int64_t begin, std::int64_t end) {
         gather_gradient_points<decltype(constant)::value>(field, grad, channels, table, channels, begin, end, out);
       });
@@ -46,7 +46,7 @@ struct InterpolationLoops<Cpu> {
       for (std::int64_t task = begin; task < end; ++task) {
         const std::int64_t first = task % slices * width;
         const std::int64_t count = std::min(width, channels - first);
-        with_channels(count, [&](auto constant) {
+        with_channels<8, 16, 32>(count, [&](auto constant) {
           scatter_part<decltype(constant)::value>(field, static_cast<int>(task / slices), grad + first, channels,
                                                   channels, count, num_points, out + first);
         });

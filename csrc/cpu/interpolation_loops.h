@@ -4,29 +4,14 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
-#include <type_traits>
 
 #include "core/parallel.h"
+#include "cpu/channels.h"
 #include "kernels/interpolation_stencils.h"
 
 namespace spslam {
 
 constexpr std::int64_t kPointGrain = 512;
-
-// Calls f with the number of channels as a constant where it is a common one, else as 0.
-template <class F>
-inline void with_channels(std::int64_t channels, const F& f) {
-  switch (channels) {
-    case 8:
-      return f(std::integral_constant<int, 8>{});
-    case 16:
-      return f(std::integral_constant<int, 16>{});
-    case 32:
-      return f(std::integral_constant<int, 32>{});
-    default:
-      return f(std::integral_constant<int, 0>{});
-  }
-}
 
 // Values of points [begin, end) into rows of `out` that are `stride` apart; with kAdd they are added to them.
 template <int kChannels, bool kAdd = false, class Field, class T>
