@@ -184,6 +184,7 @@ void measure_planes<Cpu>(Cpu, const DepthImage& image, const DepthNoise& noise, 
 template <>
 void tsdf_integrate<Cpu>(Cpu device, const TsdfBlocks& blocks, const PlaneFrame& frame, const TsdfOptions& options,
                          void* workspace) {
+  if (frame.width == 0 || frame.height == 0) return;
   float* tiles_far = static_cast<float*>(workspace);
   measure_tiles(device, frame, tiles_far);
   const Pose<float> pose = load_pose(frame.pose);

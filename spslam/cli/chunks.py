@@ -40,7 +40,7 @@ def check_chunks(args: argparse.Namespace) -> None:
         raise UsageError("--chunks must be 2 at least; without it the recording is run over in one piece")
     if args.map is not None:
         raise UsageError("--chunks makes a new map; go on in another with --map in a run without it, or spslam merge")
-    if args.view or args.rerun:
+    if args.view or any(getattr(args, name) is not None for name in ("rerun", "host", "port")):
         raise UsageError("--view and --rerun show a run in one piece; spslam view OUTPUT shows the joined result")
 
 

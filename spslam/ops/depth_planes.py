@@ -1,5 +1,7 @@
 """The planes that a depth image measured: what signed distances are taken from. Not differentiable."""
 
+import math
+
 import torch
 
 from spslam.ops import _library  # noqa: F401
@@ -58,7 +60,13 @@ def measure_planes(
 
 def check_noise(name: str, noise: tuple[float, float]) -> None:
     """Raises ValueError where `noise` is not floor and growth of a variance."""
-    check(len(noise) == 2 and min(noise) >= 0, name, "noise", "be two numbers of at least 0", noise)
+    check(
+        len(noise) == 2 and all(0 <= number < math.inf for number in noise),
+        name,
+        "noise",
+        "be two numbers of at least 0",
+        noise,
+    )
 
 
 @torch.library.register_fake("spslam::measure_planes")

@@ -10,7 +10,7 @@ import torch
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
-from spslam.ops.depth_planes import PLANE_SIZE, check_noise
+from spslam.ops.depth_planes import DEFAULT_NOISE, PLANE_SIZE, check_noise
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 from spslam.ops.voxel_hash import check_table
 
@@ -78,7 +78,7 @@ def tsdf_integrate_(
     voxel_size: float,
     truncation: float,
     near_truncation: float | None = None,
-    noise: tuple[float, float] = (0.0, 0.0),
+    noise: tuple[float, float] = DEFAULT_NOISE,
     color: torch.Tensor | None = None,
     max_weight: float = 1e4,
 ) -> None:

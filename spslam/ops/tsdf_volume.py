@@ -140,7 +140,7 @@ class TsdfVolume:
             pose: float32 [7], T_world_camera.
             intrinsics: px.
             color: uint8 [H, W, 3], or None.
-            noise: of the sensor, see `measure_planes`.
+            noise: of the sensor, see `measure_planes` and `tsdf_integrate_`.
 
         Raises:
             TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.

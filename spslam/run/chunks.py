@@ -196,7 +196,7 @@ def _task(request: RunRequest, chunk: Chunk, device: str) -> Task:
     chosen = request.frames or slice(None)
     start, step = chosen.start or 0, chosen.step or 1
     if start < 0:
-        start += len(open_dataset(config.dataset, request.data_dir))
+        start = max(start + len(open_dataset(config.dataset, request.data_dir)), 0)
     frames = (start + chunk.begin * step, start + (chunk.end - 1) * step + 1, step)
     return Task(
         chunk.name,

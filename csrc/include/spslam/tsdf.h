@@ -51,7 +51,7 @@ struct TsdfBlocks {
   float voxel_size;
 };
 
-// A pixel's truncation is `near_truncation` and a deviation of its noise, at most `truncation`, m.
+// A pixel's truncation is `near_truncation` and a deviation of the noise at the voxel's depth, at most `truncation`, m.
 struct TsdfOptions {
   float truncation, near_truncation;
   DepthNoise noise;

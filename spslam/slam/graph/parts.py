@@ -84,14 +84,14 @@ def join_parts(first: Part, second: Part, boundary: int, registrar: Registrar) -
     joined = _concatenated(*kept, pose)
     archive = joined.archive
     if len(archive.keyframes) == count:
-        return replace(joined, decisions=first.decisions)
+        return replace(joined, decisions=kept[0].decisions)
     ties = _ties(first, second, kept, pose, registrar)
     content = GraphContent([*archive.edges, *ties], set(archive.tried), len(archive.keyframes))
     graph = KeyframeGraph(registrar, Component(archive.keyframes, archive.poses).surfaces(), content)
     graph.connect(archive.keyframes, count, archive.poses)
     loops, decisions = graph.find_loops(archive.keyframes, count, archive.poses)
     poses, refused = graph.close(archive.keyframes, archive.poses, loops)
-    decisions = [*first.decisions, *after_refusal(decisions, refused)]
+    decisions = [*kept[0].decisions, *after_refusal(decisions, refused)]
     moved = replace(archive, recordings=moved_recordings(archive, poses), edges=content.edges, tried=content.tried)
     return replace(joined, archive=moved, decisions=tuple(decisions))
 
@@ -136,7 +136,12 @@ def _cut(part: Part, rows: slice) -> Part:
             (int(numbers[one]), int(numbers[other])) for one, other in archive.tried if inside[one] and inside[other]
         },
     )
-    return Part(cut, part.indices[rows])
+    decisions = [
+        replace(each, source=each.source - rows.start, target=each.target - rows.start)
+        for each in part.decisions
+        if rows.start <= min(each.source, each.target) and max(each.source, each.target) < rows.stop
+    ]
+    return Part(cut, part.indices[rows], tuple(decisions))
 
 
 def _held(edges: Sequence[GraphEdge], poses: np.ndarray) -> list[GraphEdge]:
