@@ -9,7 +9,7 @@ import torch
 from spslam.geometry import compose, inverse, pose_from
 from spslam.pose_graph import rotation_matrices
 from spslam.slam.graph.archive import KeyframeArchive, Recording
-from spslam.slam.graph.edges import GraphEdge, Link
+from spslam.slam.graph.edges import GraphEdge, Link, LoopDecision
 from spslam.slam.graph.keyframe_graph import WEAK_INFORMATION
 from spslam.slam.graph.parts import Part, join_parts, whole_recording
 from spslam.slam.graph.registration import Registrar
@@ -110,3 +110,11 @@ def test_lost_frames_stay_lost(world):
     assert np.flatnonzero(joined.trajectory.lost).tolist() == [22, 23, 24, 25, 26]
     named = whole_recording(joined, Recording("kitchen", {"dataset": {}}, world[1].camera, first.trajectory))
     assert named.recordings[0].name == "kitchen" and len(named.recordings[0].trajectory) == 48
+
+
+def test_loops_of_frames_that_are_given_up_are_forgotten(world):
+    first, second = part(world, 0, 28), part(world, 16, 48, MOVED)
+    loops = tuple(LoopDecision(source, 4, False, "refused", 0.0) for source in (12, 24))
+    joined = join_parts(replace(first, decisions=loops), second, 20, registrar(first))
+    assert loops[0] in joined.decisions
+    assert loops[1] not in joined.decisions
