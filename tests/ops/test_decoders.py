@@ -134,7 +134,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_second_derivatives(device, activation):
+def test_gradgradcheck(device, activation):
     torch.manual_seed(2)
     x = torch.randn(5, 3, dtype=torch.float64, device=device, requires_grad=True)
     params = torch.randn(ops.mlp_num_params(3, 6, 2), dtype=torch.float64, device=device, requires_grad=True)

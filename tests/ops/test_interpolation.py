@@ -107,7 +107,7 @@ def test_gradient_of_one_argument_alone(name, device, generator):
 
 
 @each_op
-def test_second_derivatives(name, device, generator):
+def test_gradgradcheck(name, device, generator):
     arguments, _ = _arguments(name, device, torch.float64, generator, points=8, channels=2)
     torch.autograd.gradgradcheck(getattr(ops, name), arguments, eps=1e-7, atol=1e-4)
 
