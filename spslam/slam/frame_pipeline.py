@@ -140,6 +140,8 @@ class FramePipeline:
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
         pixels = self._receive(frame, events)
+        if self.global_mapping is not None:
+            self.global_mapping.before_tracking()
         constraints = Constraints() if begins_map else self.constraints.gather(self.history, pixels)
         tracked = self._track(pixels, constraints, number, events)
         self._store(frame, pixels, constraints, tracked)

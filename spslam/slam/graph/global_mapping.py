@@ -15,6 +15,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -24,14 +25,23 @@ from spslam.config import Config
 from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix, rotation_angle
 from spslam.prior import Prior
 from spslam.scene import SparseVolume
+from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.graph.edges import Link, LoopDecision
+from spslam.slam.graph.host_threads import host_threads
 from spslam.slam.graph.joining import Component, find_frame
 from spslam.slam.graph.keyframe import NEAR_SHARE, Keyframe, KeyframeCamera
 from spslam.slam.graph.keyframe_graph import GraphContent, GraphUpdate, KeyframeGraph
 from spslam.slam.graph.keyframe_store import KeyframeStore
 from spslam.slam.graph.overlap import Surfaces
 from spslam.slam.graph.registration import Registrar
-from spslam.slam.graph.remap import corrected_poses, empty_volume, encode_keyframe, handed_over, own_stream
+from spslam.slam.graph.remap import (
+    corrected_poses,
+    empty_volume,
+    encode_keyframe,
+    encode_keyframes,
+    handed_over,
+    own_stream,
+)
 from spslam.slam.pixels import FramePixels
 from spslam.slam.state import SlamState
 
@@ -57,11 +67,13 @@ class GlobalMapping:
         self._config, self._prior, self._state, self._store = config, prior, state, store
         self._surfaces = Surfaces()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="spslam-graph")
+        self._pool = host_threads(state.scene.device)
         # Now rather than at the first solution: an import keeps other threads from the interpreter.
         self._worker.submit(importlib.import_module, "scipy.sparse.linalg")
         self._running: Future[Any] | None = None  # None also after the state was loaded
         self._abandoned = threading.Event()  # of the map that is being made again
         self._reference: tuple[Keyframe, np.ndarray] | None = None  # the newest keyframe and its pose
+        self._coming: tuple[Keyframe, torch.Tensor, DeviceEvent] | None = None  # the same on its way to the host
         self._next = 0  # number of the frame at which a live run may begin another solution
         self._taken_up = 0  # number of the frame after which it took up something last
         self._gives_way = False
@@ -70,6 +82,8 @@ class GlobalMapping:
         """Ends the thread, once it is done with what it does."""
         self._abandoned.set()
         self._worker.shutdown(wait=True, cancel_futures=True)
+        if self._pool is not None:
+            self._pool.shutdown(wait=True)
 
     def is_due(self, number: int) -> bool:
         """Whether `before_frame` does anything before frame `number`."""
@@ -115,6 +129,13 @@ class GlobalMapping:
         else:
             self._adopt_ready(store.target)
         return ()
+
+    def before_tracking(self) -> None:
+        """Sends the newest keyframe's pose to the host, for `after_frame`: tracking waits for the device anyway."""
+        if self._store.keyframes and not self._knows_last_pose():
+            newest = self._store.keyframes[-1]
+            pose = fetch(self._state.frames.poses[newest.frame])
+            self._coming = newest, pose, event_recorder(self._state.scene.device)()
 
     def after_frame(self, number: int, pixels: FramePixels, pose: np.ndarray) -> None:
         """Makes the newest frame a keyframe if it is far enough from the last one; else waits for no device.
@@ -206,12 +227,21 @@ class GlobalMapping:
             self._adopt(target, self._remade_volume(target))
             store.begun = store.target = None
 
+    def _knows_last_pose(self) -> bool:
+        """Whether the newest keyframe's pose is as it was last read; mapping may have moved it."""
+        is_read = self._reference is not None and self._reference[0] is self._store.keyframes[-1]
+        return is_read and self._config.mapping.pose_rate == 0
+
     def _last_pose(self) -> np.ndarray:
-        """float64 [4, 4] T_world_camera of the newest keyframe, as it was last read unless it may have moved since."""
+        """float64 [4, 4] T_world_camera of the newest keyframe."""
         newest = self._store.keyframes[-1]
-        if self._reference is None or self._reference[0] is not newest or self._config.mapping.pose_rate > 0:
-            pose = self._state.frames.poses[newest.frame].cpu().double().numpy()
-            self._reference = newest, pose7_to_matrix(pose)
+        if self._reference is None or not self._knows_last_pose():
+            if self._coming is not None and self._coming[0] is newest:
+                _, pose, sent = self._coming
+                sent.wait()
+            else:
+                pose = self._state.frames.poses[newest.frame].cpu()
+            self._reference = newest, pose7_to_matrix(pose.double().numpy())
         return self._reference[1]
 
     def _is_far(self, moved: np.ndarray) -> bool:
@@ -248,7 +278,8 @@ class GlobalMapping:
 
     def _registrar(self, noise: dict[KeyframeCamera, torch.Tensor]) -> Registrar:
         tracking = self._config.tracking
-        return Registrar(noise, self._config.seed, tracking.color, tracking.features, self._state.scene.device)
+        device = self._state.scene.device
+        return Registrar(noise, self._config.seed, tracking.color, tracking.features, device, self._pool)
 
     def _solution(self, poses: np.ndarray) -> Callable[[], tuple[GraphContent, GraphUpdate]]:
         """What solves the graph of the first K keyframes from their poses float64 [K, 4, 4], on any thread."""
@@ -280,10 +311,8 @@ class GlobalMapping:
         def make() -> SparseVolume:
             with own_stream(scene.device):
                 made = empty_volume(scene) if volume is None else volume
-                for keyframe, pose in zip(keyframes, poses, strict=True):
-                    if abandoned.is_set():
-                        break
-                    encode_keyframe(made, keyframe, pose, prior, self._config)
+                posed = takewhile(lambda _: not abandoned.is_set(), zip(keyframes, poses, strict=True))
+                encode_keyframes(made, posed, prior, self._config, self._pool)
             return made
 
         return make

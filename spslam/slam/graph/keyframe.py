@@ -102,15 +102,19 @@ class Keyframe:
     def changed(self, **changes: Any) -> Keyframe:
         """The same image under another number or in other memory; features that were found are kept."""
         other = replace(self, **changes)
-        if "features" in self.__dict__:
-            other.__dict__["features"] = self.features
+        if "_features" in self.__dict__:
+            other.__dict__["_features"] = self.features
         return other
 
-    @cached_property
+    @property
     def features(self) -> ImageFeatures:
-        """Of the image, those of which the depth is known."""
-        images = self.intensity.numpy(), self.depth.numpy()
-        return features_of_images(*images, self.camera.camera, self.camera.max_depth_m).with_depth()
+        """Of the image, those of which the depth is known; found once."""
+        found: ImageFeatures | None = self.__dict__.get("_features")
+        if found is None:  # before Python 3.12 a cached_property finds those of one keyframe at a time
+            images = self.intensity.numpy(), self.depth.numpy()
+            found = features_of_images(*images, self.camera.camera, self.camera.max_depth_m).with_depth()
+            self.__dict__["_features"] = found
+        return found
 
     @cached_property
     def median_m(self) -> float:

@@ -123,15 +123,12 @@ class KeyframeGraph:
             first: number of the first new one.
             poses: float64 [K, 4, 4] T_world_camera as they are known.
         """
-        loops: list[GraphEdge] = []
-        decisions: list[LoopDecision] = []
         lengths = np.append(0.0, np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).cumsum())
-        for one in range(first, len(keyframes)):
-            known = {edge.target for edge in self.content.edges if edge.source == one}
-            found, tried = self._loops.find(keyframes, one, known, poses, lengths, self.content.waiting)
-            loops += found
-            decisions += tried
-        return loops, decisions
+        known: dict[int, set[int]] = {one: set() for one in range(first, len(keyframes))}
+        for edge in self.content.edges:
+            if edge.source in known:
+                known[edge.source].add(edge.target)
+        return self._loops.find(keyframes, known, poses, lengths, self.content.waiting)
 
     def connect(self, keyframes: Sequence[Keyframe], first: int, poses: np.ndarray) -> None:
         """Registers the keyframes from `first` on with those just before them, and with all that share surface.

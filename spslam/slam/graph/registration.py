@@ -9,7 +9,9 @@ neighboring pixels.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -106,6 +108,7 @@ class _Batch(NamedTuple):
     noise: torch.Tensor
 
 
+_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 Pair = tuple[Keyframe, Keyframe]  # source and target
 
@@ -119,6 +122,10 @@ class Registrar:
         brightness: whether differences of brightness count.
         features: whether image features do.
         device: where pairs are aligned and compared; on CUDA on a stream of their own.
+        pool: threads for what the host does of each keyframe and pair; None does it in the caller's.
+
+    Attributes:
+        features: see the argument.
     """
 
     def __init__(
@@ -128,10 +135,11 @@ class Registrar:
         brightness: bool = True,
         features: bool = True,
         device: torch.device | str = "cpu",
+        pool: ThreadPoolExecutor | None = None,
     ):
         # Errors of registration are in pixels of the frames' images.
         self._noise = {camera: one.cpu() * torch.tensor([1, 1, 1, 1 / camera.step**2]) for camera, one in noise.items()}
-        self._seed, self._device = seed, torch.device(device)
+        self._seed, self._device, self._pool = seed, torch.device(device), pool
         self.features, self._brightness = features, brightness
         self._sampled = functools.lru_cache(CACHED)(self._sample)
         self._origin = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
@@ -140,6 +148,10 @@ class Registrar:
     def forget(self) -> None:
         """Gives back the memory of the pixels that it has drawn: dozens of MB."""
         self._sampled.cache_clear()
+
+    def each(self, call: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+        """What a call returns for each item; in the pool's threads, so it must not use them itself."""
+        return list(map(call, items) if self._pool is None else self._pool.map(call, items))
 
     def register(self, source: Keyframe, target: Keyframe, start: torch.Tensor) -> Registration | None:
         """The registration found from an initial T_target_source float32 [7]; None where they share no surface."""
@@ -151,7 +163,8 @@ class Registrar:
         poses = self._aligned(pairs, poses, WITH_BRIGHTNESS)
         others: list[torch.Tensor | None] = []
         if self.features:
-            others = [self._by_features(*pair, pose) for pair, pose in zip(pairs, poses, strict=True)]
+            self.each(lambda keyframe: keyframe.features, dict.fromkeys(itertools.chain(*pairs)))
+            others = self.each(lambda row: self._by_features(*pairs[row], poses[row]), range(len(pairs)))
         again = [row for row, pose in enumerate(others) if pose is not None]
         if again:
             started = torch.stack([pose for pose in others if pose is not None])

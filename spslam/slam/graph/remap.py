@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 
 import numpy as np
@@ -18,6 +20,9 @@ from spslam.slam.graph.keyframe import Keyframe
 from spslam.slam.poses import pose_tensor
 
 SAMPLED_SHARE = 1.5  # pixels that are drawn for each that is encoded, as not all have a normal
+SAMPLED_AHEAD = 16  # keyframes, of 300 kB of pixels each
+
+_Pixels = tuple[torch.Tensor, torch.Tensor]
 
 
 def encode_keyframe(volume: SparseVolume, keyframe: Keyframe, pose: np.ndarray, prior: Prior, config: Config) -> None:
@@ -30,10 +35,54 @@ def encode_keyframe(volume: SparseVolume, keyframe: Keyframe, pose: np.ndarray, 
         prior: on the volume's device.
         config: of the run.
     """
-    records, normals = keyframe.sample(round(SAMPLED_SHARE * config.prior.points_per_frame), config.seed)
-    if not len(records):
+    _encode(volume, keyframe, _sampled(keyframe, config), pose, prior, config)
+
+
+def encode_keyframes(
+    volume: SparseVolume,
+    posed: Iterable[tuple[Keyframe, np.ndarray]],
+    prior: Prior,
+    config: Config,
+    pool: ThreadPoolExecutor | None = None,
+) -> None:
+    """Does so with several keyframes and their poses, one after the other.
+
+    Args:
+        volume: changed.
+        posed: keyframes and their float64 [4, 4] T_world_camera.
+        prior: on the volume's device.
+        config: of the run.
+        pool: threads that draw pixels of the next keyframes meanwhile; None draws them in the caller's.
+    """
+    if pool is None:
+        for keyframe, pose in posed:
+            encode_keyframe(volume, keyframe, pose, prior, config)
         return
-    records, normals = (tensor.contiguous().to(volume.device) for tensor in (records, normals))
+    coming: deque[tuple[Keyframe, np.ndarray, Future[_Pixels]]] = deque()
+
+    def fuse_next() -> None:
+        keyframe, pose, sampled = coming.popleft()
+        _encode(volume, keyframe, sampled.result(), pose, prior, config)
+
+    for keyframe, pose in posed:
+        coming.append((keyframe, pose, pool.submit(_sampled, keyframe, config)))
+        if len(coming) > SAMPLED_AHEAD:
+            fuse_next()
+    while coming:
+        fuse_next()
+
+
+def _sampled(keyframe: Keyframe, config: Config) -> _Pixels:
+    """Records and normals of pixels of a keyframe."""
+    return keyframe.sample(round(SAMPLED_SHARE * config.prior.points_per_frame), config.seed)
+
+
+def _encode(
+    volume: SparseVolume, keyframe: Keyframe, pixels: _Pixels, pose: np.ndarray, prior: Prior, config: Config
+) -> None:
+    if not len(pixels[0]):
+        return
+    records, normals = (tensor.contiguous().to(volume.device) for tensor in pixels)
     at = pose_tensor(pose, volume.device)
     points, turned = ops.unproject_pixels(records, normals, at, *keyframe.camera.intrinsics)
     encode_frame(volume, points, turned, prior, config.prior, config.seed, config.precision == "tf32")

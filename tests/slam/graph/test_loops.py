@@ -75,7 +75,7 @@ def test_a_loop_alone_waits(there_and_back):
     finder, waiting, lengths = LoopFinder(registrar(frames[0])), [], np.arange(len(frames)) * 0.3
     start = drifted(truth, 0.015)
     last = len(frames) - 1
-    edges, decisions = finder.find(frames, last, set(), start, lengths, waiting)
+    edges, decisions = finder.find(frames, {last: set()}, start, lengths, waiting)
     assert edges == [] and waiting
     assert {decision.reason for decision in decisions if not decision.accepted} >= {"waits for a second one"}
 
@@ -86,7 +86,7 @@ def test_more_than_drift_is_another_place(there_and_back):
     far = truth.copy()
     far[len(frames) // 2 :, 2, 3] += 1.0
     finder, waiting = LoopFinder(registrar(frames[0])), []
-    edges, decisions = finder.find(frames, len(frames) - 1, set(), far, np.arange(len(frames)) * 0.01, waiting)
+    edges, decisions = finder.find(frames, {len(frames) - 1: set()}, far, np.arange(len(frames)) * 0.01, waiting)
     assert edges == [] and waiting == []
     assert any("no drift" in decision.reason for decision in decisions)
 
@@ -104,11 +104,11 @@ def test_neighbors_in_time_are_no_loops(there_and_back):
     frames, truth = there_and_back
     finder = LoopFinder(registrar(frames[0]))
     lengths = np.arange(len(frames)) * 0.3
-    assert finder.find(frames, MIN_AGE - 1, set(), truth, lengths, []) == ([], [])
+    assert finder.find(frames, {MIN_AGE - 1: set()}, truth, lengths, []) == ([], [])
 
 
 def test_without_image_features_there_are_no_loops(there_and_back):
     frames, truth = there_and_back
     finder, waiting = LoopFinder(Registrar({frames[0].camera: NOISE}, 0, features=False)), []
     lengths = np.arange(len(frames)) * 0.3
-    assert finder.find(frames, len(frames) - 1, set(), truth, lengths, waiting) == ([], [])
+    assert finder.find(frames, {len(frames) - 1: set()}, truth, lengths, waiting) == ([], [])
