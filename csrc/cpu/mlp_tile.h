@@ -31,7 +31,10 @@ inline __attribute__((always_inline)) void accumulate(const T* a, std::int64_t a
   for (std::int64_t k = 0; k < depth; ++k) {
     Vector<T> right[N];
 #pragma GCC unroll 8
-    for (int n = 0; n < N; ++n) right[n] = load_vector<Vector<T>>(b + k * b_stride + n * kLanes<T>);
+    for (int n = 0; n < N; ++n) {
+      right[n] = load_vector<Vector<T>>(b + k * b_stride + n * kLanes<T>);
+      hold_in_register(right[n]);
+    }
 #pragma GCC unroll 8
     for (int m = 0; m < M; ++m) {
       const T left = a[m * a_row + k * a_column];

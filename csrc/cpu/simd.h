@@ -44,6 +44,21 @@ inline __attribute__((always_inline)) void store_vector(T* p, const V& v) {
   __builtin_memcpy(p, &v, sizeof v);
 }
 
+// Has the compiler load a vector once into a register. Left alone it reads memory again in every multiply-add that the
+// vector takes part in, and loads are what inner kernels then wait for.
+template <class V>
+inline __attribute__((always_inline)) void hold_in_register(V& v) {
+#if defined(__AVX512F__)
+  asm("" : "+v"(v));
+#elif defined(__x86_64__)
+  asm("" : "+x"(v));
+#elif defined(__aarch64__)
+  asm("" : "+w"(v));
+#else
+  static_cast<void>(v);
+#endif
+}
+
 // Sum of the lanes, by halving.
 template <class T, int Bytes>
 struct LaneSum {
