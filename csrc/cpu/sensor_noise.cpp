@@ -1,6 +1,13 @@
 #include "kernels/sensor_noise.h"
 
+#include "core/parallel.h"
+
 namespace spslam {
+namespace {
+
+constexpr std::int64_t kPixelGrain = 256;
+
+}  // namespace
 
 template <>
 void measure_noise<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t num_pixels, const float* pose,
@@ -9,14 +16,16 @@ void measure_noise<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t num_pixels
   const Pose<float> T_world_camera = load_pose(pose);
   DepthKeyframe loaded[kMaxDepthKeyframes];
   for (int k = 0; k < keyframes.count; ++k) loaded[k] = load_depth_keyframe(keyframes, k);
-  for (std::int64_t i = 0; i < num_pixels; ++i) {
-    const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
-    if (!(pixel.depth > 0.0f)) continue;
-    const Vec3<float> world = surface_point(pixel, T_world_camera, intrinsics).world;
-    for (int k = 0; k < keyframes.count; ++k) {
-      count_residuals(keyframes, loaded[k], pixel, world, [&](std::int64_t at) { counts[at] += kResidualCount; });
+  // Whole numbers: their sums do not depend on the order.
+  const auto add = [counts](std::int64_t at) { __atomic_fetch_add(counts + at, kResidualCount, __ATOMIC_RELAXED); };
+  parallel_for(num_pixels, kPixelGrain, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
+      if (!(pixel.depth > 0.0f)) continue;
+      const Vec3<float> world = surface_point(pixel, T_world_camera, intrinsics).world;
+      for (int k = 0; k < keyframes.count; ++k) count_residuals(keyframes, loaded[k], pixel, world, add);
     }
-  }
+  });
   for (int histogram = 0; histogram < kNoiseHistograms; ++histogram) {
     BinVariance bins[kNoiseBins];
     for (int b = 0; b < kNoiseBins; ++b) {
