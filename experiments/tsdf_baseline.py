@@ -20,7 +20,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import SpslamError
 from spslam.evaluation.finished_run import surface_figures
 from spslam.evaluation.run_output import RunOutput
-from spslam.evaluation.surface import TriangleSurface
+from spslam.evaluation.surface import Surface, TriangleSurface
 from spslam.meshing import TriangleMesh, save_mesh
 from spslam.meshing.mesh import vertex_normals
 from spslam.run.mesh import posed_frames
@@ -65,13 +65,22 @@ def main() -> None:
     run = RunOutput.read(arguments.run)
     dataset = open_dataset(load_config(run.folder.config).dataset)
     truth = dataset.surface if arguments.gt_mesh == "generated" else TriangleSurface.load(Path(arguments.gt_mesh))
-    folder = arguments.run / "open3d"
-    folder.mkdir(exist_ok=True)
-    for threshold, mesh in zip(WEIGHT_THRESHOLDS, fuse(dataset, run, arguments.voxel), strict=True):
-        save_mesh(mesh, RunFolder(folder).mesh)
-        figures = surface_figures(replace(run, folder=_WithMesh(run.folder.path, folder)), dataset, truth)
+    for threshold, figures in zip(
+        WEIGHT_THRESHOLDS, figures_of_baseline(run, dataset, truth, arguments.voxel), strict=True
+    ):
         row = " ".join(f"{name} {value:.2f}" for name, value in figures.items())
         print(f"Open3D {arguments.voxel:g} m, weight from {threshold:g}: {row}", flush=True)
+
+
+def figures_of_baseline(run: RunOutput, dataset: RgbdDataset, truth: Surface, voxel_m: float) -> list[dict[str, float]]:
+    """Figures of Open3D's meshes, one for each weight threshold; the last one stays in `open3d`."""
+    folder = run.folder.path / "open3d"
+    folder.mkdir(exist_ok=True)
+    rows = []
+    for mesh in fuse(dataset, run, voxel_m):
+        save_mesh(mesh, RunFolder(folder).mesh)
+        rows.append(surface_figures(replace(run, folder=_WithMesh(run.folder.path, folder)), dataset, truth))
+    return rows
 
 
 class _WithMesh(RunFolder):
