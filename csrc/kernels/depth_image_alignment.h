@@ -98,7 +98,7 @@ SPS_INLINE void add_comparison(const GaussNewtonOptions& options, const EarlierF
   const std::uint16_t stored = frames.keyframes[0].image[row * images.width + column];
   if (stored == 0) return;
   const float depth = images.unit * static_cast<float>(stored);
-  const float deviation = std::fmax(std::sqrt(depth_variance(frames.noise, depth)), kLeastDepthDeviation);
+  const float deviation = std::fmax(std::sqrt(depth_variance(frames.noise.depth, depth)), kLeastDepthDeviation);
   const float behind = point.z - depth, tolerance = comparison.tolerance + comparison.tolerance_deviations * deviation;
   terms[0] += T(1);
   if (behind < -comparison.clear_tolerances * tolerance) terms[2] += T(1);

@@ -8,6 +8,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/depth_noise.h"
 #include "spslam/tsdf.h"
 
 namespace spslam {
@@ -65,11 +66,6 @@ SPS_INLINE float inverse_depth(float depth) {
   return (depth > kNearest) & (depth < kFarthest) ? 1.0f / depth : 0.0f;
 }
 
-SPS_INLINE float depth_noise_variance(const DepthNoise& noise, float depth) {
-  const float squared = depth * depth;
-  return noise.floor + noise.growth * squared * squared;
-}
-
 // Slope along one axis: the smaller one of the differences to both neighbors, as an edge lies on one side at most.
 SPS_INLINE float one_sided_slope(float before, float middle, float after) {
   const float backward = middle - before, forward = after - middle;
@@ -80,7 +76,7 @@ SPS_INLINE float one_sided_slope(float before, float middle, float after) {
 SPS_INLINE PlaneMiddle plane_middle(const DepthNoise& noise, const Intrinsics& camera, float q, float by_u,
                                     float by_v) {
   const float safe = q > 0.0f ? q : 1.0f;
-  const float deviation = std::sqrt(depth_noise_variance(noise, 1.0f / safe)) * safe;
+  const float deviation = std::sqrt(depth_variance(noise, 1.0f / safe)) * safe;
   const float wide = kPlaneGateDeviations * deviation;
   const float steepest_u = kSteepest * safe / camera.fx, steepest_v = kSteepest * safe / camera.fy;
   const bool surface_u = std::fabs(by_u) < steepest_u, surface_v = std::fabs(by_v) < steepest_v;
@@ -125,7 +121,7 @@ SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera,
   const float over = (support - kLeastSupport) / (kFullSupport - kLeastSupport);
   // How far the window is from flat, and the pixel from the plane, in variances of inverse depth.
   const float safe = center > 0.0f ? center : 1.0f;
-  const float noise_variance = depth_noise_variance(noise, 1.0f / safe) * (safe * safe) * (safe * safe);
+  const float noise_variance = depth_variance(noise, 1.0f / safe) * (safe * safe) * (safe * safe);
   const float moved = mq - by_u * mu - by_v * mv;
   const float spread = s.qq * scale - mq * mq - by_u * qu - by_v * qv;
   const float own = 0.5f * moved * moved;
@@ -139,7 +135,7 @@ SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera,
   const float distance = 1.0f / std::sqrt(mx * mx + my * my + mz * mz);
   const float cosine = q * distance / std::sqrt(x * x + y * y + 1.0f);
   const bool known = (center > 0.0f) & (q > 0.0f) & (support > kLeastSupport) & (cosine > kLeastCosine);
-  const float variance = depth_noise_variance(noise, 1.0f / (known ? q : 1.0f));
+  const float variance = depth_variance(noise, 1.0f / (known ? q : 1.0f));
   const float certainty = kPoseVariance / (kPoseVariance + variance);
   const float body = support * (1.0f / kFullWeightSupport);
   const float weight = certainty * cosine * (body < 1.0f ? body : 1.0f);

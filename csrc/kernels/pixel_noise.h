@@ -5,6 +5,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/depth_noise.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
@@ -21,12 +22,7 @@ constexpr float kRegistrationError = 0.3f;
 constexpr float kRobustDeviations = 3.0f;
 
 SPS_INLINE SensorNoise load_sensor_noise(const float* numbers) {
-  return {numbers[0], numbers[1], numbers[2], numbers[3]};
-}
-
-SPS_INLINE float depth_variance(const SensorNoise& noise, float depth) {
-  const float squared = depth * depth;
-  return noise.depth_floor + noise.depth_growth * squared * squared;
+  return {{numbers[0], numbers[1]}, numbers[2], numbers[3]};
 }
 
 // Of a difference between intensities where the image has these derivatives (1/px).
@@ -54,8 +50,8 @@ SPS_INLINE PixelNoise pixel_noise(const SensorNoise* sensor, float depth, float 
   if (!sensor) return {nullptr, 1.0f, 1.0f, intensity, 0.0f};
   constexpr float kMost = kSurfaceDeviation * kSurfaceDeviation,
                   kLeast = kLeastSurfaceDeviation * kLeastSurfaceDeviation;
-  const float variance = depth_variance(*sensor, depth);
-  const float surface = std::fmin(kLeast + sensor->depth_floor, kMost);
+  const float variance = depth_variance(sensor->depth, depth);
+  const float surface = std::fmin(kLeast + sensor->depth.floor, kMost);
   return {sensor, kMost / (kMost + variance), surface / std::fmax(kLeast + variance, surface), intensity,
           kIntensityGain * std::sqrt(surface * intensity_share(*sensor))};
 }

@@ -7,6 +7,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/depth_noise.h"
 #include "kernels/depth_planes.h"
 #include "kernels/voxel_hash.h"
 #include "spslam/tsdf.h"
@@ -89,10 +90,6 @@ SPS_INLINE float tile_far(const PlaneFrame& frame, int tile_u, int tile_v) {
     }
   }
   return far;
-}
-
-SPS_INLINE int tiles_along(std::int32_t size) {
-  return (size + kTsdfTileSide - 1) / kTsdfTileSide;
 }
 
 // A block in camera axes: its first voxel and the steps between voxels, m.
@@ -179,7 +176,7 @@ struct TsdfObservation {
 
 SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, const Vec3<float>& at, const TsdfOptions& options,
                                          std::int32_t pixel) {
-  const float deviation = std::sqrt(depth_noise_variance(options.noise, at.z));
+  const float deviation = std::sqrt(depth_variance(options.noise, at.z));
   const float wanted = options.near_truncation + deviation;
   const float truncation = wanted < options.truncation ? wanted : options.truncation;
   const float sdf = plane.distance - dot(plane.normal, at);

@@ -6,6 +6,7 @@
 #include "core/device.h"
 #include "core/philox.h"
 #include "spslam/scene_view.h"
+#include "spslam/types/depth_noise.h"
 
 namespace spslam {
 
@@ -22,10 +23,10 @@ struct ReferenceImage {
   float kernel;           // width of the robust kernel, intensity
 };
 
-// The variance of a pixel's depth z is depth_floor + depth_growth z^4 (m^2), that of the difference between its
-// intensity and an earlier image's, where that has the gradient g (1/px), intensity_floor + intensity_growth g^2.
+// The noise of a pixel's depth, and the variance of the difference between its intensity and an earlier image's, where
+// that has the gradient g (1/px): intensity_floor + intensity_growth g^2.
 struct SensorNoise {
-  float depth_floor, depth_growth;          // m^2, 1/m^2
+  DepthNoise depth;
   float intensity_floor, intensity_growth;  // of [0, 1], px^2
 };
 constexpr int kSensorNoiseSize = 4;

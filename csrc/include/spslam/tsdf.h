@@ -7,8 +7,10 @@
 #include <cstdint>
 
 #include "core/device.h"
+#include "core/macros.h"
 #include "spslam/prior_fusion.h"
 #include "spslam/types/camera.h"
+#include "spslam/types/depth_noise.h"
 #include "spslam/types/voxel_table.h"
 
 namespace spslam {
@@ -26,11 +28,6 @@ constexpr int kTouchedPerPixel = 6;
 constexpr int kTsdfTileSide = 16;
 // First coordinate of rows that name no block.
 constexpr std::int32_t kNoBlock = INT32_MIN;
-
-// Variance of a depth z: floor + growth z^4, m^2.
-struct DepthNoise {
-  float floor, growth;
-};
 
 // Planes [height, width, kPlaneSize] measured by a frame, its colors [height, width, 3] or null, and pose [7].
 struct PlaneFrame {
@@ -82,10 +79,12 @@ void tsdf_touched_blocks(Device device, const PlaneFrame& frame, float voxel_siz
                          std::int32_t* coords);
 
 // Adds a frame to all blocks that it sees.
+SPS_INLINE std::int32_t tiles_along(std::int32_t size) {
+  return (size + kTsdfTileSide - 1) / kTsdfTileSide;
+}
 inline std::int64_t tsdf_integrate_workspace_bytes(const PlaneFrame& frame) {
-  const std::int64_t columns = (frame.width + kTsdfTileSide - 1) / kTsdfTileSide;
-  const std::int64_t rows = (frame.height + kTsdfTileSide - 1) / kTsdfTileSide;
-  return columns * rows * static_cast<std::int64_t>(sizeof(float));
+  const std::int64_t tiles = static_cast<std::int64_t>(tiles_along(frame.width)) * tiles_along(frame.height);
+  return tiles * static_cast<std::int64_t>(sizeof(float));
 }
 template <class Device>
 void tsdf_integrate(Device device, const TsdfBlocks& blocks, const PlaneFrame& frame, const TsdfOptions& options,
