@@ -143,10 +143,13 @@ class TsdfVolume:
             noise: of the sensor, see `measure_planes` and `tsdf_integrate_`.
 
         Raises:
-            TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
+            TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range. The volume is
+                then as before.
             VoxelLimitError: more than `max_blocks`. The volume is then as before.
         """
         planes = measure_planes(depth, intrinsics, noise)
+        if color is not None:  # before blocks are added
+            check_tensor("TsdfVolume.integrate", "color", color, (*depth.shape, 3), torch.uint8, like=depth)
         size, truncation = self.voxel_size, self.truncation
         reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
