@@ -45,10 +45,11 @@ Tensor tsdf_touched_blocks(Tensor planes, Tensor pose, std::vector<double> intri
   pose = contiguous(pose);
   const PlaneFrame frame = load_frame(kName, planes, pose, intrinsics);
   const std::int32_t pixels = static_cast<std::int32_t>(step);
-  const Tensor coords = empty(planes, {touched_rows(frame, pixels), 3}, ScalarType::Int);
-  spslam::tsdf_touched_blocks(scope.context, frame, static_cast<float>(voxel_size), static_cast<float>(truncation),
-                              pixels, mutable_data<std::int32_t>(coords));
-  return coords;
+  Tensor coords = empty(planes, {touched_rows(frame, pixels), 3}, ScalarType::Int);
+  const std::int64_t written =
+      spslam::tsdf_touched_blocks(scope.context, frame, static_cast<float>(voxel_size), static_cast<float>(truncation),
+                                  pixels, mutable_data<std::int32_t>(coords));
+  return torch::stable::narrow(coords, 0, 0, written);
 }
 
 void check_blocks(const char* name, const Tensor& sdf, const Tensor& weights, const Tensor& colors) {

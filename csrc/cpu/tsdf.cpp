@@ -2,113 +2,58 @@
 
 #include <algorithm>
 
-#include "cpu/simd.h"
-#include "kernels/depth_planes.h"
+#include "cpu/plane_lanes.h"
 
 namespace spslam {
 namespace {
 
-constexpr std::int64_t kRowGrain = 8, kBlockGrain = 16;
-// Pixels, and voxels, that are worked on together.
-constexpr int kPixelLanes = 64, kVoxelLanes = kTsdfBlockSide * kTsdfBlockSide;
+constexpr std::int64_t kBlockGrain = 16, kTileGrain = 1;
+// Voxels of a block with the same first coordinate, which are worked on together, and pixels.
+constexpr int kVoxelLanes = kTsdfBlockSide * kTsdfBlockSide, kPixelLanes = 64;
+static_assert(kPixelLanes % kTsdfTileSide == 0, "a batch of pixels must end where a tile does");
 
-// Inverse depth with a border of unknown pixels as wide as the window reaches, and a whole batch on the right.
-class InverseDepth {
- public:
-  InverseDepth(ScratchBuffer<float>& buffer, const DepthImage& image)
-      : stride_(image.width + 2 * kPlaneRadius + kPixelLanes) {
-    const std::int64_t rows = image.height + 2 * kPlaneRadius;
-    float* begin = buffer.reserve(rows * stride_);
-    origin_ = begin + kPlaneRadius * (stride_ + 1);
-    parallel_for(rows, kRowGrain, [&](std::int64_t first, std::int64_t last) {
-      for (std::int64_t r = first; r < last; ++r) {
-        float* row = begin + r * stride_;
-        const std::int64_t v = r - kPlaneRadius;
-        std::fill(row, row + stride_, 0.0f);
-        if (v < 0 || v >= image.height) continue;
-        const float* depth = image.depth + v * image.width;
-        SPS_SIMD for (std::int32_t u = 0; u < image.width; ++u) row[kPlaneRadius + u] = inverse_depth(depth[u]);
-      }
-    });
-  }
-
-  const float* row(std::int64_t v) const { return origin_ + v * stride_; }
-
- private:
-  std::int64_t stride_;
-  const float* origin_;
-};
-
-// Planes of the pixels [first, first + kPixelLanes) of a row that lie in the image.
-void planes_of_batch(const DepthImage& image, const InverseDepth& inverse, const DepthNoise& noise, std::int64_t v,
-                     std::int32_t first, float* planes) {
-  alignas(64) float by_u[kPixelLanes], by_v[kPixelLanes], gates[kPixelLanes];
-  alignas(64) float sums[kPlaneSums][kPixelLanes] = {}, out[kPlaneSize][kPixelLanes];
-  const float* centers = inverse.row(v) + first;
-  const float *above = inverse.row(v - 1) + first, *below = inverse.row(v + 1) + first;
-  const Intrinsics camera = image.camera;
-  SPS_SIMD for (int i = 0; i < kPixelLanes; ++i) {
-    const float slope_u = one_sided_slope(centers[i - 1], centers[i], centers[i + 1]);
-    const float slope_v = one_sided_slope(above[i], centers[i], below[i]);
-    const PlaneMiddle middle = plane_middle(noise, camera, centers[i], slope_u, slope_v);
-    by_u[i] = middle.by_u;
-    by_v[i] = middle.by_v;
-    gates[i] = middle.inverse_gate;
-  }
-  for (int dv = -kPlaneRadius; dv <= kPlaneRadius; ++dv) {
-    for (int du = -kPlaneRadius; du <= kPlaneRadius; ++du) {
-      const float* q = inverse.row(v + dv) + first + du;
-      const float window_weight = plane_window_weight(du, dv);
-      SPS_SIMD for (int i = 0; i < kPixelLanes; ++i) {
-        PlaneSums s{sums[0][i], sums[1][i], sums[2][i], sums[3][i], sums[4][i],
-                    sums[5][i], sums[6][i], sums[7][i], sums[8][i], sums[9][i]};
-        add_plane_sample(q[i], {centers[i], by_u[i], by_v[i], gates[i]}, du, dv, window_weight, s);
-        sums[0][i] = s.one, sums[1][i] = s.u, sums[2][i] = s.v, sums[3][i] = s.uu, sums[4][i] = s.uv;
-        sums[5][i] = s.vv, sums[6][i] = s.q, sums[7][i] = s.qu, sums[8][i] = s.qv, sums[9][i] = s.qq;
-      }
-    }
-  }
-  const float whole = whole_plane_window();
+// Raises the farthest surface of tiles to that of the pixels [first, first + kPixelLanes) of row v that there are.
+void measure_batch(const PlaneFrame& frame, std::int64_t v, std::int32_t first, float* tiles_far) {
+  const std::int32_t count = frame.width - first;
+  PlaneLanes<kPixelLanes> planes;
+  planes.load(frame.planes, [&](int m) { return m < count ? v * frame.width + first + m : -1; });
+  alignas(64) float depth[kPixelLanes];
+  const Intrinsics camera = frame.camera;
   const float row = static_cast<float>(v);
-  SPS_SIMD for (int i = 0; i < kPixelLanes; ++i) {
-    const PlaneSums s{sums[0][i], sums[1][i], sums[2][i], sums[3][i], sums[4][i],
-                      sums[5][i], sums[6][i], sums[7][i], sums[8][i], sums[9][i]};
-    const MeasuredPlane plane = fit_plane(s, camera, noise, static_cast<float>(first + i), row, centers[i], whole);
-    out[0][i] = plane.normal.x;
-    out[1][i] = plane.normal.y;
-    out[2][i] = plane.normal.z;
-    out[3][i] = plane.distance;
-    out[4][i] = plane.weight;
+  SPS_SIMD for (int m = 0; m < kPixelLanes; ++m) {
+    depth[m] = plane_depth(planes[m], camera, static_cast<float>(first + m), row);
   }
-  const int count = std::min(kPixelLanes, image.width - first);
-  float* to = planes + kPlaneSize * (v * image.width + first);
-  for (int i = 0; i < count; ++i) {
-    for (int c = 0; c < kPlaneSize; ++c) to[kPlaneSize * i + c] = out[c][i];
+  // Lanes without a pixel have depth 0.
+  for (int begin = 0; begin < std::min(count, kPixelLanes); begin += kTsdfTileSide) {
+    float& tile = tiles_far[(first + begin) / kTsdfTileSide];
+    float far = tile;
+#pragma omp simd reduction(max : far)
+    for (int m = 0; m < kTsdfTileSide; ++m) far = depth[begin + m] > far ? depth[begin + m] : far;
+    tile = far;
   }
 }
 
-// The planes of some pixels, one array per number. Copied one by one: gathers of vectors are slower on many processors.
-struct PlaneLanes {
-  alignas(64) float x[kVoxelLanes], y[kVoxelLanes], z[kVoxelLanes], distance[kVoxelLanes], weight[kVoxelLanes];
-
-  void load(const float* planes, const std::int32_t* pixels) {
-    static constexpr float kNothing[kPlaneSize] = {};
-    for (int m = 0; m < kVoxelLanes; ++m) {
-      const float* plane = pixels[m] < 0 ? kNothing : planes + static_cast<std::int64_t>(kPlaneSize) * pixels[m];
-      x[m] = plane[0];
-      y[m] = plane[1];
-      z[m] = plane[2];
-      distance[m] = plane[3];
-      weight[m] = plane[4];
+// The farthest surface (m) in each tile of the image; 0 without any.
+void measure_tiles(const PlaneFrame& frame, float* tiles_far) {
+  const std::int32_t columns = tiles_along(frame.width);
+  parallel_for(tiles_along(frame.height), kTileGrain, [&](std::int64_t begin, std::int64_t end) {
+    std::fill(tiles_far + begin * columns, tiles_far + end * columns, 0.0f);
+    const std::int64_t last = std::min<std::int64_t>(end * kTsdfTileSide, frame.height);
+    for (std::int64_t v = begin * kTsdfTileSide; v < last; ++v) {
+      float* tiles = tiles_far + v / kTsdfTileSide * columns;
+      for (std::int32_t first = 0; first < frame.width; first += kPixelLanes) measure_batch(frame, v, first, tiles);
     }
-  }
-};
+  });
+}
 
-// Camera axes of the 64 voxels with first coordinate i of a block, one array per axis.
-struct SlicePoints {
+// Camera axes of the voxels with first coordinate i of a block, one array per axis, and the pixels that they fall on.
+struct VoxelSlice {
   alignas(64) float x[kVoxelLanes], y[kVoxelLanes], z[kVoxelLanes];
+  alignas(64) std::int32_t pixels[kVoxelLanes];
 
-  SlicePoints(const BlockInCamera& block, int i) {
+  // Returns whether any falls on a pixel. Not inlined, as sums that are contracted in another order around it would
+  // move voxels between pixels.
+  __attribute__((noinline)) bool place(const BlockInCamera& block, int i, const PlaneFrame& frame) {
     const Vec3<float> first = block.first + static_cast<float>(i) * block.i;
     for (int j = 0; j < kTsdfBlockSide; ++j) {
       const Vec3<float> row = first + static_cast<float>(j) * block.j;
@@ -118,81 +63,149 @@ struct SlicePoints {
         z[kTsdfBlockSide * j + k] = row.z + static_cast<float>(k) * block.k.z;
       }
     }
+    // A copy, as what the loop writes might else be part of what it reads.
+    const PlaneFrame view = frame;
+    std::int32_t last = -1;
+#pragma omp simd reduction(max : last)
+    for (int m = 0; m < kVoxelLanes; ++m) {
+      const std::int32_t pixel = pixel_at(view, {x[m], y[m], z[m]});
+      pixels[m] = pixel;
+      last = pixel > last ? pixel : last;
+    }
+    if (last < 0) return false;
+    for (int m = 0; m < kVoxelLanes; ++m) {
+      __builtin_prefetch(frame.planes + kPlaneSize * static_cast<std::int64_t>(pixels[m] < 0 ? last : pixels[m]));
+    }
+    return true;
   }
 };
 
-// Adds a frame to the voxels with first coordinate i of a block.
-void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const BlockInCamera& block,
-                     const PlaneFrame& frame, const TsdfOptions& options) {
-  const SlicePoints at(block, i);
-  alignas(64) std::int32_t pixels[kVoxelLanes];
-  // Copies, as what a loop writes might else be part of what it reads.
-  const PlaneFrame view = frame;
-  std::int32_t last_pixel = -1;
-#pragma omp simd reduction(max : last_pixel)
-  for (int m = 0; m < kVoxelLanes; ++m) {
-    const std::int32_t pixel = pixel_at(view, {at.x[m], at.y[m], at.z[m]});
-    pixels[m] = pixel;
-    last_pixel = pixel > last_pixel ? pixel : last_pixel;
+// Voxels of a block that take a color. A color and its weight are four times 16 bits in memory.
+struct ColoredVoxels {
+  alignas(64) std::int32_t places[kTsdfBlockVoxels], pixels[kTsdfBlockVoxels];
+  alignas(64) float certainty[kTsdfBlockVoxels], depth[kTsdfBlockVoxels];
+  alignas(64) float red[kTsdfBlockVoxels], green[kTsdfBlockVoxels], blue[kTsdfBlockVoxels];
+  alignas(64) std::uint32_t red_green[kTsdfBlockVoxels], blue_weight[kTsdfBlockVoxels];
+  int count = 0;
+
+  // Appends the voxels of slice i where `takes`, and asks for the memory that they will need.
+  void append(int i, const VoxelSlice& at, const float* plane_weights, const std::int32_t* takes,
+              const PlaneFrame& frame, const std::uint16_t* colors) {
+    int end = count;
+    for (int m = 0; m < kVoxelLanes; ++m) {
+      places[end] = m;
+      end += takes[m];
+    }
+    for (int n = count; n < end; ++n) {
+      const int m = places[n];
+      places[n] = kVoxelLanes * i + m;
+      pixels[n] = at.pixels[m];
+      certainty[n] = plane_weights[m];
+      depth[n] = at.z[m];
+      __builtin_prefetch(colors + kTsdfColorSize * places[n], 1);
+      __builtin_prefetch(frame.colors + 3 * static_cast<std::int64_t>(pixels[n]));
+    }
+    count = end;
   }
-  if (last_pixel < 0) return;
-  PlaneLanes planes;
-  planes.load(frame.planes, pixels);
-  alignas(64) float sdf[kVoxelLanes], weight[kVoxelLanes];
+
+  // Adds a frame to their colors, those of the block being [512, 4].
+  void update(const PlaneFrame& frame, float voxel_size, std::uint16_t* colors) {
+    for (int n = 0; n < count; ++n) {
+      const std::uint16_t* mean = colors + kTsdfColorSize * places[n];
+      const std::uint8_t* rgb = frame.colors + 3 * static_cast<std::int64_t>(pixels[n]);
+      red_green[n] = static_cast<std::uint32_t>(mean[0]) | static_cast<std::uint32_t>(mean[1]) << 16;
+      blue_weight[n] = static_cast<std::uint32_t>(mean[2]) | static_cast<std::uint32_t>(mean[3]) << 16;
+      red[n] = rgb[0];
+      green[n] = rgb[1];
+      blue[n] = rgb[2];
+    }
+    const float focal = frame.camera.fx;
+    const int voxels = count;
+    SPS_SIMD for (int n = 0; n < voxels; ++n) {
+      const std::uint32_t low = red_green[n], high = blue_weight[n];
+      const ColorUnits before{static_cast<std::int32_t>(low & 0xFFFF), static_cast<std::int32_t>(low >> 16),
+                              static_cast<std::int32_t>(high & 0xFFFF), static_cast<std::int32_t>(high >> 16)};
+      const ColorSample seen{red[n], green[n], blue[n], certainty[n]};
+      const ColorUnits mean = mix_colors(before, seen, focal * voxel_size / depth[n]);
+      red_green[n] = static_cast<std::uint32_t>(mean.red) | static_cast<std::uint32_t>(mean.green) << 16;
+      blue_weight[n] = static_cast<std::uint32_t>(mean.blue) | static_cast<std::uint32_t>(mean.weight) << 16;
+    }
+    for (int n = 0; n < count; ++n) {
+      std::uint16_t* to = colors + kTsdfColorSize * places[n];
+      to[0] = static_cast<std::uint16_t>(red_green[n]);
+      to[1] = static_cast<std::uint16_t>(red_green[n] >> 16);
+      to[2] = static_cast<std::uint16_t>(blue_weight[n]);
+      to[3] = static_cast<std::uint16_t>(blue_weight[n] >> 16);
+    }
+  }
+};
+
+// Adds a frame to the distances of slice i of a block; its voxels that take a color are appended.
+void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const VoxelSlice& at, const PlaneFrame& frame,
+                     const TsdfOptions& options, ColoredVoxels& colored_voxels) {
+  PlaneLanes<kVoxelLanes> planes;
+  planes.load(frame.planes, [&](int m) { return at.pixels[m]; });
+  alignas(64) float distance[kVoxelLanes];
   const TsdfOptions seen_with = options;
-  float most = 0.0f, nearest = options.truncation;
-#pragma omp simd reduction(max : most) reduction(min : nearest)
+  float most = 0.0f;
+#pragma omp simd reduction(max : most)
   for (int m = 0; m < kVoxelLanes; ++m) {
-    const MeasuredPlane plane{{planes.x[m], planes.y[m], planes.z[m]}, planes.distance[m], planes.weight[m]};
-    const TsdfObservation seen = observe_voxel(plane, {at.x[m], at.y[m], at.z[m]}, seen_with, 0);
-    const float seen_sdf = seen.sdf, seen_weight = seen.weight;
-    sdf[m] = seen_sdf;
-    weight[m] = seen_weight;
-    most = seen_weight > most ? seen_weight : most;
-    const float near = seen_weight > 0.0f ? std::fabs(seen_sdf) : seen_with.truncation;
-    nearest = near < nearest ? near : nearest;
+    distance[m] = plane_distance(planes[m], {at.x[m], at.y[m], at.z[m]});
+    const float near = distance[m] > -seen_with.truncation ? planes.weight[m] : 0.0f;
+    most = near > most ? near : most;
   }
   if (!(most > 0.0f)) return;
+  const float voxel_size = blocks.voxel_size;
+  const float* depth = at.z;
+  alignas(64) float sdf[kVoxelLanes], weight[kVoxelLanes];
+  alignas(64) std::int32_t takes[kVoxelLanes];
+  std::int32_t any = 0;
+#pragma omp simd reduction(| : any)
+  for (int m = 0; m < kVoxelLanes; ++m) {
+    const TsdfObservation seen = observe_voxel(planes.weight[m], distance[m], depth[m], seen_with);
+    const float seen_sdf = seen.sdf, seen_weight = seen.weight;
+    const std::int32_t colored = takes_color(seen_weight, distance[m], voxel_size);
+    sdf[m] = seen_sdf;
+    weight[m] = seen_weight;
+    takes[m] = colored;
+    any |= colored;
+  }
   const std::int64_t place = kTsdfBlockVoxels * row + kVoxelLanes * i;
   float *to_sdf = blocks.sdf + place, *to_weight = blocks.weights + place;
-  const float max_weight = options.max_weight;
   SPS_SIMD for (int m = 0; m < kVoxelLanes; ++m) {
-    update_voxel({sdf[m], weight[m], 0}, max_weight, to_sdf[m], to_weight[m]);
+    update_voxel({sdf[m], weight[m]}, seen_with.max_weight, to_sdf[m], to_weight[m]);
   }
-  if (!(nearest < kColorBand * blocks.voxel_size)) return;
-  for (int m = 0; m < kVoxelLanes; ++m) {
-    const TsdfObservation seen{sdf[m], weight[m], pixels[m]};
-    if (!takes_color(frame, seen, blocks.voxel_size)) continue;
-    update_color(frame, seen, at.z[m], blocks.voxel_size, blocks.colors + kTsdfColorSize * (place + m));
+  if (!any || !frame.colors) return;
+  colored_voxels.append(i, at, planes.weight, takes, frame, blocks.colors + kTsdfColorSize * kTsdfBlockVoxels * row);
+}
+
+// Adds a frame to a block.
+void integrate_block(const TsdfBlocks& blocks, std::int64_t row, const BlockInCamera& block, const PlaneFrame& frame,
+                     const TsdfOptions& options) {
+  VoxelSlice slices[kTsdfBlockSide];
+  bool seen[kTsdfBlockSide];
+  for (int i = 0; i < kTsdfBlockSide; ++i) seen[i] = slices[i].place(block, i, frame);
+  ColoredVoxels colored;
+  for (int i = 0; i < kTsdfBlockSide; ++i) {
+    if (seen[i]) integrate_slice(blocks, row, i, slices[i], frame, options, colored);
   }
+  colored.update(frame, blocks.voxel_size, blocks.colors + kTsdfColorSize * kTsdfBlockVoxels * row);
 }
 
 }  // namespace
 
 template <>
-void measure_planes<Cpu>(Cpu, const DepthImage& image, const DepthNoise& noise, float* planes) {
-  if (image.width == 0 || image.height == 0) return;
-  ScratchBuffer<float> buffer;
-  const InverseDepth inverse(buffer, image);
-  parallel_for(image.height, kRowGrain, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t v = begin; v < end; ++v) {
-      for (std::int32_t u = 0; u < image.width; u += kPixelLanes) planes_of_batch(image, inverse, noise, v, u, planes);
-    }
-  });
-}
-
-template <>
-void tsdf_integrate<Cpu>(Cpu device, const TsdfBlocks& blocks, const PlaneFrame& frame, const TsdfOptions& options,
+void tsdf_integrate<Cpu>(Cpu, const TsdfBlocks& blocks, const PlaneFrame& frame, const TsdfOptions& options,
                          void* workspace) {
   if (frame.width == 0 || frame.height == 0) return;
   float* tiles_far = static_cast<float*>(workspace);
-  measure_tiles(device, frame, tiles_far);
+  measure_tiles(frame, tiles_far);
   const Pose<float> pose = load_pose(frame.pose);
   parallel_for(blocks.count, kBlockGrain, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t row = begin; row < end; ++row) {
       const BlockInCamera block = block_in_camera(pose, blocks.coords + 3 * row, blocks.voxel_size);
       if (!block_in_view(frame, block, tiles_far, options.truncation)) continue;
-      for (int i = 0; i < kTsdfBlockSide; ++i) integrate_slice(blocks, row, i, block, frame, options);
+      integrate_block(blocks, row, block, frame, options);
     }
   });
 }

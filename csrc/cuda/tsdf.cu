@@ -1,4 +1,4 @@
-// One block of threads per block of voxels; the other launches are one thread per pixel, point or ray.
+// One block of threads per block of voxels; the other launches are one thread per pixel, tile, point or ray.
 #include "core/cuda_check.cuh"
 #include "kernels/depth_planes.h"
 #include "launch/tsdf.h"
@@ -7,6 +7,62 @@ namespace spslam {
 namespace {
 
 constexpr int kIntegrateThreads = 128;
+
+// Writes the blocks that a pixel touches, but those that its left neighbor's same sample touches too.
+__device__ void write_touched(const PlaneFrame& frame, const Pose<float>& pose, float inverse_block_size,
+                              float truncation, int u, int v, int step, std::int32_t* coords) {
+  const auto ray_at = [&](int column) {
+    const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + column);
+    return touched_ray(load_plane(plane), frame.camera, truncation, static_cast<float>(column), static_cast<float>(v));
+  };
+  const TouchedRay own = ray_at(u), left = u >= step ? ray_at(u - step) : TouchedRay{{0, 0, 0}, {0, 0, 0}, false};
+  const auto block = [&](const TouchedRay& ray, int k) {
+    return ray.known ? touched_block(ray.first, ray.step, k, pose, inverse_block_size) : VoxelCoord{kNoBlock, 0, 0};
+  };
+  VoxelCoord before{kNoBlock, 0, 0};
+  for (int k = 0; k < kTouchedPerPixel; ++k) {
+    const VoxelCoord at = block(own, k);
+    const bool known = same_block(at, before) || same_block(at, block(left, k));
+    before = at;
+    coords[3 * k] = known ? kNoBlock : at.x;
+    coords[3 * k + 1] = known ? 0 : at.y;
+    coords[3 * k + 2] = known ? 0 : at.z;
+  }
+}
+
+// The farthest surface (m) in a tile of the image; 0 without any.
+__device__ float tile_far(const PlaneFrame& frame, int tile_u, int tile_v) {
+  float far = 0.0f;
+  for (int v = tile_v * kTsdfTileSide; v < (tile_v + 1) * kTsdfTileSide && v < frame.height; ++v) {
+    for (int u = tile_u * kTsdfTileSide; u < (tile_u + 1) * kTsdfTileSide && u < frame.width; ++u) {
+      const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + u);
+      const float depth = plane_depth(load_plane(plane), frame.camera, static_cast<float>(u), static_cast<float>(v));
+      far = depth > far ? depth : far;
+    }
+  }
+  return far;
+}
+
+void measure_tiles(Cuda device, const PlaneFrame& frame, float* tiles_far) {
+  const int columns = tiles_along(frame.width);
+  for_each(device, static_cast<std::int64_t>(columns) * tiles_along(frame.height), [=] __device__(std::int64_t i) {
+    tiles_far[i] = tile_far(frame, static_cast<int>(i % columns), static_cast<int>(i / columns));
+  });
+}
+
+// Adds a pixel's color to a voxel at a depth.
+__device__ void update_color(const PlaneFrame& frame, std::int32_t pixel, float depth, float voxel_size,
+                             std::uint16_t* color) {
+  const std::uint8_t* rgb = frame.colors + 3 * static_cast<std::int64_t>(pixel);
+  const ColorSample seen{static_cast<float>(rgb[0]), static_cast<float>(rgb[1]), static_cast<float>(rgb[2]),
+                         frame.planes[static_cast<std::int64_t>(kPlaneSize) * pixel + 4]};
+  const ColorUnits mean =
+      mix_colors({color[0], color[1], color[2], color[3]}, seen, frame.camera.fx * voxel_size / depth);
+  color[0] = static_cast<std::uint16_t>(mean.red);
+  color[1] = static_cast<std::uint16_t>(mean.green);
+  color[2] = static_cast<std::uint16_t>(mean.blue);
+  color[3] = static_cast<std::uint16_t>(mean.weight);
+}
 
 __global__ void __launch_bounds__(kIntegrateThreads)
     integrate_kernel(TsdfBlocks blocks, PlaneFrame frame, TsdfOptions options, const float* tiles_far) {
@@ -22,12 +78,13 @@ __global__ void __launch_bounds__(kIntegrateThreads)
       const std::int32_t pixel = pixel_at(frame, at);
       if (pixel < 0) continue;
       const MeasuredPlane plane = load_plane(frame.planes + static_cast<std::int64_t>(kPlaneSize) * pixel);
-      const TsdfObservation seen = observe_voxel(plane, at, options, pixel);
+      const float distance = plane_distance(plane, at);
+      const TsdfObservation seen = observe_voxel(plane.weight, distance, at.z, options);
       if (!(seen.weight > 0.0f)) continue;
       const std::int64_t place = kTsdfBlockVoxels * row + m;
       update_voxel(seen, options.max_weight, blocks.sdf[place], blocks.weights[place]);
-      if (takes_color(frame, seen, blocks.voxel_size)) {
-        update_color(frame, seen, at.z, blocks.voxel_size, blocks.colors + kTsdfColorSize * place);
+      if (frame.colors && takes_color(seen.weight, distance, blocks.voxel_size)) {
+        update_color(frame, pixel, at.z, blocks.voxel_size, blocks.colors + kTsdfColorSize * place);
       }
     }
   }
@@ -58,6 +115,19 @@ void measure_planes<Cuda>(Cuda device, const DepthImage& image, const DepthNoise
                                           center, whole_plane_window());
     store_plane(plane, planes + kPlaneSize * i);
   });
+}
+
+template <>
+std::int64_t tsdf_touched_blocks<Cuda>(Cuda device, const PlaneFrame& frame, float voxel_size, float truncation,
+                                       std::int32_t step, std::int32_t* coords) {
+  const std::int64_t columns = (frame.width + step - 1) / step, rows = touched_rows(frame, step);
+  const float inverse_block_size = 1.0f / (kTsdfBlockSide * voxel_size);
+  for_each(device, rows / kTouchedPerPixel, [=] __device__(std::int64_t i) {
+    const int u = static_cast<int>(i % columns) * step, v = static_cast<int>(i / columns) * step;
+    write_touched(frame, load_pose(frame.pose), inverse_block_size, truncation, u, v, step,
+                  coords + 3 * kTouchedPerPixel * i);
+  });
+  return rows;
 }
 
 template <>

@@ -17,79 +17,53 @@ namespace spslam {
 constexpr float kNearestIntegrated = 0.05f;  // m
 // A ray that grazes the surface is followed through the truncation as if it met it at this cosine.
 constexpr float kTouchCosine = 0.3f;
-// Colors are taken up to so many voxels from the surface.
+// Voxels from the surface up to which colors are taken.
 constexpr float kColorBand = 1.5f;
 constexpr float kColorUnit = 256.0f, kColorWeightUnit = 1024.0f, kMostUnits = 65535.0f;
 
-SPS_INLINE float plane_depth(const PlaneFrame& frame, const float* plane, int u, int v) {
-  const float x = (static_cast<float>(u) - frame.camera.cx) / frame.camera.fx;
-  const float y = (static_cast<float>(v) - frame.camera.cy) / frame.camera.fy;
-  return plane[3] / (plane[0] * x + plane[1] * y + plane[2]);
+// Where a pixel's ray meets its plane, as depth (m); 0 without a plane.
+SPS_INLINE float plane_depth(const MeasuredPlane& plane, const Intrinsics& camera, float u, float v) {
+  const float x = (u - camera.cx) / camera.fx, y = (v - camera.cy) / camera.fy;
+  const float depth = plane.distance / (plane.normal.x * x + plane.normal.y * y + plane.normal.z);
+  return plane.weight > 0.0f ? depth : 0.0f;
 }
 
 SPS_INLINE VoxelCoord block_at(const Vec3<float>& world, float inverse_block_size) {
   const float x = std::floor(world.x * inverse_block_size), y = std::floor(world.y * inverse_block_size),
               z = std::floor(world.z * inverse_block_size);
   constexpr float kLow = static_cast<float>(kVoxelCoordMin), kHigh = static_cast<float>(kVoxelCoordMax);
-  const bool inside = x >= kLow && y >= kLow && z >= kLow && x <= kHigh && y <= kHigh && z <= kHigh;
-  if (!inside) return {kNoBlock, 0, 0};
-  return {static_cast<std::int32_t>(x), static_cast<std::int32_t>(y), static_cast<std::int32_t>(z)};
+  const bool inside = (x >= kLow) & (y >= kLow) & (z >= kLow) & (x <= kHigh) & (y <= kHigh) & (z <= kHigh);
+  // Converted only where it fits.
+  const std::int32_t i = static_cast<std::int32_t>(inside ? x : 0.0f);
+  return {inside ? i : kNoBlock, static_cast<std::int32_t>(inside ? y : 0.0f),
+          static_cast<std::int32_t>(inside ? z : 0.0f)};
 }
 
-// The part of a pixel's ray within the truncation of its plane, as camera points `first` + s `step`; count 0 for none.
+SPS_INLINE bool same_block(const VoxelCoord& a, const VoxelCoord& b) {
+  return (a.x == b.x) & (a.y == b.y) & (a.z == b.z);
+}
+
+// The part of a pixel's ray within the truncation of its plane, as camera points `first` + s `step`.
 struct TouchedRay {
   Vec3<float> first, step;
-  int count;
+  bool known;
 };
 
-SPS_INLINE TouchedRay touched_ray(const PlaneFrame& frame, float truncation, int u, int v) {
-  const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + u);
-  if (!(plane[4] > 0.0f)) return {{0, 0, 0}, {0, 0, 0}, 0};
-  const Vec3<float> ray{(static_cast<float>(u) - frame.camera.cx) / frame.camera.fx,
-                        (static_cast<float>(v) - frame.camera.cy) / frame.camera.fy, 1.0f};
-  const float along = plane[0] * ray.x + plane[1] * ray.y + plane[2], depth = plane[3] / along;
+SPS_INLINE TouchedRay touched_ray(const MeasuredPlane& plane, const Intrinsics& camera, float truncation, float u,
+                                  float v) {
+  const Vec3<float> ray{(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0f};
+  const float along = plane.normal.x * ray.x + plane.normal.y * ray.y + plane.normal.z;
+  const float depth = plane.distance / along;
   const float least = kTouchCosine * std::sqrt(dot(ray, ray));
   const float reach = truncation / (along > least ? along : least);
-  return {(depth - reach) * ray, (2.0f * reach / (kTouchedPerPixel - 1)) * ray, kTouchedPerPixel};
+  return {(depth - reach) * ray, (2.0f * reach / (kTouchedPerPixel - 1)) * ray, plane.weight > 0.0f};
 }
 
-// Writes the blocks that a pixel touches, but those that its left neighbor's same sample touches too.
-SPS_INLINE void write_touched(const PlaneFrame& frame, const Pose<float>& pose, float inverse_block_size,
-                              float truncation, int u, int v, int step, std::int32_t* coords) {
-  const TouchedRay own = touched_ray(frame, truncation, u, v);
-  const TouchedRay left = u >= step ? touched_ray(frame, truncation, u - step, v) : TouchedRay{{0, 0, 0}, {0, 0, 0}, 0};
-  const auto block = [&](const TouchedRay& ray, int k) {
-    const Vec3<float> point = ray.first + static_cast<float>(k) * ray.step;
-    return block_at(pose.rotation * point + pose.translation, inverse_block_size);
-  };
-  VoxelCoord before{kNoBlock, 0, 0};
-  for (int k = 0; k < kTouchedPerPixel; ++k) {
-    VoxelCoord at{kNoBlock, 0, 0};
-    if (k < own.count) {
-      at = block(own, k);
-      const VoxelCoord beside = k < left.count ? block(left, k) : VoxelCoord{kNoBlock, 0, 0};
-      const bool known = (at.x == before.x && at.y == before.y && at.z == before.z) ||
-                         (at.x == beside.x && at.y == beside.y && at.z == beside.z);
-      before = at;
-      if (known) at.x = kNoBlock;
-    }
-    coords[3 * k] = at.x;
-    coords[3 * k + 1] = at.x == kNoBlock ? 0 : at.y;
-    coords[3 * k + 2] = at.x == kNoBlock ? 0 : at.z;
-  }
-}
-
-// The farthest surface (m) in a tile of the image; 0 without any.
-SPS_INLINE float tile_far(const PlaneFrame& frame, int tile_u, int tile_v) {
-  float far = 0.0f;
-  for (int v = tile_v * kTsdfTileSide; v < (tile_v + 1) * kTsdfTileSide && v < frame.height; ++v) {
-    for (int u = tile_u * kTsdfTileSide; u < (tile_u + 1) * kTsdfTileSide && u < frame.width; ++u) {
-      const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + u);
-      const float depth = plane[4] > 0.0f ? plane_depth(frame, plane, u, v) : 0.0f;
-      far = depth > far ? depth : far;
-    }
-  }
-  return far;
+// The block of sample k of kTouchedPerPixel along a ray.
+SPS_INLINE VoxelCoord touched_block(const Vec3<float>& first, const Vec3<float>& step, int k, const Pose<float>& pose,
+                                    float inverse_block_size) {
+  const Vec3<float> point = first + static_cast<float>(k) * step;
+  return block_at(pose.rotation * point + pose.translation, inverse_block_size);
 }
 
 // A block in camera axes: its first voxel and the steps between voxels, m.
@@ -171,21 +145,23 @@ constexpr float kFullWeightDeviations = 1.2f, kMostFullWeight = 0.7f;
 // truncation; weight 0 where nothing was measured, or the voxel lies farther behind.
 struct TsdfObservation {
   float sdf, weight;
-  std::int32_t pixel;
 };
 
-SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, const Vec3<float>& at, const TsdfOptions& options,
-                                         std::int32_t pixel) {
-  const float deviation = std::sqrt(depth_variance(options.noise, at.z));
+SPS_INLINE float plane_distance(const MeasuredPlane& plane, const Vec3<float>& at) {
+  return plane.distance - dot(plane.normal, at);
+}
+
+// Of a voxel at a depth and a distance from a plane of that weight.
+SPS_INLINE TsdfObservation observe_voxel(float plane_weight, float distance, float depth, const TsdfOptions& options) {
+  const float deviation = std::sqrt(depth_variance(options.noise, depth));
   const float wanted = options.near_truncation + deviation;
   const float truncation = wanted < options.truncation ? wanted : options.truncation;
-  const float sdf = plane.distance - dot(plane.normal, at);
-  const bool known = (plane.weight > 0.0f) & (sdf > -truncation);
+  const bool known = (plane_weight > 0.0f) & (distance > -truncation);
   const float noisy = kFullWeightDeviations * deviation / truncation;
   const float full = noisy < kMostFullWeight ? noisy : kMostFullWeight;
-  const float fall = (1.0f + sdf / truncation) / (1.0f - full);
-  const float weight = plane.weight * (fall < 1.0f ? fall : 1.0f);
-  return {sdf < truncation ? sdf : truncation, known ? weight : 0.0f, pixel};
+  const float fall = (1.0f + distance / truncation) / (1.0f - full);
+  const float weight = plane_weight * (fall < 1.0f ? fall : 1.0f);
+  return {distance < truncation ? distance : truncation, known ? weight : 0.0f};
 }
 
 // The running mean of a voxel's distances.
@@ -196,32 +172,40 @@ SPS_INLINE void update_voxel(const TsdfObservation& seen, float max_weight, floa
   weight = total < max_weight ? total : max_weight;
 }
 
-SPS_INLINE std::uint16_t rounded_units(float value) {
+// Colors are taken up to kColorBand voxels from the surface, however short the truncation is.
+SPS_INLINE bool takes_color(float weight, float distance, float voxel_size) {
+  return (weight > 0.0f) & (std::fabs(distance) < kColorBand * voxel_size);
+}
+
+SPS_INLINE std::int32_t rounded_units(float value) {
   const float bounded = value < 0.0f ? 0.0f : value < kMostUnits ? value : kMostUnits;
-  return static_cast<std::uint16_t>(bounded + 0.5f);
+  return static_cast<std::int32_t>(bounded + 0.5f);
 }
 
-// The running mean of a voxel's colors. A view counts by the certainty of its plane, squared, as edges and slanted
-// views blur, and by how much of the voxel a pixel covers: one larger than the voxel says little of it.
-SPS_INLINE void update_color(const PlaneFrame& frame, const TsdfObservation& seen, float depth, float voxel_size,
-                             std::uint16_t* color) {
-  const float certainty = frame.planes[kPlaneSize * seen.pixel + 4];
-  const float resolved = frame.camera.fx * voxel_size / depth;
+// A voxel's color as in memory: red, green, blue and weight.
+struct ColorUnits {
+  std::int32_t red, green, blue, weight;
+};
+
+// Red, green and blue of a pixel, and the weight of its plane.
+struct ColorSample {
+  float red, green, blue, certainty;
+};
+
+// The running mean of a voxel's colors, `resolved` being the pixels that the voxel covers. A view counts by the
+// certainty of its plane, squared, as edges and slanted views blur, and by how much of the voxel a pixel covers: one
+// larger than the voxel says little of it.
+SPS_INLINE ColorUnits mix_colors(const ColorUnits& mean, const ColorSample& seen, float resolved) {
   const float sharpness = resolved < 1.0f ? resolved : 1.0f;
-  const float added = certainty * certainty * sharpness * sharpness;
-  const float before = static_cast<float>(color[3]) / kColorWeightUnit, total = before + added;
+  const float added = seen.certainty * seen.certainty * sharpness * sharpness;
+  const float before = static_cast<float>(mean.weight) / kColorWeightUnit, total = before + added;
   const float share = added / total;
-  const std::uint8_t* rgb = frame.colors + 3 * static_cast<std::int64_t>(seen.pixel);
-  for (int c = 0; c < 3; ++c) {
-    const float old = static_cast<float>(color[c]);
-    color[c] = rounded_units(old + share * (kColorUnit * static_cast<float>(rgb[c]) - old));
-  }
-  const std::uint16_t units = rounded_units(kColorWeightUnit * total);
-  color[3] = units > 0 ? units : 1;
-}
-
-SPS_INLINE bool takes_color(const PlaneFrame& frame, const TsdfObservation& seen, float voxel_size) {
-  return frame.colors != nullptr && seen.weight > 0.0f && std::fabs(seen.sdf) < kColorBand * voxel_size;
+  const float red = static_cast<float>(mean.red), green = static_cast<float>(mean.green),
+              blue = static_cast<float>(mean.blue);
+  const std::int32_t weight = rounded_units(kColorWeightUnit * total);
+  return {rounded_units(red + share * (kColorUnit * seen.red - red)),
+          rounded_units(green + share * (kColorUnit * seen.green - green)),
+          rounded_units(blue + share * (kColorUnit * seen.blue - blue)), weight > 0 ? weight : 1};
 }
 
 }  // namespace spslam

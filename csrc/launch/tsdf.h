@@ -8,30 +8,7 @@
 
 namespace spslam {
 
-constexpr std::int64_t kTileGrain = 8, kRayGrain = 64;
-
-template <class Device>
-void tsdf_touched_blocks(Device device, const PlaneFrame& frame, float voxel_size, float truncation, std::int32_t step,
-                         std::int32_t* coords) {
-  const std::int64_t columns = (frame.width + step - 1) / step;
-  const float inverse_block_size = 1.0f / (kTsdfBlockSide * voxel_size);
-  for_each(device, touched_rows(frame, step) / kTouchedPerPixel, [=] SPS_HOST_DEVICE(std::int64_t i) {
-    const int u = static_cast<int>(i % columns) * step, v = static_cast<int>(i / columns) * step;
-    write_touched(frame, load_pose(frame.pose), inverse_block_size, truncation, u, v, step,
-                  coords + 3 * kTouchedPerPixel * i);
-  });
-}
-
-template <class Device>
-void measure_tiles(Device device, const PlaneFrame& frame, float* tiles_far) {
-  const int columns = tiles_along(frame.width);
-  for_each(
-      device, static_cast<std::int64_t>(columns) * tiles_along(frame.height),
-      [=] SPS_HOST_DEVICE(std::int64_t i) {
-        tiles_far[i] = tile_far(frame, static_cast<int>(i % columns), static_cast<int>(i / columns));
-      },
-      kTileGrain);
-}
+constexpr std::int64_t kRayGrain = 64;
 
 template <class Device>
 void tsdf_query(Device device, const TsdfView& view, const float* points, std::int64_t n, float* sdf, float* colors,
@@ -71,9 +48,8 @@ void tsdf_ray_cast(Device device, const TsdfView& view, const RayCastCamera& cam
       kRayGrain);
 }
 
-#define SPS_INSTANTIATE_TSDF(Device)                                                                               \
-  template void tsdf_touched_blocks<Device>(Device, const PlaneFrame&, float, float, std::int32_t, std::int32_t*); \
-  template void tsdf_query<Device>(Device, const TsdfView&, const float*, std::int64_t, float*, float*, bool*);    \
+#define SPS_INSTANTIATE_TSDF(Device)                                                                            \
+  template void tsdf_query<Device>(Device, const TsdfView&, const float*, std::int64_t, float*, float*, bool*); \
   template void tsdf_ray_cast<Device>(Device, const TsdfView&, const RayCastCamera&, float*, float*, float*);
 
 }  // namespace spslam

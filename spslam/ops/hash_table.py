@@ -138,7 +138,7 @@ class VoxelHash(VoxelLookup):
         coords, leading = self._rows("VoxelHash.insert", voxel_coords)
         voxel_ids = self._find(coords)
         missing = voxel_ids < 0
-        absent = coords[missing]
+        absent = coords.index_select(0, missing.nonzero()[:, 0])  # by a mask, torch would wake threads for it
         if absent.shape[0]:
             self._enter(absent_voxels("VoxelHash.insert", self.hash_keys, self.hash_values, absent))
             voxel_ids = self._find(coords)

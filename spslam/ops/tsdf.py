@@ -62,7 +62,8 @@ def tsdf_touched_blocks(
     _check_sizes(name, voxel_size, truncation)
     check_count(name, "step", step)
     coords = torch.ops.spslam.tsdf_touched_blocks(planes, pose, list(intrinsics), voxel_size, truncation, step)
-    return coords[coords[:, 0] != NO_BLOCK]
+    # Not by a mask, for which torch wakes its own threads, however few rows there are: they would wait for cores.
+    return coords.index_select(0, (coords[:, 0] != NO_BLOCK).nonzero()[:, 0])
 
 
 @public_op()
@@ -279,8 +280,7 @@ def _check_field(name: str, field: tuple[torch.Tensor, ...], voxel_size: float) 
 
 @torch.library.register_fake("spslam::tsdf_touched_blocks")
 def _(planes, pose, intrinsics, voxel_size, truncation, step):
-    rows = 6 * -(-planes.shape[0] // step) * -(-planes.shape[1] // step)  # kTouchedPerPixel
-    return planes.new_empty((rows, 3), dtype=torch.int32)
+    return planes.new_empty((torch.library.get_ctx().new_dynamic_size(), 3), dtype=torch.int32)
 
 
 @torch.library.register_fake("spslam::tsdf_integrate_")

@@ -69,14 +69,15 @@ template <class Device>
 void measure_planes(Device device, const DepthImage& image, const DepthNoise& noise, float* planes);
 
 // Coordinates [touched_rows(frame, step), 3] of the blocks within the truncation of the planes of every step-th pixel,
-// with repetitions; kNoBlock where there is none.
+// with repetitions; kNoBlock in rows without one. Returns how many rows it wrote, from the first one on: all of them on
+// CUDA, where it does not wait for the device.
 inline std::int64_t touched_rows(const PlaneFrame& frame, std::int32_t step) {
   const std::int64_t columns = (frame.width + step - 1) / step, rows = (frame.height + step - 1) / step;
   return kTouchedPerPixel * columns * rows;
 }
 template <class Device>
-void tsdf_touched_blocks(Device device, const PlaneFrame& frame, float voxel_size, float truncation, std::int32_t step,
-                         std::int32_t* coords);
+std::int64_t tsdf_touched_blocks(Device device, const PlaneFrame& frame, float voxel_size, float truncation,
+                                 std::int32_t step, std::int32_t* coords);
 
 // Adds a frame to all blocks that it sees.
 SPS_INLINE std::int32_t tiles_along(std::int32_t size) {
