@@ -7,7 +7,6 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from spslam.datasets import open_dataset, open_sequence
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import ConfigError, OutputError, SpslamError
 from spslam.io import atomic_write
+from spslam.run.chunk_options import ChunkOptions
 from spslam.run.chunk_results import Chunk, join_chunks
 from spslam.run.device import resolve_device
 from spslam.run.output_folder import OutputFolder
@@ -29,26 +29,9 @@ from spslam.slam.checkpoint import fingerprint
 from spslam.tasks.schedule import LOG, run_tasks
 from spslam.tasks.task import Executor, Needs, Task, TaskCall, TaskEnd
 
-OVERLAP = 60  # frames that two chunks share, 2 s at 30 Hz: several keyframes of both
-CORES = 2  # of a chunk's run without GPU: it needs little less time with more
 FOLDER, PLAN = "chunks", "plan.json"
 
 Report = Callable[[int, int, TaskEnd], None]
-
-
-@dataclass(frozen=True)
-class ChunkOptions:
-    """How a recording is cut.
-
-    Attributes:
-        count: number of chunks, 2 at least.
-        overlap: frames that neighbors share.
-        device: of the chunks' runs, `cpu` or `cuda`; they are joined on the configuration's.
-    """
-
-    count: int
-    overlap: int = OVERLAP
-    device: str = "cpu"
 
 
 def cut(frames: int, options: ChunkOptions) -> list[Chunk]:

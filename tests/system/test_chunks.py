@@ -110,6 +110,9 @@ class Broken:
     def __init__(self):
         self.keys = []
 
+    def prepare(self, tasks):
+        pass
+
     def start(self, task):
         self.keys.append(task.key)
 
