@@ -72,7 +72,8 @@ def open_executor(args: argparse.Namespace, device: str, cores: int | None = Non
         from spslam.tasks.local import LocalExecutor
 
         found = resolve_device(device).type
-        return LocalExecutor(args.workers, args.threads, found == "cuda", cores, _notify), found
+        notify = _ignore if args.quiet else _notify
+        return LocalExecutor(args.workers, args.threads, found == "cuda", cores, notify), found
     from spslam.tasks.ray_cluster import RayExecutor, RayOptions
 
     executor = RayExecutor(RayOptions(args.cluster, args.workers, args.threads, args.copy_data, cores, _notify))
@@ -81,3 +82,7 @@ def open_executor(args: argparse.Namespace, device: str, cores: int | None = Non
 
 def _notify(line: str) -> None:
     print(f"spslam: {line}", file=sys.stderr, flush=True)
+
+
+def _ignore(line: str) -> None:
+    """With `--quiet`."""

@@ -58,13 +58,17 @@ class LocalExecutor:
         room = wanted if free is None or not needed else free // needed
         self._set_slots(max(min(wanted, room), 1))
         if room < wanted:
-            few = f"{room} at a time instead of {wanted}" if room else "one at a time, which may run out of memory"
+            few = (
+                f"{room} run at a time instead of {wanted}"
+                if room
+                else "one runs at a time, which may run out of memory"
+            )
             self._notify(
                 f"{few}: each is given {needed} MB of memory, and {free} MB are free; docs/cluster.md says what a run "
                 "takes, and what makes it less"
             )
         elif self._asked is not None and wanted < self._asked:
-            self._notify(f"{wanted} at a time instead of {self._asked}: there are no more")
+            self._notify(f"{wanted} run at a time instead of {self._asked}: there are no more")
 
     def start(self, task: Task) -> None:
         """Begins a task; there must be a slot left."""

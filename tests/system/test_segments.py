@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.generated import GeneratedDataset
+from spslam.slam.state import UnjoinedFrames
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import run_on, settings
@@ -22,10 +24,10 @@ POSES = GeneratedDataset(300, 160, 120).poses()
 class Frames(RgbdDataset):
     """The generated room's frames in the order of the test, -1 black, at 30 Hz."""
 
-    name = "lost"
+    name, order = "lost", ORDER
 
-    def __init__(self, count=COUNT):
-        self._room, self._count = GeneratedDataset(300, 160, 120), count
+    def __init__(self, count=None):
+        self._room, self._count = GeneratedDataset(300, 160, 120), count or len(self.order)
         self.camera = self._room.camera
 
     def __len__(self):
@@ -37,9 +39,13 @@ class Frames(RgbdDataset):
     def poses(self):
         return None
 
+    def truth(self):
+        """float64 [F, 4, 4] where the camera was, black frames where the first one was."""
+        return POSES[np.maximum(self.order, 0)]
+
     def read(self, index):
-        frame = self._room[max(ORDER[index], 0)]
-        if ORDER[index] < 0:
+        frame = self._room[max(self.order[index], 0)]
+        if self.order[index] < 0:
             frame.color[:], frame.depth[:] = 0, 0
         return replace(frame, index=index, timestamp=index / 30)
 
@@ -88,6 +94,16 @@ def test_resumed_within_a_segment_it_gives_the_same_bytes(frames, joined, tmp_pa
     np.testing.assert_array_equal(resumed.trajectory().poses, joined.trajectory().poses)
     one, other = (system.state.scene.volume for system in (resumed, joined))
     assert one.embeddings.equal(other.embeddings)
+
+
+def test_frames_that_both_maps_know_are_in_one_file_only(joined, monkeypatch):
+    rows = torch.arange(KNOWN - 2, KNOWN + 2)  # the first two are known in the map
+    poses = torch.arange(28.0).reshape(4, 7)
+    unjoined = [UnjoinedFrames(rows, poses), UnjoinedFrames(rows[:2], poses[:2])]
+    monkeypatch.setattr(joined.state, "unjoined", unjoined)
+    (segment,) = joined.segments()
+    np.testing.assert_array_equal(segment.timestamps, joined.trajectory().timestamps[KNOWN : KNOWN + 2])
+    np.testing.assert_array_equal(segment.poses[:, :3, 3], poses[2:, 4:])
 
 
 def test_a_place_that_is_never_joined_is_kept_apart(frames):

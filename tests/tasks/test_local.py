@@ -49,9 +49,15 @@ MADE_LESS = "docs/cluster.md says what a run takes, and what makes it less"
     [
         (None, 8, 64000, 4, None),  # one per two of eight cores
         (None, 3, 64000, 3, None),  # nobody asked for more
-        (8, 3, 64000, 3, "3 at a time instead of 8: there are no more"),
-        (None, 8, 5999, 2, "2 at a time instead of 4: each is given 2500 MB of memory, and 5999 MB are free"),
-        (8, 8, 900, 1, "one at a time, which may run out of memory: each is given 2500 MB of memory, and 900 MB are"),
+        (8, 3, 64000, 3, "3 run at a time instead of 8: there are no more"),
+        (None, 8, 5999, 2, "2 run at a time instead of 4: each is given 2500 MB of memory, and 5999 MB are free"),
+        (
+            8,
+            8,
+            900,
+            1,
+            "one runs at a time, which may run out of memory: each is given 2500 MB of memory, and 900 MB are",
+        ),
         (8, 8, None, 8, None),  # the system does not say
     ],
 )
