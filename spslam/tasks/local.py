@@ -50,19 +50,12 @@ class LocalExecutor:
 
     def prepare(self, tasks: Sequence[Task]) -> None:
         """Runs as many at a time as there is memory for, by what they need; none may be running."""
-        wanted, needed, free = (
-            min(self._most, len(tasks)),
-            max(task.needs.memory_mb for task in tasks),
-            free_memory_mb(),
-        )
+        wanted = min(self._most, len(tasks))
+        needed, free = max(task.needs.memory_mb for task in tasks), free_memory_mb()
         room = wanted if free is None or not needed else free // needed
         self._set_slots(max(min(wanted, room), 1))
         if room < wanted:
-            few = (
-                f"{room} run at a time instead of {wanted}"
-                if room
-                else "one runs at a time, which may run out of memory"
-            )
+            few = f"{room} run at a time instead of {wanted}" if room else "one runs at a time and may not have enough"
             self._notify(
                 f"{few}: each is given {needed} MB of memory, and {free} MB are free; docs/cluster.md says what a run "
                 "takes, and what makes it less"

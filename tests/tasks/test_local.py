@@ -56,7 +56,7 @@ MADE_LESS = "docs/cluster.md says what a run takes, and what makes it less"
             8,
             900,
             1,
-            "one runs at a time, which may run out of memory: each is given 2500 MB of memory, and 900 MB are",
+            "one runs at a time and may not have enough: each is given 2500 MB of memory, and 900 MB are",
         ),
         (8, 8, None, 8, None),  # the system does not say
     ],
