@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -109,9 +110,8 @@ class FramePipeline:
         self.global_mapping = None
         if self.state.graph is not None:
             self.global_mapping = GlobalMapping(self.config, self._prior, self.state, self.state.graph)
-        self._other_maps = MultiMap(
-            self.config, self.state, self.global_mapping, self.tracker, self.recovery, self._alike
-        )
+        alike = functools.partial(FramePipeline, camera=self.camera, device=self.device)
+        self._other_maps = MultiMap(self.config, self.state, self.global_mapping, self.tracker, self.recovery, alike)
         self._task: MappingTask | None = None
         self.mapping_loss: torch.Tensor | None = None
 
@@ -241,10 +241,6 @@ class FramePipeline:
         if place is not None:
             self.optimize_map()
             self._other_maps.join(place)
-
-    def _alike(self, config: Config) -> FramePipeline:
-        """A system of the same camera with other options."""
-        return FramePipeline(config, self.camera, None, self.device)
 
     def _take_up_ready(self, number: int) -> tuple[LoopDecision, ...]:
         """`_update_globally` of a live run, after a frame: waits for nothing."""

@@ -6,6 +6,7 @@ is lost begins a new map for what it sees (`spslam.slam.segments`), which joins 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -47,11 +48,13 @@ class MultiMap:
         make: Callable[[Config], SegmentSystem],
     ):
         self._config, self._state, self._global_mapping = config, state, global_mapping
-        self._tracker, self._recovery, self._make = tracker, recovery, make
+        self._tracker, self._recovery = tracker, recovery
         self._segments: Segments | None = None
         after_s = config.graph.new_map_after_s
         if global_mapping is not None and after_s is not None:
-            self._segments = Segments(after_s, state, global_mapping, self._segment_system)
+            # Nothing here refers back to the system, so that its memory goes with it.
+            make_segment = functools.partial(_segment_system, make, segment_config(config))
+            self._segments = Segments(after_s, state, global_mapping, make_segment)
 
     def close(self) -> None:
         """Ends the threads of the segment's system."""
@@ -111,9 +114,10 @@ class MultiMap:
         if self._segments is not None:
             self._segments.end()
 
-    def _segment_system(self, state: SlamState | None) -> SegmentSystem:
-        """A system for what a lost camera sees, that of a state if one is given."""
-        system = self._make(segment_config(self._config))
-        if state is not None:
-            system.adopt(state)
-        return system
+
+def _segment_system(make: Callable[[Config], SegmentSystem], config: Config, state: SlamState | None) -> SegmentSystem:
+    """A system for what a lost camera sees, that of a state if one is given."""
+    system = make(config)
+    if state is not None:
+        system.adopt(state)
+    return system

@@ -1,5 +1,7 @@
 """What a lost camera sees is mapped on its own, and joined with the map when the camera is known there again."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -119,6 +121,19 @@ def test_a_place_that_is_never_joined_is_kept_apart(frames):
     truth = POSES[np.array(ORDER)[KNOWN + BLACK : KNOWN + BLACK + 5]]
     assert len(segment) == 5
     np.testing.assert_allclose(segment.poses, np.linalg.inv(truth[0]) @ truth, atol=0.01)
+
+
+def test_memory_of_a_system_goes_with_it(frames):
+    """Without the garbage collector: a segment's map would else stay until that runs."""
+    system = SlamSystem(settings(*CONFIG), frames.camera, POSES[0])
+    system.close()
+    state = weakref.ref(system.state)
+    gc.disable()
+    try:
+        del system
+        assert state() is None
+    finally:
+        gc.enable()
 
 
 def test_without_the_option_none_begins(frames):
