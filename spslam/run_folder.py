@@ -9,6 +9,7 @@ from pathlib import Path
 
 MESH_FORMATS = ("ply", "glb", "obj")
 
+_SEGMENT = re.compile(r"segment-([0-9]+)\.txt")
 _COLOR_PREVIEW = re.compile(r"frame-([0-9]{6,})\.png")
 
 
@@ -34,6 +35,13 @@ class RunFolder:
     def segment(self, number: int) -> Path:
         """Trajectory in the TUM format of what a lost camera saw, in axes of its own; `number` is from 1."""
         return self.path / f"segment-{number}.txt"
+
+    def segments(self) -> list[Path]:
+        """The files of `segment` that there are, by their numbers."""
+        found = {
+            int(name[1]): path for path in self.path.glob("segment-*.txt") if (name := _SEGMENT.fullmatch(path.name))
+        }
+        return [found[number] for number in sorted(found)]
 
     def trajectory_of(self, recording: int) -> Path:
         """Trajectory of one of the recordings of a merged map, counted from 0; its name counts from 1."""
@@ -89,6 +97,21 @@ class RunFolder:
         return self.path / "checkpoint.safetensors"
 
     @property
+    def chunks(self) -> Path:
+        """Folder of the runs of chunks, until they are joined."""
+        return self.path / "chunks"
+
+    @property
+    def chunk_plan(self) -> Path:
+        """How the recording is cut into chunks; removed when the run has finished."""
+        return self.chunks / "plan.json"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it is of a run that has written all results: there is nothing left to resume."""
+        return self.metrics.is_file() and not self.checkpoint.is_file() and not self.chunk_plan.is_file()
+
+    @property
     def previews(self) -> Path:
         """Folder of the input that the report shows: camera, ground truth and some frames."""
         return self.path / "previews"
@@ -120,7 +143,7 @@ class RunFolder:
         """All files that a run or a later command may leave directly in the folder; `previews` is not among them."""
         meshes = [self.mesh_as(file_format) for file_format in MESH_FORMATS]
         others = [self.metrics, self.report, self.config, self.log, self.skipped, self.checkpoint]
-        return [self.trajectory, *sorted(self.path.glob("segment-*.txt")), self.map, self.keyframes, *meshes, *others]
+        return [self.trajectory, *self.segments(), self.map, self.keyframes, *meshes, *others]
 
 
 def is_merged(folder: RunFolder) -> bool:

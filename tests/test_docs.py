@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from spslam.cli.cluster import OPTIONS as CLUSTER_OPTIONS
 from spslam.cli.main import COMMANDS
 from spslam.config import option_paths
 
@@ -77,6 +78,13 @@ def test_configuration_page_is_current():
 def test_configuration_page_has_every_option():
     page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     assert not [option for option in option_paths() if f"| `{option}` |" not in page]
+
+
+def test_cluster_page_has_the_options_as_the_command_explains_them():
+    """The table of docs/cluster.md is the help of `spslam run` and `spslam bench`."""
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(--\S+)[^`]*` \| (.*) \|$", page, re.MULTILINE)
+    assert dict(rows) == {name: argument["help"] for name, argument in CLUSTER_OPTIONS.items()}
 
 
 def headings(page):

@@ -31,6 +31,28 @@ def test_rows_with_a_preview_are_found_in_order(tmp_path):
     assert folder.preview_rows() == [3, 12, 1_000_000]
 
 
+def test_segments_are_in_the_order_of_their_numbers(tmp_path):
+    folder = RunFolder(tmp_path)
+    for number in (10, 2, 1):
+        folder.segment(number).touch()
+    (tmp_path / "segment-last.txt").touch()
+    assert folder.segments() == [folder.segment(number) for number in (1, 2, 10)]
+    assert set(folder.segments()) <= set(folder.files())
+
+
+def test_a_run_has_finished_when_nothing_is_left_to_resume(tmp_path):
+    folder = RunFolder(tmp_path)
+    assert not folder.is_finished
+    folder.metrics.touch()
+    assert folder.is_finished
+    folder.chunks.mkdir()
+    for marker in (folder.checkpoint, folder.chunk_plan):
+        marker.touch()
+        assert not folder.is_finished
+        marker.unlink()
+    assert folder.is_finished
+
+
 def literals(path):
     """String constants of a module and the fixed parts of its f-strings, without docstrings."""
     tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from spslam.cli.arguments import at_least_one
 from spslam.cli.cluster import add_cluster, check_cluster, open_executor
 from spslam.cli.parser import UsageError
+from spslam.run.chunk_options import CORES, OVERLAP, ChunkOptions
 
 if TYPE_CHECKING:
     from spslam.run.request import RunRequest
@@ -23,7 +24,7 @@ def add_chunks(parser: argparse.ArgumentParser) -> None:
         "--chunks", metavar="N", type=at_least_one, help="cut the recording into N chunks, run them apart and join them"
     )
     parser.add_argument(
-        "--overlap", metavar="FRAMES", type=at_least_one, help="frames that two chunks share (default: 60)"
+        "--overlap", metavar="FRAMES", type=at_least_one, help=f"frames that two chunks share (default: {OVERLAP})"
     )
     add_cluster(parser)
 
@@ -51,7 +52,7 @@ def run_in_chunks(request: RunRequest, args: argparse.Namespace) -> dict[str, An
         SpslamError: as of `run_chunks`.
         KeyboardInterrupt: after Ctrl-C; its message says how to resume.
     """
-    from spslam.run.chunks import CORES, OVERLAP, ChunkOptions, run_chunks
+    from spslam.run.chunks import run_chunks
 
     executor, device = open_executor(args, request.config.device, CORES)
     options = ChunkOptions(args.chunks, args.overlap or OVERLAP, device)

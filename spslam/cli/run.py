@@ -46,8 +46,7 @@ def execute(args: argparse.Namespace) -> None:
         raise UsageError("--resume needs the interrupted run's folder as --output")
     output = args.output or default_output(args.config)
     config = load_config(choose_config(args, args.quiet), args.preset, overrides(args))
-    folder = RunFolder(output)
-    was_finished = args.resume and folder.metrics.is_file() and not folder.checkpoint.is_file()
+    was_finished = args.resume and RunFolder(output).is_finished
     request = make_request(config, output, args.frames, args.resume, not args.no_mesh)
     request = replace(request, map=args.map, command=args.command_line)
     if args.chunks is not None:

@@ -24,6 +24,9 @@ _WAIT_MS = 500
 _SILENCE_S = 5.0
 # The lens is taken as free of distortion if it moves no pixel further.
 _NEGLIGIBLE_PX = 0.1
+# Of a frame's period. Images of one moment are at most half of it apart, as cameras do not expose both together; where
+# one is missing, the SDK gives the one before in its place, which is a whole period off.
+_MOST_APART = 0.75
 _GRID_PX = 8  # distance of the pixels of which the SDK is asked where they come from
 
 
@@ -37,7 +40,12 @@ class RealSenseSource(LiveSource, AbstractContextManager):
         serial: serial number of the camera; any camera where not given.
         width, height: of both streams, px; 640x480 where not given.
         rate_hz: frames per second; 30 where not given.
-        recording: a `.bag` or `.db3` file of the SDK, played at its own pace, instead of a camera.
+        recording: a `.bag` or `.db3` file of the SDK, instead of a camera.
+        real_time: play the recording at its own pace, so that frames are dropped where they are not taken in time;
+            else each waits until it is taken.
+
+    Attributes:
+        dropped: frames that came without their color or depth image, or were not taken in time.
 
     Raises:
         SourceError: pyrealsense2 is missing, there is no such camera, mode or recording.
@@ -50,6 +58,7 @@ class RealSenseSource(LiveSource, AbstractContextManager):
         height: int | None = None,
         rate_hz: int | None = None,
         recording: Path | None = None,
+        real_time: bool = True,
     ) -> None:
         self._sdk = sdk = _import_sdk()
         self._is_recording, self.dropped = recording is not None, 0
@@ -66,6 +75,10 @@ class RealSenseSource(LiveSource, AbstractContextManager):
             config.enable_stream(sdk.stream.color, *size, sdk.format.rgb8, rate_hz or RATE_HZ)
         self._pipeline: Any = sdk.pipeline()
         try:
+            if recording is not None:
+                # Before the first frame is played.
+                player = config.resolve(sdk.pipeline_wrapper(self._pipeline)).get_device().as_playback()
+                player.set_real_time(real_time)
             profile = self._pipeline.start(config)
         except RuntimeError as error:
             wanted = f"{width or WIDTH}x{height or HEIGHT} at {rate_hz or RATE_HZ} Hz"
@@ -84,7 +97,10 @@ class RealSenseSource(LiveSource, AbstractContextManager):
                 if self._is_over():
                     return
                 if complete_s - last_s > _SILENCE_S:
-                    raise SourceError(f"{self.name}: sent no frame for {_SILENCE_S:g} s; check its cable and USB port")
+                    raise SourceError(
+                        f"{self.name}: sent no color and depth image of one moment for {_SILENCE_S:g} s; check its "
+                        "cable and USB port"
+                    )
                 yield None
                 continue
             last_s = complete_s
@@ -119,8 +135,8 @@ class RealSenseSource(LiveSource, AbstractContextManager):
         words = [device.get_info(info) for info in infos if device.supports(info)]
         self.name = " ".join(words) or (f"RealSense recording {Path(recording).name}" if recording else "RealSense")
         self._playback = device.as_playback() if self._is_recording else None
-        if self._playback is not None:
-            self._playback.set_real_time(True)
+        rate_hz = min(stream.fps() for stream in streams.values())
+        self._most_apart_ms = 1e3 * _MOST_APART / max(rate_hz, 1)
         color = streams[sdk.stream.color].as_video_stream_profile()
         lens = color.get_intrinsics()
         self.camera = Camera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy)
@@ -129,12 +145,20 @@ class RealSenseSource(LiveSource, AbstractContextManager):
         self._align = sdk.align(sdk.stream.color)
 
     def _wait(self) -> Any:
-        """The next pair of images; None if none came in time, or one image came without the other."""
+        """The next pair of images; None if none came in time, or one image came without the other of its moment."""
         try:
             arrived, frameset = self._pipeline.try_wait_for_frames(_WAIT_MS)
         except RuntimeError as error:
             raise SourceError(f"{self.name}: {error}") from None
-        return frameset if arrived and frameset.get_color_frame() and frameset.get_depth_frame() else None
+        return frameset if arrived and self._is_pair(frameset) else None
+
+    def _is_pair(self, frameset: Any) -> bool:
+        color, depth = frameset.get_color_frame(), frameset.get_depth_frame()
+        if not color or not depth:
+            return False
+        if color.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain():
+            return True  # of two clocks
+        return abs(color.get_timestamp() - depth.get_timestamp()) <= self._most_apart_ms
 
     def _is_over(self) -> bool:
         return self._playback is not None and self._playback.current_status() == self._sdk.playback_status.stopped

@@ -15,25 +15,32 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.run_output import RunOutput
-from spslam.evaluation.trajectory_metrics import ate, rpe
-from spslam.evaluation.verdict import judge_run
+from spslam.geometry import compose, inverse
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
 from spslam.run.device import explained_failures, resolve_device
+from spslam.run.figures import (
+    decoding_figures,
+    graph_figures,
+    noise_figures,
+    origin,
+    scene_figures,
+    timings,
+    tracking_figures,
+    truth_figures,
+)
 from spslam.run.merge import joined_state, make_map
-from spslam.run.mesh import noise_of_model
 from spslam.run.output_folder import OutputFolder
-from spslam.run.provenance import provenance
 from spslam.run.recordings import source_of, write_map_mesh
 from spslam.run.request import RunRequest
-from spslam.run.results import RunInput, max_error_probability, timings
+from spslam.run.results import RunInput, finish_results, write_segments
 from spslam.run.session import identity_of
 from spslam.run.threads import kernel_threads_limited, library_threads_limited
 from spslam.run_folder import RunFolder
 from spslam.slam.graph.archive import KeyframeArchive, Recording
 from spslam.slam.graph.edges import LoopDecision
+from spslam.slam.graph.joined import registrar_of
 from spslam.slam.graph.parts import Part, join_parts, whole_recording
-from spslam.slam.graph.registration import Registrar
 from spslam.slam.opened_map import archive_of, load_archive
 from spslam.slam.state import SlamState
 from spslam.trajectory import Trajectory
@@ -65,13 +72,14 @@ class Chunk:
 
 @dataclass(frozen=True)
 class _Run:
-    """The run of a chunk: its lines of log.jsonl and skipped.jsonl, metrics, and map."""
+    """The run of a chunk: its lines of log.jsonl and skipped.jsonl, metrics, map, and segments of its own frames."""
 
     chunk: Chunk
     log: list[dict[str, Any]]
     skipped: list[dict[str, Any]]
     metrics: dict[str, Any]
     part: Part
+    segments: list[Trajectory]
 
 
 def join_chunks(
@@ -125,14 +133,42 @@ def _read(chunk: Chunk, path: RunFolder) -> _Run:
     if len(indices) != len(archive.recordings[0].trajectory):
         raise OutputError(f"{folder.log}: must have a line for each frame of {folder.trajectory.name}")
     metrics = json.loads(folder.metrics.read_text(encoding="utf-8"))
-    return _Run(chunk, log, folder.read_skipped(), metrics, Part(archive, indices))
+    part = Part(archive, indices)
+    own = slice(part.row(chunk.own_begin), part.row(chunk.own_end))
+    segments = own_segments(folder, own)
+    return _Run(chunk, log, folder.read_skipped(), metrics, part, segments)
+
+
+def own_segments(folder: RunFolder, rows: slice) -> list[Trajectory]:
+    """The segments of a run, of some of its frames only: of those that are lost in its trajectory.
+
+    Args:
+        folder: of the run.
+        rows: in the trajectory, of the frames that are wanted.
+
+    Returns:
+        Each in the axes of its first frame that is wanted; those without one are left out.
+    """
+    # Both files have the same rounded times.
+    trajectory = Trajectory.load_tum(folder.trajectory)
+    times = trajectory.timestamps[rows][trajectory.lost[rows]]
+    found = []
+    for path in folder.segments():
+        segment = Trajectory.load_tum(path)
+        kept = np.isin(segment.timestamps, times)
+        if not kept.any():
+            continue
+        poses = segment.poses[kept]
+        if not kept[0]:
+            poses = compose(inverse(poses[0]), poses)
+        found.append(Trajectory(segment.timestamps[kept], poses))
+    return found
 
 
 def _joined(runs: Sequence[_Run], config: Config) -> Part:
     joined = runs[0].part
     for run in runs[1:]:
-        noise = {**run.part.archive.noise, **joined.archive.noise}
-        registrar = Registrar(noise, config.seed, config.tracking.color, config.tracking.features)
+        registrar = registrar_of(joined.archive, run.part.archive, config)
         found = join_parts(joined, run.part, run.chunk.own_begin, registrar)
         if isinstance(found, str):
             raise OutputError(
@@ -159,13 +195,13 @@ def _write(request: RunRequest, dataset: RgbdDataset, runs: Sequence[_Run], whol
     whole.state.scene.save(folder.map)
     archive.save(folder.keyframes)
     source = RunInput.of_dataset(dataset, [line["index"] for line in log], config.run.previews)
-    metrics = _metrics(request, dataset, runs, whole, log) | {"skipped_frames": len(skipped)}
+    metrics = {
+        **_metrics(request, dataset, runs, whole, log),
+        **write_segments(folder, [segment for run in runs for segment in run.segments]),
+        "skipped_frames": len(skipped),
+        **truth_figures(trajectory, source.poses),
+    }
     warnings = list(dict.fromkeys(text for run in runs for text in run.metrics.get("warnings", ())))
-    if source.poses is not None:
-        known = trajectory.mask_lost(source.poses)
-        metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
-    if "ate_rmse_cm" not in metrics:
-        metrics["unchecked"] = ["error", "depth scale", "mirrored images"]
     if request.mesh:
         # The trajectory is the file's, so that `spslam mesh` makes the same one.
         written = replace(archive.recordings[0], trajectory=Trajectory.load_tum(folder.trajectory))
@@ -178,11 +214,7 @@ def _write(request: RunRequest, dataset: RgbdDataset, runs: Sequence[_Run], whol
         metrics |= {"wall_s": wall_s, "fps": len(log) / wall_s}
     if warnings:
         metrics["warnings"] = warnings
-    run = RunOutput(folder, trajectory, source.poses, metrics, log, "", dataset.camera)
-    metrics["verdict"] = judge_run(run, config).level
-    atomic_write(folder.metrics, json.dumps(metrics, indent=1) + "\n")
-    folder.write_previews(dataset.camera, source.previews, source.ground_truth)
-    folder.write_report()
+    finish_results(RunOutput(folder, trajectory, source.poses, metrics, log, "", dataset.camera), source, config)
     return metrics
 
 
@@ -190,35 +222,23 @@ def _metrics(
     request: RunRequest, dataset: RgbdDataset, runs: Sequence[_Run], whole: _Whole, log: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """What metrics.json says of the chunks and of their joined map."""
-    lost, scene, archive = whole.trajectory.lost, whole.state.scene, whole.archive
+    scene, archive = whole.state.scene, whole.archive
     clock = RunClock(len(log), sum(run.metrics["wall_s"] * len(_own_lines(run)) / len(run.log) for run in runs))
     clock.decode_s = sum(run.metrics["decode_ms"] / 1e3 * len(_own_lines(run)) for run in runs)
-    kinds = [edge.kind for edge in archive.edges]
-    noise = noise_of_model(next(iter(archive.noise.values())))
     return {
-        **provenance(request.config, scene.device),
-        **({"command": request.command} if request.command else {}),
+        **origin(request.config, scene.device, request.command),
         "data": identity_of(dataset, request),
         "frames": len(log),
         "chunks": len(runs),
         "chunk_frames": [run.chunk.end - run.chunk.begin for run in runs],
         "chunk_wall_s": [run.metrics["wall_s"] for run in runs],
         **timings(log, clock),
-        "decode_ms": 1e3 * clock.decode_s / max(len(log), 1),
-        "lost_frames": int(lost.sum()),
-        "unjoined_frames": sum(run.metrics["unjoined_frames"] for run in runs),
-        "tracking_failures": int((lost[1:] & ~lost[:-1]).sum()) + int(lost[0]),
-        "recovered_frames": sum(line["recovered"] for line in log),
-        "relocalized_frames": sum(line["relocalized"] for line in log),
-        **max_error_probability(log),
-        "voxels": scene.volume.num_voxels,
-        "model_mb": scene.nbytes / 2**20,
+        **decoding_figures(clock),
+        **tracking_figures(whole.trajectory, log),
+        **scene_figures(scene),
         "peak_rss_mb": max(run.metrics["peak_rss_mb"] for run in runs),
-        "keyframes": len(archive.keyframes),
-        "graph_edges": len(kinds),
-        "closed_loops": kinds.count("loop"),
-        "depth_noise_floor_m2": noise[0],
-        "depth_noise_growth_m2": noise[1],
+        **graph_figures(len(archive.keyframes), archive.edges),
+        **noise_figures(next(iter(archive.noise.values()))),
     }
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from spslam.datasets import open_dataset, open_sequence
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import ConfigError, OutputError, SpslamError
 from spslam.io import atomic_write
+from spslam.run.chunk_options import ChunkOptions, ChunkPlan
 from spslam.run.chunk_results import Chunk, join_chunks
 from spslam.run.device import resolve_device
 from spslam.run.output_folder import OutputFolder
@@ -29,26 +28,7 @@ from spslam.slam.checkpoint import fingerprint
 from spslam.tasks.schedule import LOG, run_tasks
 from spslam.tasks.task import Executor, Needs, Task, TaskCall, TaskEnd
 
-OVERLAP = 60  # frames that two chunks share, 2 s at 30 Hz: several keyframes of both
-CORES = 2  # of a chunk's run without GPU: it needs little less time with more
-FOLDER, PLAN = "chunks", "plan.json"
-
 Report = Callable[[int, int, TaskEnd], None]
-
-
-@dataclass(frozen=True)
-class ChunkOptions:
-    """How a recording is cut.
-
-    Attributes:
-        count: number of chunks, 2 at least.
-        overlap: frames that neighbors share.
-        device: of the chunks' runs, `cpu` or `cuda`; they are joined on the configuration's.
-    """
-
-    count: int
-    overlap: int = OVERLAP
-    device: str = "cpu"
 
 
 def cut(frames: int, options: ChunkOptions) -> list[Chunk]:
@@ -103,15 +83,16 @@ def run_chunks(
     folder = OutputFolder(Path(request.output_dir))
     with folder.locked():
         finished = finished_metrics(request, dataset)
-        if finished is not None:
-            return finished
-        started = time.perf_counter()
-        _prepare(folder, request, dataset, options)
-        resumed = _run_all(request, chunks, options, executor, report)
-        runs = [(chunk, chunk_folder(request, chunk)) for chunk in chunks]
-        metrics = join_chunks(request, dataset, runs, None if resumed else started)
-        shutil.rmtree(folder.path / FOLDER, ignore_errors=True)
-    return metrics
+        if finished is None:
+            started = time.perf_counter()
+            _prepare(folder, request, dataset, options)
+            resumed = _run_all(request, chunks, options, executor, report)
+            runs = [(chunk, chunk_folder(request, chunk)) for chunk in chunks]
+            finished = join_chunks(request, dataset, runs, None if resumed else started)
+            # The run has finished when the plan is gone; what is killed before is joined again, to the same results.
+            folder.chunk_plan.unlink()
+        shutil.rmtree(folder.chunks, ignore_errors=True)
+    return finished
 
 
 def run_chunk(call: TaskCall) -> None:
@@ -138,33 +119,45 @@ def _prepare(folder: OutputFolder, request: RunRequest, dataset: RgbdDataset, op
     Raises:
         OutputError: it holds something else.
     """
-    plan = {
-        "settings": fingerprint(request.config),
-        "data": identity_of(dataset, request),
-        "chunks": options.count,
-        "overlap": options.overlap,
-    }
-    place = folder.path / FOLDER / PLAN
-    if request.resume and place.is_file() and json.loads(place.read_text(encoding="utf-8")) != plan:
+    plan = ChunkPlan(fingerprint(request.config), identity_of(dataset, request), options.count, options.overlap)
+    found = ChunkPlan.read(folder)
+    if found is None:
+        _check_whole(folder)
+        folder.create(request.resume)
+    elif (found.settings, found.data) != (plan.settings, plan.data):
         raise OutputError(f"{folder.path}: holds chunks of other options, data or frames; use another --output")
-    folder.create(request.resume)
+    elif found != plan or not request.resume:
+        raise found.to_be_continued(folder)
+    else:
+        folder.clear()  # of what was written before they were joined to the end
     device = resolve_device(request.config.device)
     atomic_write(folder.config, dump_config(request.config, provenance(request.config, device)))
-    if not place.is_file():
-        shutil.rmtree(place.parent, ignore_errors=True)
-        place.parent.mkdir()
-        atomic_write(place, json.dumps(plan) + "\n")
+    if found is None:
+        shutil.rmtree(folder.chunks, ignore_errors=True)
+        folder.chunks.mkdir()
+        plan.write(folder)
+
+
+def _check_whole(folder: OutputFolder) -> None:
+    """Raises OutputError where the folder has an interrupted run in one piece."""
+    if folder.checkpoint.is_file():
+        begun = "contains an interrupted run in one piece; continue it"
+    elif folder.log.is_file() and not folder.metrics.is_file():
+        begun = "holds a run in one piece that ended before its first checkpoint; start it over"
+    else:
+        return
+    raise OutputError(f"{folder.path}: {begun} with --resume and without --chunks, or use another --output")
 
 
 def _run_all(
     request: RunRequest, chunks: Sequence[Chunk], options: ChunkOptions, executor: Executor, report: Report | None
 ) -> bool:
     """Runs the chunks that have not finished; returns whether there were others."""
-    missing = [chunk for chunk in chunks if not is_finished(chunk_folder(request, chunk))]
+    missing = [chunk for chunk in chunks if not chunk_folder(request, chunk).is_finished]
     by_key = {chunk.name: chunk for chunk in missing}
     tasks = [_task(request, chunk, options.device) for chunk in missing]
     done, failed = len(chunks) - len(missing), []
-    log = Path(request.output_dir) / FOLDER / LOG
+    log = RunFolder(Path(request.output_dir)).chunks / LOG
     with contextlib.closing(run_tasks(tasks, executor, log)) as ends:
         for end in ends:
             done += 1
@@ -210,9 +203,4 @@ def _task(request: RunRequest, chunk: Chunk, device: str) -> Task:
 
 def chunk_folder(request: RunRequest, chunk: Chunk) -> RunFolder:
     """Output folder of a chunk's run."""
-    return RunFolder(Path(request.output_dir) / FOLDER / chunk.name)
-
-
-def is_finished(folder: RunFolder) -> bool:
-    """Whether a chunk's run has finished."""
-    return folder.metrics.is_file() and not folder.checkpoint.is_file()
+    return RunFolder(RunFolder(Path(request.output_dir)).chunks / chunk.name)

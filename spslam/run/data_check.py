@@ -27,7 +27,7 @@ def check_data(request: RunRequest, dataset: RgbdDataset) -> list[str]:
         DatasetError: something is wrong beyond doubt, and `run.data_check` is `stop`.
     """
     mode, folder = request.config.run.data_check, RunFolder(Path(request.output_dir))
-    if mode == "skip" or (request.resume and folder.metrics.exists() and not folder.checkpoint.exists()):
+    if mode == "skip" or (request.resume and folder.is_finished):
         return []
     findings = check_first_frames(dataset)
     if mode == "stop":

@@ -19,6 +19,7 @@ from spslam.errors import OutputError
 from spslam.io import atomic_write
 from spslam.prior import load_prior
 from spslam.run.device import explained_failures, resolve_device
+from spslam.run.figures import graph_figures, origin, scene_figures
 from spslam.run.output_folder import OutputFolder
 from spslam.run.provenance import provenance
 from spslam.run.recordings import write_map_mesh
@@ -26,8 +27,7 @@ from spslam.run.threads import kernel_threads_limited, library_threads_limited
 from spslam.run_folder import RunFolder
 from spslam.scene import Scene
 from spslam.slam.graph.archive import KeyframeArchive
-from spslam.slam.graph.joined import join_archives
-from spslam.slam.graph.registration import Registrar
+from spslam.slam.graph.joined import join_archives, registrar_of
 from spslam.slam.mapper import Mapper
 from spslam.slam.opened_map import (
     archive_of,
@@ -128,9 +128,7 @@ def _joined(folders: Sequence[Path], archives: Sequence[KeyframeArchive], config
     while waiting:
         reasons = {}
         for folder, archive in list(waiting.items()):
-            noise = {**archive.noise, **joined.noise}
-            registrar = Registrar(noise, config.seed, config.tracking.color, config.tracking.features)
-            found = join_archives(joined, archive, registrar)
+            found = join_archives(joined, archive, registrar_of(joined, archive, config))
             if isinstance(found, str):
                 reasons[folder] = found
             else:
@@ -180,19 +178,14 @@ def _write(
     for number, recording in enumerate(archive.recordings):
         recording.trajectory.save_tum(folder.trajectory_of(number))
     lost = [int(each.trajectory.lost.sum()) for each in archive.recordings]
-    kinds = [edge.kind for edge in archive.edges]
     metrics: dict[str, Any] = {
-        **provenance(config, state.scene.device),
-        **({"command": request.command} if request.command else {}),
+        **origin(config, state.scene.device, request.command),
         "merged": [str(folder) for folder in request.folders],
         "recordings": [each.name for each in archive.recordings],
         "frames": sum(len(each.trajectory) for each in archive.recordings),
         "lost_frames": sum(lost),
-        "voxels": state.scene.volume.num_voxels,
-        "model_mb": state.scene.nbytes / 2**20,
-        "keyframes": len(archive.keyframes),
-        "graph_edges": len(kinds),
-        "closed_loops": kinds.count("loop"),
+        **scene_figures(state.scene),
+        **graph_figures(len(archive.keyframes), archive.edges),
     }
     if request.mesh:
         _, figures, missing = write_map_mesh(folder.mesh, state.scene, archive, config.mesh)

@@ -18,6 +18,7 @@ from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.html_report import write_report
 from spslam.io import atomic_write, writing
+from spslam.run.chunk_options import ChunkPlan
 from spslam.run_folder import RunFolder
 from spslam.trajectory import Trajectory
 
@@ -100,6 +101,9 @@ class OutputFolder(RunFolder):
         Raises:
             OutputError: the folder has other content.
         """
+        plan = ChunkPlan.read(self)
+        if plan is not None:
+            raise plan.to_be_continued(self)
         if self.metrics.exists():
             raise OutputError(f"{self.path}: holds a finished run; use another --output")
         if self.checkpoint.exists():
@@ -111,14 +115,28 @@ class OutputFolder(RunFolder):
                 f"{self.path}: holds a run that ended before its first checkpoint; "
                 "start it over with --resume, or use another --output"
             )
-        try:
+        with self._being_emptied():
             self.remove_temporaries()
             if any(self.path.iterdir()) and not self.config.exists():
                 raise OutputError(f"{self.path}: is not empty; use another --output")
+        self.clear()
+
+    def clear(self) -> None:
+        """Removes what a run has written, but for the configuration, which marks the folder as a run's.
+
+        Raises:
+            OutputError: it can't be removed.
+        """
+        with self._being_emptied():
+            self.remove_temporaries()
             for earlier in self.files():
-                # config.yaml marks the folder as a run's; it is overwritten next.
                 if earlier != self.config:
                     earlier.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _being_emptied(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             raise OutputError(f"{self.path}: can't be emptied: {error.strerror or error}") from None
 

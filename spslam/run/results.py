@@ -2,7 +2,7 @@
 
 import json
 import resource
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,21 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.errors import DatasetError
 from spslam.evaluation.run_output import RunOutput
-from spslam.evaluation.trajectory_metrics import ate, rpe
 from spslam.evaluation.verdict import judge_run
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
+from spslam.run.figures import (
+    decoding_figures,
+    graph_figures,
+    noise_figures,
+    origin,
+    scene_figures,
+    timings,
+    tracking_figures,
+    truth_figures,
+)
 from spslam.run.mesh import EarlierFrames, MeshJob, noise_of_model, write_mesh
 from spslam.run.output_folder import OutputFolder
-from spslam.run.provenance import provenance
 from spslam.run.recordings import read_again, source_of
 from spslam.run.request import RunRequest
 from spslam.run.session import RunSession
@@ -99,26 +107,18 @@ def write_results(
     if lost.all():
         raise DatasetError(_not_found(source.name, request.map) if request.map else _nothing_known(source.name, config))
     trajectory.save_tum(folder.trajectory)
-    segments = system.segments()
-    for number, segment in enumerate(segments, start=1):
-        segment.save_tum(folder.segment(number))
     system.state.scene.save(folder.map)
     written = Trajectory.load_tum(folder.trajectory)
     archive = _save_keyframes(system, source, request, folder)
     metrics = {
-        **provenance(config, system.device),
-        **({"command": request.command} if request.command else {}),
+        **origin(config, system.device, request.command),
         "data": session.identity,
         "frames": frames,
         **_speed(clock),
         **timings(log, clock),
         **(figures or {}),
-        "lost_frames": int(lost.sum()),
-        "unjoined_frames": sum(map(len, segments)),
-        "tracking_failures": int((lost[1:] & ~lost[:-1]).sum()) + int(lost[0]),
-        "recovered_frames": sum(line["recovered"] for line in log),
-        "relocalized_frames": sum(line["relocalized"] for line in log),
-        **max_error_probability(log),
+        **tracking_figures(trajectory, log),
+        **write_segments(folder, system.segments()),
         "skipped_frames": len(skipped),
         **_sizes(system),
     }
@@ -131,24 +131,44 @@ def write_results(
         missing = []
     if session.warnings or missing:
         metrics["warnings"] = [*session.warnings, *missing]
-    if source.poses is not None:
-        known = trajectory.mask_lost(source.poses)
-        metrics |= {**ate(trajectory.poses, known), **rpe(trajectory.poses, known)}
-    if "ate_rmse_cm" not in metrics:
-        metrics["unchecked"] = ["error", "depth scale", "mirrored images"]
-    noise = noise_of_model(system.state.noise.model)
-    metrics |= {"depth_noise_floor_m2": noise[0], "depth_noise_growth_m2": noise[1]}
+    noise = system.state.noise.model
+    metrics |= {**truth_figures(trajectory, source.poses), **noise_figures(noise)}
     if request.mesh:
         # The trajectory is the file's, so that `spslam mesh` makes the same one.
-        job = MeshJob(system.state.scene, written, system.camera, config.mesh, noise, earlier)
+        job = MeshJob(system.state.scene, written, system.camera, config.mesh, noise_of_model(noise), earlier)
         metrics |= write_mesh(folder.mesh, job, source.dataset)[1]
-    run = RunOutput(folder, trajectory, source.poses, metrics, log, "", system.camera)
-    metrics["verdict"] = judge_run(run, config).level
-    atomic_write(folder.metrics, json.dumps(metrics, indent=1) + "\n")
-    folder.write_previews(system.camera, source.previews, source.ground_truth)
-    folder.write_report()
+    finish_results(RunOutput(folder, trajectory, source.poses, metrics, log, "", system.camera), source, config)
     folder.checkpoint.unlink(missing_ok=True)
     return metrics
+
+
+def write_segments(folder: OutputFolder, segments: Sequence[Trajectory]) -> dict[str, int]:
+    """Writes the poses of frames that are known among themselves only; returns the figure for metrics.json.
+
+    Args:
+        folder: of the run.
+        segments: of frames that are lost in the run's trajectory, each in axes of its own.
+    """
+    for number, segment in enumerate(segments, start=1):
+        segment.save_tum(folder.segment(number))
+    return {"unjoined_frames": sum(map(len, segments))}
+
+
+def finish_results(run: RunOutput, source: RunInput, config: Config) -> None:
+    """Writes what comes last, from all other results: metrics.json with the verdict, previews, and the report.
+
+    Args:
+        run: the results; the verdict is added to its metrics.
+        source: what is known of the input.
+        config: of the run.
+    """
+    folder, camera = OutputFolder(run.folder.path), run.camera
+    if camera is None:
+        raise ValueError("finish_results: run must have a camera")
+    run.metrics["verdict"] = judge_run(run, config).level
+    atomic_write(folder.metrics, json.dumps(run.metrics, indent=1) + "\n")
+    folder.write_previews(camera, source.previews, source.ground_truth)
+    folder.write_report()
 
 
 def _save_keyframes(
@@ -182,71 +202,23 @@ def _nothing_known(name: str, config: Config) -> str:
     )
 
 
-def max_error_probability(log: list[dict[str, Any]]) -> dict[str, float]:
-    """The highest error probability of the accepted poses; empty where none was judged."""
-    error_probabilities = [
-        line["error_probability"] for line in log if not line["lost"] and line["error_probability"] is not None
-    ]
-    return {"max_error_probability": max(error_probabilities)} if error_probabilities else {}
-
-
 def _speed(clock: RunClock) -> dict[str, float]:
     return {
         "start_s": clock.start_s,
         "wall_s": clock.wall_s,
         "fps": clock.frames / clock.wall_s if clock.wall_s else 0.0,
-        "decode_ms": 1e3 * clock.decode_s / max(clock.frames, 1),
+        **decoding_figures(clock),
     }
 
 
 def _sizes(system: SlamSystem) -> dict[str, float]:
-    scene = system.state.scene
     sizes = {
-        "voxels": scene.volume.num_voxels,
-        "model_mb": scene.nbytes / 2**20,
+        **scene_figures(system.state.scene),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
     graph = system.state.graph
     if graph is not None:
-        kinds = [edge.kind for edge in graph.content.edges]
-        sizes |= {"keyframes": len(graph.keyframes), "graph_edges": len(kinds), "closed_loops": kinds.count("loop")}
+        sizes |= graph_figures(len(graph.keyframes), graph.content.edges)
     if system.device.type == "cuda":
         sizes["peak_gpu_mb"] = torch.cuda.max_memory_allocated(system.device) / 2**20
     return sizes
-
-
-def timings(log: list[dict[str, Any]], clock: RunClock) -> dict[str, float]:
-    """Timings of metrics.json from the log: the stages' share of the loop, and time per iteration.
-
-    Args:
-        log: the lines of log.jsonl.
-        clock: of the run.
-    """
-    tracked = [line for line in log if line["tracking_iterations"]]
-    mapped = [line for line in log if line["mapping_iterations"]]
-    later = mapped[1:]
-    figures = _stage_times(log, clock)
-    if tracked:
-        seconds = sum(line["tracking_ms"] for line in tracked) / 1e3
-        iterations = sum(line["tracking_iterations"] for line in tracked)
-        figures["tracking_ms_per_iteration"] = 1e3 * seconds / iterations
-        figures["tracking_iterations"] = tracked[-1]["tracking_iterations"]
-        figures["tracking_fps"] = len(tracked) / seconds
-    if mapped:
-        figures["first_mapping_s"] = mapped[0]["mapping_ms"] / 1e3
-    if later:
-        total = sum(line["mapping_iterations"] for line in later)
-        figures["mapping_ms_per_iteration"] = sum(line["mapping_ms"] for line in later) / total
-        figures["mapping_iterations"] = later[-1]["mapping_iterations"]
-    return figures
-
-
-def _stage_times(log: list[dict[str, Any]], clock: RunClock) -> dict[str, float]:
-    """Mean ms/frame of each stage. Waiting, the stages and `other_ms` add up to the loop's time; uploads overlap."""
-    frames = max(clock.frames, 1)
-    figures = {
-        name: sum(line[name] for line in log) / frames
-        for name in ("upload_ms", "wait_ms", "tracking_ms", "encode_ms", "mapping_ms")
-    }
-    spent_ms = sum(figures.values()) - figures["upload_ms"]
-    return {**figures, "other_ms": max(1e3 * clock.wall_s / frames - spent_ms, 0.0)}

@@ -75,7 +75,7 @@ def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any
         OutputError: the folder holds a finished run of other options, data or frames.
     """
     folder = OutputFolder(Path(request.output_dir))
-    if not request.resume or folder.checkpoint.exists() or not folder.metrics.exists():
+    if not request.resume or not folder.is_finished:
         return None
     try:
         metrics = json.loads(folder.metrics.read_text(encoding="utf-8"))

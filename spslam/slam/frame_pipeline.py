@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -21,13 +22,13 @@ from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
 from spslam.slam.image_features import extract_features
 from spslam.slam.mapper import Mapper, MappingTask
+from spslam.slam.multi_map import MultiMap
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import pose_tensor
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.recovery import Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
-from spslam.slam.segments import Segments, segment_config
 from spslam.slam.state import SlamState
 from spslam.slam.tracker import Tracker, TrackingProblem
 from spslam.slam.upload import Upload
@@ -84,7 +85,6 @@ class FramePipeline:
         self.first_pose = np.eye(4)
         self._prior = prior
         self.global_mapping: GlobalMapping | None = None
-        self._segments: Segments | None = None
         self.reset(first_pose)
 
     def reset(self, first_pose: np.ndarray | None = None) -> None:
@@ -107,12 +107,11 @@ class FramePipeline:
         self.history = FrameHistory(self.state)
         self.constraints = ConstraintSource(self.config, self.camera)
         self.close()
-        self.global_mapping = self._segments = None
+        self.global_mapping = None
         if self.state.graph is not None:
             self.global_mapping = GlobalMapping(self.config, self._prior, self.state, self.state.graph)
-            after_s = self.config.graph.new_map_after_s
-            if after_s is not None:
-                self._segments = Segments(after_s, self.state, self.global_mapping, self._segment_system)
+        alike = functools.partial(FramePipeline, camera=self.camera, device=self.device)
+        self._other_maps = MultiMap(self.config, self.state, self.global_mapping, self.tracker, self.recovery, alike)
         self._task: MappingTask | None = None
         self.mapping_loss: torch.Tensor | None = None
 
@@ -120,8 +119,7 @@ class FramePipeline:
         """Ends the threads; no frame can follow, unless after `reset`."""
         if self.global_mapping is not None:
             self.global_mapping.close()
-        if self._segments is not None:
-            self._segments.close()
+            self._other_maps.close()
 
     def submit(
         self, frame: PreparedFrame, on_pose: PoseCallback | None = None, defer_mapping: bool = False
@@ -151,7 +149,7 @@ class FramePipeline:
         if begins_map:
             self._tell(on_pose)
         self._keep_features(frame, pixels, tracked, number)
-        self._follow_segment(frame, pixels)
+        self._follow_other_maps(frame, pixels)
         is_keyframe = not tracked.occluded and not self.state.frames.lost[-1] and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
             self.global_mapping.after_frame(number, pixels, tracked.matrix())
@@ -190,8 +188,7 @@ class FramePipeline:
     def finish(self) -> None:
         """Optimizes once more if frames came after the last mapping call. Call it after the last frame."""
         self.optimize_map()
-        if self._segments is not None:
-            self._segments.end()
+        self._other_maps.end()
         if self.state.frames.is_anywhere:
             return
         iterations = self.config.mapping.iterations if self.state.unmapped else 0
@@ -239,21 +236,11 @@ class FramePipeline:
         decisions = self.global_mapping.before_frame(number)
         return tuple(replace(each, source=each.source - opened, target=each.target - opened) for each in decisions)
 
-    def _follow_segment(self, frame: PreparedFrame, pixels: FramePixels) -> None:
-        """While the camera is lost, and until it is known how what it saw then is joined with the map."""
-        if self._segments is None:
-            return
-        place = self._segments.after_frame(frame, pixels, not self._has_too_little_depth(pixels))
+    def _follow_other_maps(self, frame: PreparedFrame, pixels: FramePixels) -> None:
+        place = self._other_maps.after_frame(frame, pixels, not self._has_too_little_depth(pixels))
         if place is not None:
             self.optimize_map()
-            self._segments.join(place)
-
-    def _segment_system(self, state: SlamState | None) -> FramePipeline:
-        """A system for what a lost camera sees, that of a state if one is given."""
-        system = FramePipeline(segment_config(self.config), self.camera, None, self.device)
-        if state is not None:
-            system.adopt(state)
-        return system
+            self._other_maps.join(place)
 
     def _take_up_ready(self, number: int) -> tuple[LoopDecision, ...]:
         """`_update_globally` of a live run, after a frame: waits for nothing."""
@@ -277,26 +264,13 @@ class FramePipeline:
             return TrackedFrame.untracked(first, lost=self._has_too_little_depth(pixels))
         begin = self._record()
         if self.state.frames.is_anywhere:
-            tracked = self._enter(pixels, number)
+            has_depth = not self._has_too_little_depth(pixels)
+            tracked = self._other_maps.find_camera(pixels, number, self.history.noise, has_depth)
         else:
             predicted = self.tracker.predict(self.state.frames)
             tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints)
         events.tracking = (begin, self._record())
         return tracked
-
-    def _enter(self, pixels: FramePixels, number: int) -> TrackedFrame:
-        """The pose of a frame in the map that was opened, in which none was found yet."""
-        nowhere = TrackedFrame.untracked(self.state.frames.poses[-1].clone(), lost=True)
-        if self.global_mapping is None or self._has_too_little_depth(pixels):
-            return nowhere
-        found = self.global_mapping.find(number, pixels)
-        if found is None:
-            return nowhere
-        start = pose_tensor(found, self.device)
-        problem = TrackingProblem(self.state.scene, pixels.records, start, number, Constraints(self.history.noise))
-        tracked = self.recovery.judge(self.tracker.track_from(problem, start))
-        is_sure = tracked.error_probability <= self.config.tracking.relocalization_threshold and not tracked.lost
-        return replace(tracked, relocalized=True) if is_sure else replace(nowhere, fit=tracked.fit)
 
     def _store(
         self, frame: PreparedFrame, pixels: FramePixels, constraints: Constraints, tracked: TrackedFrame

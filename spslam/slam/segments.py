@@ -38,6 +38,9 @@ class SegmentSystem(Protocol):
     def submit(self, frame: PreparedFrame) -> Any:
         """Tracks and maps the next frame."""
 
+    def adopt(self, state: SlamState) -> None:
+        """Goes on from a state of the same options and camera."""
+
     def close(self) -> None:
         """Ends its threads."""
 

@@ -102,11 +102,12 @@ class SlamSystem(FramePipeline):
         Each is of a map that was begun while the camera was lost, and has its first frame's axes. One that is joined
         with the map later is part of `trajectory()` instead.
         """
-        times = self.state.frames.timestamps.numpy()
-        return [
-            Trajectory(times[each.rows.numpy()], pose7_to_matrix(each.poses.double().numpy()))
-            for each in self.state.unjoined
-        ]
+        frames, found = self.state.frames, []
+        for each in self.state.unjoined:
+            kept = frames.lost[each.rows]
+            times, poses = frames.timestamps[each.rows][kept].numpy(), each.poses[kept].double().numpy()
+            found.append(Trajectory(times, pose7_to_matrix(poses)))
+        return [each for each in found if len(each)]
 
     def mesh(self, resolution_m: float | None = None) -> TriangleMesh:
         """The colored mesh of the map as it is now; frames can follow.

@@ -6,40 +6,68 @@ import os
 import queue
 import threading
 import time
+from collections.abc import Callable, Sequence
 from types import TracebackType
 
 import torch
 
 from spslam.tasks.child import Child, environment
+from spslam.tasks.machine import core_count, free_memory_mb
 from spslam.tasks.task import Task, TaskCall, TaskEnd
 
 
 class LocalExecutor:
     """Runs tasks in processes of this machine.
 
-    Memory is not divided: what `Needs.memory_mb` says counts on a cluster only.
-
     Args:
-        workers: how many run at a time; None for one per GPU where they are used, else one.
-        threads: kernel threads of each; None for an equal share of the processors.
+        workers: how many run at a time; None for one per GPU where they are used, else one per `threads` or `cores`
+            cores. Fewer run where there are fewer tasks, or not enough memory for as many.
+        threads: kernel threads of each; None for an equal share of the cores.
         use_gpus: whether tasks need GPUs.
+        cores: of a task without GPU where `threads` is None; None for all of the machine, whatever `threads` is.
+        notify: is told, in one line, why fewer run at a time.
     """
 
-    def __init__(self, workers: int | None = None, threads: int | None = None, use_gpus: bool = False):
+    def __init__(
+        self,
+        workers: int | None = None,
+        threads: int | None = None,
+        use_gpus: bool = False,
+        cores: int | None = None,
+        notify: Callable[[str], None] = lambda _: None,
+    ):
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         self._gpus = visible.split(",") if visible else [str(index) for index in range(torch.cuda.device_count())]
-        self.slots: int = workers or (max(len(self._gpus), 1) if use_gpus else 1)
-        self._threads = threads
-        self._free = list(range(self.slots))
+        if use_gpus:
+            most = max(len(self._gpus), 1)
+        else:
+            most = 1 if cores is None else max(core_count() // (threads or cores), 1)
+        self._asked, self._most, self._threads, self._notify = workers, workers or most, threads, notify
         self._ends: queue.Queue[tuple[int, TaskEnd]] = queue.Queue()
         self._running: dict[str, tuple[Child, threading.Thread]] = {}
         self._lock = threading.Lock()
+        self._set_slots(self._most)
+
+    def prepare(self, tasks: Sequence[Task]) -> None:
+        """Runs as many at a time as there is memory for, by what they need; none may be running."""
+        wanted = min(self._most, len(tasks))
+        needed, free = max(task.needs.memory_mb for task in tasks), free_memory_mb()
+        room = wanted if free is None or not needed else free // needed
+        self._set_slots(max(min(wanted, room), 1))
+        if room < wanted:
+            few = f"{room} run at a time instead of {wanted}" if room else "one runs at a time and may not have enough"
+            self._notify(
+                f"{few}: each is given {needed} MB of memory, and {free} MB are free; docs/cluster.md says what a run "
+                "takes, and what makes it less"
+            )
+        elif self._asked is not None and wanted < self._asked:
+            self._notify(f"{wanted} run at a time instead of {self._asked}: there are no more")
 
     def start(self, task: Task) -> None:
         """Begins a task; there must be a slot left."""
         slot = self._free.pop(0)
         gpu = {"CUDA_VISIBLE_DEVICES": self._gpus[slot % len(self._gpus)]} if task.needs.gpus and self._gpus else {}
-        threads = self._threads or max(1, (os.cpu_count() or 1) // self.slots)
+        threads = self._threads or max(1, core_count() // self.slots)
         call = TaskCall(task.function, task.arguments, task.output, threads, self.slots)
         child = Child(call, environment(gpu))
         watcher = threading.Thread(target=self._watch, args=(slot, task.key, child), daemon=True)
@@ -65,6 +93,10 @@ class LocalExecutor:
             child.kill()
         for _, watcher in running:
             watcher.join()
+
+    def _set_slots(self, count: int) -> None:
+        self.slots: int = count
+        self._free = list(range(count))
 
     def _watch(self, slot: int, key: str, child: Child) -> None:
         started = time.monotonic()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -78,6 +78,9 @@ class RayExecutor:
     def has_gpus(self) -> bool:
         """Whether a node has a GPU."""
         return any(node.get("GPU", 0) >= 1 for node in self._nodes())
+
+    def prepare(self, tasks: Sequence[Task]) -> None:
+        """Nothing is to be prepared: nodes, also those that come later, take what they have room for."""
 
     def start(self, task: Task) -> None:
         """Queues a task."""

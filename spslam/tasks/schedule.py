@@ -34,6 +34,8 @@ def run_tasks(tasks: Iterable[Task], executor: Executor, log: Path) -> Generator
     waiting = deque(tasks)
     running: dict[str, Task] = {}
     attempts: Counter[str] = Counter()
+    if waiting:
+        executor.prepare(tuple(waiting))
     while waiting or running:
         while waiting and (executor.slots is None or len(running) < executor.slots):
             task = waiting.popleft()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -93,11 +93,14 @@ class Executor(Protocol):
     """Runs tasks. Used as a context; leaving it ends all tasks that are still running.
 
     Attributes:
-        slots: how many tasks are started at a time; None for all.
+        slots: how many tasks are started at a time, once it is prepared; None for all.
     """
 
     @property
     def slots(self) -> int | None: ...
+
+    def prepare(self, tasks: Sequence[Task]) -> None:
+        """Is told of all tasks, of which there is at least one, before the first is started."""
 
     def start(self, task: Task) -> None:
         """Begins a task, or puts it into a queue; returns at once."""

@@ -1,12 +1,16 @@
 """What a lost camera sees is mapped on its own, and joined with the map when the camera is known there again."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.generated import GeneratedDataset
+from spslam.slam.state import UnjoinedFrames
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import run_on, settings
@@ -22,10 +26,10 @@ POSES = GeneratedDataset(300, 160, 120).poses()
 class Frames(RgbdDataset):
     """The generated room's frames in the order of the test, -1 black, at 30 Hz."""
 
-    name = "lost"
+    name, order = "lost", ORDER
 
-    def __init__(self, count=COUNT):
-        self._room, self._count = GeneratedDataset(300, 160, 120), count
+    def __init__(self, count=None):
+        self._room, self._count = GeneratedDataset(300, 160, 120), count or len(self.order)
         self.camera = self._room.camera
 
     def __len__(self):
@@ -37,9 +41,13 @@ class Frames(RgbdDataset):
     def poses(self):
         return None
 
+    def truth(self):
+        """float64 [F, 4, 4] where the camera was, black frames where the first one was."""
+        return POSES[np.maximum(self.order, 0)]
+
     def read(self, index):
-        frame = self._room[max(ORDER[index], 0)]
-        if ORDER[index] < 0:
+        frame = self._room[max(self.order[index], 0)]
+        if self.order[index] < 0:
             frame.color[:], frame.depth[:] = 0, 0
         return replace(frame, index=index, timestamp=index / 30)
 
@@ -90,6 +98,16 @@ def test_resumed_within_a_segment_it_gives_the_same_bytes(frames, joined, tmp_pa
     assert one.embeddings.equal(other.embeddings)
 
 
+def test_frames_that_both_maps_know_are_in_one_file_only(joined, monkeypatch):
+    rows = torch.arange(KNOWN - 2, KNOWN + 2)  # the first two are known in the map
+    poses = torch.arange(28.0).reshape(4, 7)
+    unjoined = [UnjoinedFrames(rows, poses), UnjoinedFrames(rows[:2], poses[:2])]
+    monkeypatch.setattr(joined.state, "unjoined", unjoined)
+    (segment,) = joined.segments()
+    np.testing.assert_array_equal(segment.timestamps, joined.trajectory().timestamps[KNOWN : KNOWN + 2])
+    np.testing.assert_array_equal(segment.poses[:, :3, 3], poses[2:, 4:])
+
+
 def test_a_place_that_is_never_joined_is_kept_apart(frames):
     system = SlamSystem(settings(*CONFIG), frames.camera, POSES[0])
     voxels = 0
@@ -103,6 +121,19 @@ def test_a_place_that_is_never_joined_is_kept_apart(frames):
     truth = POSES[np.array(ORDER)[KNOWN + BLACK : KNOWN + BLACK + 5]]
     assert len(segment) == 5
     np.testing.assert_allclose(segment.poses, np.linalg.inv(truth[0]) @ truth, atol=0.01)
+
+
+def test_memory_of_a_system_goes_with_it(frames):
+    """Without the garbage collector: a segment's map would else stay until that runs."""
+    system = SlamSystem(settings(*CONFIG), frames.camera, POSES[0])
+    system.close()
+    state = weakref.ref(system.state)
+    gc.disable()
+    try:
+        del system
+        assert state() is None
+    finally:
+        gc.enable()
 
 
 def test_without_the_option_none_begins(frames):

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 
 import pytest
 
@@ -18,7 +17,7 @@ from spslam.tasks.task import Needs, Task
 from tests.benchmark.examples import tiny_job
 from tests.cli.command import ROOT
 from tests.system.test_maps import SETTINGS
-from tests.tasks.examples import InThisProcess, task
+from tests.tasks.examples import InThisProcess, task, wait_for
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'spslam[cluster]'")
 
@@ -56,13 +55,6 @@ def executor(cluster, **options):
 
 def untimed(record):
     return {name: value for name, value in record["figures"].items() if not name.endswith(TIMED)}
-
-
-def wait_for(condition, most_s=120):
-    started = time.monotonic()
-    while not condition():
-        assert time.monotonic() - started < most_s
-        time.sleep(0.05)
 
 
 def test_a_suite_has_the_figures_of_one_machine(cluster, tmp_path):
@@ -193,9 +185,9 @@ def test_what_no_node_has_is_told(cluster, tmp_path, monkeypatch):
 def test_leaving_the_executor_ends_its_tasks(cluster, tmp_path):
     with executor(cluster) as on_cluster:
         on_cluster.start(task(tmp_path, "long", seconds=600))
-        wait_for(lambda: any(children(pid) for pid in worker_processes()))
+        wait_for(lambda: any(children(pid) for pid in worker_processes()), "the begin of the task")
         running = [child for pid in worker_processes() for child in children(pid)]
-    wait_for(lambda: not any("spslam.cli.task" in command_line(pid) for pid in running))
+    wait_for(lambda: not any("spslam.cli.task" in command_line(pid) for pid in running), "the end of the task")
 
 
 @pytest.mark.parametrize(

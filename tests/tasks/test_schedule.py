@@ -14,6 +14,9 @@ class Scripted(contextlib.AbstractContextManager):
     def __init__(self, slots=None, **errors):
         self.slots, self.errors, self.started, self.most = slots, errors, [], 0
 
+    def prepare(self, tasks):
+        self.prepared = [task.key for task in tasks]
+
     def start(self, task):
         self.started.append(task.key)
         self.most = max(self.most, len(self.started))
@@ -58,6 +61,13 @@ def test_no_more_than_the_slots_are_started(tmp_path):
     run(tmp_path, limited, *"abcde")
     run(tmp_path, unlimited, *"abcde")
     assert (limited.most, unlimited.most) == (2, 5)
+
+
+def test_an_executor_is_told_of_all_tasks_before_the_first(tmp_path):
+    executor = Scripted(1)
+    run(tmp_path, executor, *"abc")
+    assert executor.prepared == ["a", "b", "c"]
+    assert list(run_tasks([], None, tmp_path / "log")) == []
 
 
 def test_a_line_that_a_killed_scheduler_left_is_not_read(tmp_path):

@@ -277,9 +277,7 @@ class GlobalMapping:
         return self._remade(target)() if running is None else running.result()
 
     def _registrar(self, noise: dict[KeyframeCamera, torch.Tensor]) -> Registrar:
-        tracking = self._config.tracking
-        device = self._state.scene.device
-        return Registrar(noise, self._config.seed, tracking.color, tracking.features, device, self._pool)
+        return Registrar.of_config(self._config, noise, self._state.scene.device, self._pool)
 
     def _solution(self, poses: np.ndarray) -> Callable[[], tuple[GraphContent, GraphUpdate]]:
         """What solves the graph of the first K keyframes from their poses float64 [K, 4, 4], on any thread."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from spslam.config import Config
 from spslam.geometry import compose, inverse
 from spslam.slam.graph.archive import KeyframeArchive, Recording, same_length
 from spslam.slam.graph.edges import GraphEdge, Link
@@ -39,6 +40,11 @@ def join_archives(first: KeyframeArchive, second: KeyframeArchive, registrar: Re
         return f"what brings them together {refused}"
     recordings = moved_recordings(joined, poses)
     return replace(joined, recordings=recordings, edges=content.edges, tried=content.tried)
+
+
+def registrar_of(first: KeyframeArchive, second: KeyframeArchive, config: Config) -> Registrar:
+    """A registrar of the keyframes of two maps; a sensor that both know has the noise that the first one measured."""
+    return Registrar.of_config(config, {**second.noise, **first.noise})
 
 
 def moved_recordings(archive: KeyframeArchive, poses: np.ndarray) -> list[Recording]:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from spslam import ops
+from spslam.config import Config
 from spslam.geometry import pose7_to_matrix
 from spslam.slam.graph.keyframe import Keyframe, KeyframeCamera
 from spslam.slam.recovery.feature_alignment import FeatureAlignment
@@ -144,6 +145,17 @@ class Registrar:
         self._sampled = functools.lru_cache(CACHED)(self._sample)
         self._origin = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
         self._stream = torch.cuda.Stream(self._device) if self._device.type == "cuda" else None
+
+    @classmethod
+    def of_config(
+        cls,
+        config: Config,
+        noise: Mapping[KeyframeCamera, torch.Tensor],
+        device: torch.device | str = "cpu",
+        pool: ThreadPoolExecutor | None = None,
+    ) -> Registrar:
+        """As the options of a run say: its seed, and whether it uses brightness and image features."""
+        return cls(noise, config.seed, config.tracking.color, config.tracking.features, device, pool)
 
     def forget(self) -> None:
         """Gives back the memory of the pixels that it has drawn: dozens of MB."""
