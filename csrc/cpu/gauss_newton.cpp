@@ -100,7 +100,7 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, options.num_pixels, own_stats);
     join_keyframe_terms(terms, terms + kTrackingTerms, measure.num_keyframes, joint);
-    tracking_step(terms, joint, options.damping, pose, own_stats + 2, hessian);
+    tracking_step(terms, joint, options.damping, held_damping(measure, terms), pose, own_stats + 2, hessian);
   }
 }
 

@@ -33,7 +33,7 @@ void projective_icp<Cpu>(Cpu, const float* points, std::int64_t num_points, cons
     sum_terms<kTrackingTerms>(num_points, kPointGrain, partials, terms, add_points);
     float* own_stats = stats + kTrackingStatSize * iteration;
     tracking_fit(terms, num_points, own_stats);
-    tracking_step(terms, terms, options.damping, pose, own_stats + 2, hessian);
+    tracking_step(terms, terms, options.damping, 0.0, pose, own_stats + 2, hessian);
   }
 }
 

@@ -175,7 +175,7 @@ __global__ void __launch_bounds__(kThreads, 1)
     add_partials(shared_sums, gridDim.x, shares, terms);
     if (threadIdx.x == 0) {
       join_keyframe_terms(terms, terms + kPaddedTerms, measure.num_keyframes, joint);
-      tracking_step(terms, joint, options.damping, own_pose, own_stats + 2, own_hessian);
+      tracking_step(terms, joint, options.damping, held_damping(measure, terms), own_pose, own_stats + 2, own_hessian);
     }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
     __syncthreads();

@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(kThreads) icp_kernel(const float* points, std:
     }
     __syncthreads();
     float* own_stats = stats + kTrackingStatSize * iteration;
-    if (threadIdx.x == 0) tracking_step(terms, terms, options.damping, own_pose, own_stats + 2, own_hessian);
+    if (threadIdx.x == 0) tracking_step(terms, terms, options.damping, 0.0, own_pose, own_stats + 2, own_hessian);
     if (threadIdx.x == kWarp) tracking_fit(terms, num_points, own_stats);
     __syncthreads();
   }

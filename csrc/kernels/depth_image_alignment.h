@@ -49,7 +49,7 @@ SPS_INLINE void alignment_step(const double* keyframe_terms, double damping, flo
   double joint[kNormalTerms];
   float steps[2], hessian[36];
   join_keyframe_terms(map_terms, keyframe_terms, 1, joint);
-  tracking_step(map_terms, joint, damping, pose, steps, hessian);
+  tracking_step(map_terms, joint, damping, 0.0, pose, steps, hessian);
 }
 
 template <class T>

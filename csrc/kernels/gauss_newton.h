@@ -132,17 +132,24 @@ SPS_INLINE double tracking_cost(const double* terms) {
   return weights > 1e-6 ? terms[kNormalTerms - 1] / weights : 0.0;
 }
 
-// Solves the joint normal equations and moves the pose. `steps` gets |dt| (m) and |domega| (rad). `hessian` gets the
-// map's matrix as if pixels had on average their score weights and no certainties: it says how firmly the surface holds
-// the pose, whatever its distance and the width of the kernel.
-SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, float* pose, float* steps,
-                              float* hessian) {
+// What holds the directions of little information while the map alone moves the pose, as an absolute damping.
+SPS_INLINE double held_damping(const Measurement& measure, const double* terms) {
+  const GaussNewtonOptions& options = *measure.options;
+  const bool waits = measure.num_keyframes < options.depth_keyframes.count;
+  return waits ? options.held_information * terms[kNormalTerms + 2] : 0.0;
+}
+
+// Solves the joint normal equations, with `held` added to the diagonal, and moves the pose. `steps` gets |dt| (m) and
+// |domega| (rad). `hessian` gets the map's matrix as if pixels had on average their score weights and no certainties: it
+// says how firmly the surface holds the pose, whatever its distance and the width of the kernel.
+SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, double held, float* pose,
+                              float* steps, float* hessian) {
   double h[36], g[6], cost, delta[6];
   store_normal_terms<double>(joint, h, g, &cost);
   double trace = 0.0;
   for (int a = 0; a < 6; ++a) trace += h[a * 7];
   // The absolute part keeps directions that no pixel sees from moving.
-  solve_damped_6x6<double>(h, g, damping, 1e-6 * trace + 1e-8, 1e-12, delta);
+  solve_damped_6x6<double>(h, g, damping, 1e-6 * trace + 1e-8 + held, 1e-12, delta);
   float step[6], norm = 0.0f;
   for (int a = 0; a < 6; ++a) step[a] = static_cast<float>(delta[a]), norm += step[a] * step[a];
   norm = std::sqrt(norm);

@@ -79,6 +79,9 @@ class GaussNewtonOptions:
         seed, stream, frame: keys of the draws, see `philox_uniform`.
         score_kernel: width of the robust kernel that the statistics are computed with, m, so that they compare whatever
             kernel finds the pose; None takes the iteration's own.
+        held_information: in iterations before `depth_keyframes.first_iteration`, added to the diagonal of H for each
+            unit of its weights, 1/m^2: directions of less information per pixel hardly move while the map alone, with
+            its noise, would move the pose. 0 holds none.
         tf32: on CUDA devices from sm_80 on, let tensor cores multiply in the decoder, with factors rounded to 10 bits
             of mantissa: under 0.1 mm of SDF. Elsewhere, and without it, everything is float32.
     """
@@ -93,6 +96,7 @@ class GaussNewtonOptions:
     stream: int
     frame: int
     score_kernel: float | None = _scalar(None, above=0)
+    held_information: float = _scalar(0.0, at_least=0)
     tf32: bool = True
 
     def check(self, function: str) -> None:
@@ -133,8 +137,8 @@ def track_gauss_newton(
     """Tracks one frame against a frozen scene; all iterations in one call, on CUDA in one kernel that never stops for
     the host.
 
-    Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the
-    step to a norm of 0.15. Points outside the map, or where |s| >= 0.98, take no part, and neither do pixels without a
+    Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, before the depth
+    keyframes join with `options.held_information` in it, and limits the step to a norm of 0.15. Points outside the map, or where |s| >= 0.98, take no part, and neither do pixels without a
     positive, finite depth nor any from a pose that is not finite.
 
     Args:

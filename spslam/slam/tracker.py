@@ -17,6 +17,9 @@ from spslam.slam.state import FrameTable
 
 INDEPENDENT_PIXELS = 300  # as many a frame's pixels are worth: the map's errors are alike for neighbors
 LEAST_DEVIATION_M = 0.003  # of a pixel
+# A plain wall's map moves the camera along it by its own noise, by centimeters a frame, before the brightness of depth
+# keyframes has a say: directions of less information than this, per pixel and m^2, wait for them.
+HELD_INFORMATION = 0.01
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ class Tracker:
                 stream=ops.RandomStream.TRACKING_PIXELS,
                 frame=problem.frame,
                 score_kernel=self._score_kernel_m,
+                held_information=HELD_INFORMATION,
                 tf32=self.config.precision == "tf32",
             ),
             noise=problem.constraints.noise,

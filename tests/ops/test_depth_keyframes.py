@@ -206,6 +206,26 @@ def test_keyframes_join_at_their_first_iteration(device, generator):
     assert not torch.equal(track(keyframes)[0, 2:4], plain[0, 2:4])
 
 
+@pytest.mark.parametrize("held", [0.0, 0.01, 1.0])
+def test_until_keyframes_join_the_map_moves_little_where_it_says_little(device, generator, held):
+    """The held information comes onto the diagonal, times the sum of the map's weights; once they join, it is gone."""
+    scene = make_scene(generator, random_decoder=True, device=device)
+    records = corner_pixels(POSE, generator, 400)
+    residual, jacobian, weight, _ = surface_equations(scene, drawn_pixels(records), 0.03)
+    hessian, gradient = _sums(residual, jacobian, weight)
+    delta = _step(hessian + held * weight.sum() * torch.eye(6, dtype=torch.float64), gradient)
+    arguments = scene, records.to(device), pose7(POSE, device), INTRINSICS
+    options, keyframes = replace(ONE_STEP, tf32=False, held_information=held), _keyframes(EARLIER, device)
+    waiting = keyframes._replace(first_iteration=1)
+    _assert_moved_by(
+        ops.track_gauss_newton(*arguments, options, depth_keyframes=waiting)[0], delta, 2e-3 * float(delta.norm())
+    )
+    free = replace(options, held_information=0.0)
+    for others in (keyframes, None):
+        pose, plain = (ops.track_gauss_newton(*arguments, o, depth_keyframes=others)[0] for o in (options, free))
+        assert torch.equal(pose, plain)
+
+
 def test_what_no_keyframe_measured_moves_nothing(device, generator):
     """No depth, another direction, behind the camera, no keyframes, and images too small to lie between pixels."""
     records = corner_pixels(POSE, generator).to(device)

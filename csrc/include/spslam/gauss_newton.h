@@ -54,7 +54,8 @@ struct DepthKeyframes {
   FIELD(float, kernel_start) /* m, width of the robust kernel at the first iteration */ \
   FIELD(float, kernel_end)   /* m, at the last iterations */                            \
   FIELD(double, damping)     /* relative Levenberg damping */                           \
-  FIELD(float, score_kernel) /* m, of cost and mean weight; 0: the iteration's own */
+  FIELD(float, score_kernel) /* m, of cost and mean weight; 0: the iteration's own */   \
+  FIELD(double, held_information) /* per weight: directions of less move little before depth keyframes take part */
 #define SPS_DECLARE_FIELD(type, name) type name;
 
 struct GaussNewtonOptions {
