@@ -41,6 +41,11 @@ class FrameHistory:
         return bool(self._state.frames.lost[-1])
 
     @property
+    def knows_speed(self) -> bool:
+        """Whether the last two frames' poses are trusted."""
+        return self._state.frames.knows_speed
+
+    @property
     def consistent_frames(self) -> int:
         """How many of the last frames are lost, but have likely poses that are consistent with one another."""
         return int(self._state.frames.consistent_frames[-1])

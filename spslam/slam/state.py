@@ -95,6 +95,11 @@ class FrameTable:
         return self._count - self.opened
 
     @property
+    def knows_speed(self) -> bool:
+        """Whether the poses of the last two frames are trusted, so that the next one can be predicted from them."""
+        return self.processed >= 2 and not bool(self.lost[-2:].any())
+
+    @property
     def is_anywhere(self) -> bool:
         """Whether a map was opened in which no frame was found yet."""
         return self.opened > 0 and bool(self.lost[self.opened :].all())

@@ -78,7 +78,7 @@ class Tracker:
 
     def predict(self, frames: FrameTable) -> torch.Tensor:
         """The next pose at constant velocity, float32 [7]; the last pose after one frame only, or a lost one."""
-        if frames.processed < 2 or bool(frames.lost[-2:].any()):
+        if not frames.knows_speed:
             return frames.poses[-1].clone()
         return ops.predict_pose(frames.poses[-2], frames.poses[-1])
 

@@ -77,7 +77,7 @@ class Recovery:
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
         """
         tracked = self.judge(estimate)
-        if history.is_lost or self._is_doubtful(tracked):
+        if history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked):
             tracked = self._recover(problem, tracked, pixels, history)
         else:
             if self._may_have_slid(tracked):
@@ -100,6 +100,10 @@ class Recovery:
             lost=not (tracked.fit.inlier_share >= tracking.min_inlier_share and probability <= tracking.lost_threshold),
             occluded=self._confidence.is_occluded(tracked.fit),
         )
+
+    def _is_unpredicted(self, history: FrameHistory) -> bool:
+        """Whether nothing says how far the camera has moved: what slides from the last pose fits a young map as well."""
+        return self._config.tracking.recovery and not history.knows_speed
 
     def _is_doubtful(self, tracked: TrackedFrame) -> bool:
         tracking = self._config.tracking
