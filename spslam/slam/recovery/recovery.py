@@ -1,6 +1,7 @@
 """Decides whether a tracked pose is trusted, and looks for a better one where it is not."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -30,6 +31,8 @@ SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its 
 MIN_GAIN = 0.02  # of mean robust weight; smaller differences come from the random choice of pixels
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
 MAX_VERIFIED = 4  # poses of a frame
+MORE_AGREEING = 1.2  # times as many image features decide between poses that are trusted
+MIN_DECIDING = 60  # features
 
 
 class Recovery:
@@ -228,7 +231,8 @@ class Recovery:
             if not any(candidates[i].is_same(other) for other in distinct):
                 distinct.append(candidates[i])
         verified = [self._verify(frame, candidate) for candidate in distinct[:MAX_VERIFIED]]
-        return min(verified, key=lambda tracked: self._rank(tracked, anywhere))
+        found = min(verified, key=lambda tracked: self._rank(tracked, anywhere))
+        return found if anywhere else _by_features(found, verified)
 
     def _rank(self, tracked: TrackedFrame, anywhere: bool) -> float:
         fit = tracked.fit
@@ -276,3 +280,12 @@ class Recovery:
         if frames >= CONSISTENT_FRAMES:
             return replace(tracked, lost=False, consistent_frames=0)
         return replace(tracked, lost=True, consistent_frames=frames)
+
+
+def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame]) -> TrackedFrame:
+    """The likeliest result, or a trusted one that far more image features agree with: on a young map, or far away, one
+    that has slid along a wall fits as well."""
+    least = max(MORE_AGREEING * found.fit.feature_inliers, MIN_DECIDING)
+    agreeing = [other for other in others if not other.lost and other.fit.feature_inliers >= least]
+    known = [other for other in agreeing if not math.isnan(other.fit.feature_share)]
+    return max(known, key=lambda other: other.fit.feature_inliers, default=found)
