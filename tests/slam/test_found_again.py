@@ -1,5 +1,6 @@
 """When a lost camera counts as found: at once where there is next to no doubt, else after some frames that agree."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from spslam.slam.fit import Fit
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
-from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery
+from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery, _by_features
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import Tracker
 from tests.system.sequences import Recorded, settings
@@ -60,3 +61,27 @@ def test_an_unlikely_pose_ends_the_row(recovery):
     result = found_again(recovery, UNLIKELY, CONSISTENT_FRAMES + 1)
     assert result.error_probability > 0.1
     assert (result.lost, result.consistent_frames) == (True, 0)
+
+
+def with_features(found, inliers, share=1.0, lost=False):
+    fit = replace(CERTAIN, feature_inliers=inliers, feature_share=share)
+    return TrackedFrame(torch.zeros(7), 8, fit, error_probability=found, lost=lost)
+
+
+@pytest.mark.parametrize(
+    ("other", "decides"),
+    [
+        (with_features(0.1, 130), True),
+        (with_features(0.1, 110), False),  # next to as many agree with both
+        (with_features(0.1, 130, share=math.nan), False),  # colors are not where depth is
+        (with_features(0.9, 130, lost=True), False),
+    ],
+)
+def test_far_more_image_features_decide_between_trusted_poses(other, decides):
+    likeliest = with_features(0.05, 100)
+    assert _by_features(likeliest, [likeliest, other]) is (other if decides else likeliest)
+
+
+def test_few_image_features_decide_nothing():
+    likeliest, other = with_features(0.05, 20), with_features(0.1, 50)
+    assert _by_features(likeliest, [likeliest, other]) is likeliest
