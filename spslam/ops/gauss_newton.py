@@ -137,9 +137,10 @@ def track_gauss_newton(
     """Tracks one frame against a frozen scene; all iterations in one call, on CUDA in one kernel that never stops for
     the host.
 
-    Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, before the depth
-    keyframes join with `options.held_information` in it, and limits the step to a norm of 0.15. Points outside the map, or where |s| >= 0.98, take no part, and neither do pixels without a
-    positive, finite depth nor any from a pose that is not finite.
+    Each iteration draws pixels anew, solves (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, until the depth
+    keyframes join with `options.held_information` on the diagonal too, and limits the step to a norm of 0.15. Points
+    outside the map, or where |s| >= 0.98, take no part, and neither do pixels without a positive, finite depth nor any
+    from a pose that is not finite.
 
     Args:
         scene: the map.

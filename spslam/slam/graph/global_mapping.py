@@ -29,7 +29,7 @@ from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.graph.edges import Link, LoopDecision
 from spslam.slam.graph.host_threads import host_threads
 from spslam.slam.graph.joining import Component, find_frame
-from spslam.slam.graph.keyframe import NEAR_SHARE, Keyframe, KeyframeCamera
+from spslam.slam.graph.keyframe import NEAR_SHARE, ArrivingKeyframe, Keyframe, KeyframeCamera
 from spslam.slam.graph.keyframe_graph import GraphContent, GraphUpdate, KeyframeGraph
 from spslam.slam.graph.keyframe_store import KeyframeStore
 from spslam.slam.graph.overlap import Surfaces
@@ -72,8 +72,8 @@ class GlobalMapping:
         self._worker.submit(importlib.import_module, "scipy.sparse.linalg")
         self._running: Future[Any] | None = None  # None also after the state was loaded
         self._abandoned = threading.Event()  # of the map that is being made again
-        self._reference: tuple[Keyframe, np.ndarray] | None = None  # the newest keyframe and its pose
-        self._coming: tuple[Keyframe, torch.Tensor, DeviceEvent] | None = None  # the same on its way to the host
+        self._reference: tuple[int, np.ndarray] | None = None  # the newest keyframe's number and pose
+        self._coming: tuple[int, torch.Tensor, DeviceEvent] | None = None  # the same on its way to the host
         self._next = 0  # number of the frame at which a live run may begin another solution
         self._taken_up = 0  # number of the frame after which it took up something last
         self._gives_way = False
@@ -132,9 +132,9 @@ class GlobalMapping:
 
     def before_tracking(self) -> None:
         """Sends the newest keyframe's pose to the host, for `after_frame`: tracking waits for the device anyway."""
-        if self._store.keyframes and not self._knows_last_pose():
-            newest = self._store.keyframes[-1]
-            pose = fetch(self._state.frames.poses[newest.frame])
+        newest = self._store.newest
+        if newest is not None and not self._knows_last_pose():
+            pose = fetch(self._state.frames.poses[newest])
             self._coming = newest, pose, event_recorder(self._state.scene.device)()
 
     def after_frame(self, number: int, pixels: FramePixels, pose: np.ndarray) -> None:
@@ -145,15 +145,15 @@ class GlobalMapping:
             pixels: of the frame.
             pose: float64 [4, 4] T_world_camera of the frame.
         """
-        state, store = self._state, self._store
-        if not store.keyframes:
-            store.add(Keyframe.of(number, pixels, store.camera), Link(np.eye(4), False))
+        state, store, last = self._state, self._store, self._store.newest
+        if last is None:
+            store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(np.eye(4), False))
             return
-        last, moved = store.keyframes[-1].frame, inverse(self._last_pose()) @ pose
+        moved = inverse(self._last_pose(last)) @ pose
         if self._is_far(moved):
             relocalized = bool(state.frames.lost[last:number].any()) or last < state.frames.opened
-            store.add(Keyframe.of(number, pixels, store.camera), Link(moved, relocalized))
-            self._reference = store.keyframes[-1], pose
+            store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(moved, relocalized))
+            self._reference = number, pose
 
     def newest_pose(self) -> np.ndarray:
         """float64 [4, 4] T_world_camera of the newest keyframe; identity where there is none."""
@@ -229,18 +229,17 @@ class GlobalMapping:
 
     def _knows_last_pose(self) -> bool:
         """Whether the newest keyframe's pose is as it was last read; mapping may have moved it."""
-        is_read = self._reference is not None and self._reference[0] is self._store.keyframes[-1]
+        is_read = self._reference is not None and self._reference[0] == self._store.newest
         return is_read and self._config.mapping.pose_rate == 0
 
-    def _last_pose(self) -> np.ndarray:
-        """float64 [4, 4] T_world_camera of the newest keyframe."""
-        newest = self._store.keyframes[-1]
+    def _last_pose(self, newest: int) -> np.ndarray:
+        """float64 [4, 4] T_world_camera of the newest keyframe, that of frame `newest`."""
         if self._reference is None or not self._knows_last_pose():
-            if self._coming is not None and self._coming[0] is newest:
+            if self._coming is not None and self._coming[0] == newest:
                 _, pose, sent = self._coming
                 sent.wait()
             else:
-                pose = self._state.frames.poses[newest.frame].cpu()
+                pose = self._state.frames.poses[newest].cpu()
             self._reference = newest, pose7_to_matrix(pose.double().numpy())
         return self._reference[1]
 

@@ -12,6 +12,7 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
+from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.image_features import ImageFeatures, features_of_images
 from spslam.slam.pixels import FramePixels
 
@@ -92,12 +93,7 @@ class Keyframe:
     @classmethod
     def of(cls, frame: int, pixels: FramePixels, camera: KeyframeCamera) -> Keyframe:
         """That of a frame's pixels, on any device, which it waits for once."""
-        images = pixels.depth_image, pixels.intensity_image
-        depth, intensity = (image[:: camera.step, :: camera.step].contiguous() for image in images)
-        split = 2 * depth.numel()
-        content = torch.cat([depth.flatten().view(torch.uint8), intensity.flatten()]).cpu()
-        shape = tuple(depth.shape)
-        return cls(frame, content[:split].view(torch.uint16).view(shape), content[split:].view(shape), camera)
+        return ArrivingKeyframe.of(frame, pixels, camera).arrived()
 
     def changed(self, **changes: Any) -> Keyframe:
         """The same image under another number or in other memory; features that were found are kept."""
@@ -131,7 +127,8 @@ class Keyframe:
     def thumbnail(self) -> torch.Tensor:
         """float32 [h', w'] depth, m, 0 where unknown: every `thumbnail_step`-th pixel, the first at half of it."""
         step = self.camera.thumbnail_step
-        return self.depth_m[step // 2 :: step, step // 2 :: step]
+        depth = self.depth[step // 2 :: step, step // 2 :: step]
+        return depth.to(torch.int32).float() * self.camera.unit
 
     def sample(self, count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Random pixels: packed records int32 [P, 3] in the keyframe's pixels and normals float32 [P, 3], 0 unknown.
@@ -155,3 +152,40 @@ class Keyframe:
         found = count if valid else 0
         records, normals = (buffer[3 * count * i :][: 3 * found].view(-1, 3) for i in range(2))
         return records, normals.view(torch.float32)
+
+
+@dataclass(frozen=True)
+class ArrivingKeyframe:
+    """A keyframe whose images are on their way to the host.
+
+    Attributes:
+        frame: its number.
+        content: uint8 of both images, depth first.
+        sent: once it is complete, the content is there.
+        camera: of the images.
+    """
+
+    frame: int
+    content: torch.Tensor
+    sent: DeviceEvent
+    camera: KeyframeCamera
+
+    @classmethod
+    def of(cls, frame: int, pixels: FramePixels, camera: KeyframeCamera) -> ArrivingKeyframe:
+        """That of a frame's pixels, on any device, which it does not wait for."""
+        images = pixels.depth_image, pixels.intensity_image
+        depth, intensity = (image[:: camera.step, :: camera.step].flatten() for image in images)
+        content = fetch(torch.cat([depth.view(torch.uint8), intensity]))
+        return cls(frame, content, event_recorder(depth.device)(), camera)
+
+    def arrived(self) -> Keyframe:
+        """The keyframe; waits until it is there."""
+        self.sent.wait()
+        k = self.camera.camera
+        depth, intensity = self.content.split((2 * k.height * k.width, k.height * k.width))
+        return Keyframe(
+            self.frame,
+            depth.view(torch.uint16).view(k.height, k.width),
+            intensity.view(k.height, k.width),
+            self.camera,
+        )

@@ -12,7 +12,7 @@ from spslam.geometry import compose
 from spslam.slam.graph.archive import KeyframeArchive
 from spslam.slam.graph.edges import Link
 from spslam.slam.graph.image_pool import ImagePool
-from spslam.slam.graph.keyframe import Keyframe, KeyframeCamera
+from spslam.slam.graph.keyframe import ArrivingKeyframe, Keyframe, KeyframeCamera
 from spslam.slam.graph.keyframe_graph import GraphContent
 from spslam.slam.graph.keyframe_tensors import (
     cameras_of,
@@ -35,7 +35,6 @@ class KeyframeStore:
 
     Attributes:
         camera: of the keyframes that are added; those of an opened map may have others.
-        keyframes: in the order of their frames.
         links: of each keyframe to the one before; only that of new ones is used.
         anchors: of keyframes that were left out, ascending.
         content: edges, as of the last solution.
@@ -49,7 +48,8 @@ class KeyframeStore:
 
     def __init__(self, camera: KeyframeCamera):
         self.camera = camera
-        self.keyframes: list[Keyframe] = []
+        self._keyframes: list[Keyframe] = []
+        self._arriving: ArrivingKeyframe | None = None
         self._images: dict[KeyframeCamera, ImagePool] = {}
         self.links: list[Link] = []
         self.anchors: list[Anchor] = []
@@ -62,6 +62,19 @@ class KeyframeStore:
         self.opened: KeyframeArchive | None = None
 
     @property
+    def keyframes(self) -> list[Keyframe]:
+        """In the order of their frames; waits for one that is on its way from the device."""
+        self._settle()
+        return self._keyframes
+
+    @property
+    def newest(self) -> int | None:
+        """Number of the newest keyframe's frame, also while its images are on their way; None where there is none."""
+        if self._arriving is not None:
+            return self._arriving.frame
+        return self._keyframes[-1].frame if self._keyframes else None
+
+    @property
     def rows(self) -> np.ndarray:
         """int64 [K] numbers of the keyframes' frames."""
         return np.array([keyframe.frame for keyframe in self.keyframes], np.int64)
@@ -71,9 +84,13 @@ class KeyframeStore:
         """float32 [4] of every camera's sensor, as of the last solution."""
         return {**self.opened_noise, self.camera: self.noise}
 
-    def add(self, keyframe: Keyframe, link: Link) -> None:
+    def add(self, keyframe: Keyframe | ArrivingKeyframe, link: Link) -> None:
         """Appends a keyframe; its images move to a file that the system can put out of memory."""
-        self._keep(keyframe)
+        self._settle()
+        if isinstance(keyframe, ArrivingKeyframe):
+            self._arriving = keyframe
+        else:
+            self._keep(keyframe)
         self.links.append(link)
 
     def leave_out(self, out: Mapping[int, int], poses: np.ndarray) -> None:
@@ -89,7 +106,7 @@ class KeyframeStore:
         for one in out:
             keyframe = self.keyframes[one]
             self._images[keyframe.camera].give_back(keyframe.depth, keyframe.intensity)
-        self.keyframes, self.links = [self.keyframes[one] for one in kept], [self.links[one] for one in kept]
+        self._keyframes, self.links = [self.keyframes[one] for one in kept], [self.links[one] for one in kept]
 
     def with_anchors(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Numbers int64 [N], ascending, and poses float64 [N, 4, 4] of keyframes and those left out.
@@ -130,7 +147,7 @@ class KeyframeStore:
         cameras = cameras_of(state["cameras"])
         if cameras[:1] != [self.camera]:
             raise ValueError("the keyframes are of another camera")
-        self.keyframes = []
+        self._keyframes, self._arriving = [], None
         self._images.clear()
         for keyframe in keyframes_of(state, cameras):
             self._keep(keyframe)
@@ -147,9 +164,14 @@ class KeyframeStore:
         self.noise, *others = state["noise"].cpu().clone()
         self.opened_noise = dict(zip(cameras[1:], others, strict=True))
 
+    def _settle(self) -> None:
+        if self._arriving is not None:
+            arriving, self._arriving = self._arriving, None
+            self._keep(arriving.arrived())
+
     def _keep(self, keyframe: Keyframe) -> None:
         camera = keyframe.camera
         if camera not in self._images:
             self._images[camera] = ImagePool(camera.camera.height, camera.camera.width)
         depth, intensity = self._images[camera].keep(keyframe.depth, keyframe.intensity)
-        self.keyframes.append(keyframe.changed(depth=depth, intensity=intensity))
+        self._keyframes.append(keyframe.changed(depth=depth, intensity=intensity))

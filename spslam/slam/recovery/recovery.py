@@ -105,7 +105,7 @@ class Recovery:
         )
 
     def _is_unpredicted(self, history: FrameHistory) -> bool:
-        """Whether nothing says how far the camera has moved: what slides from the last pose fits a young map as well."""
+        """Whether nothing says how far the camera has moved; a pose that slid from the last one fits a young map."""
         return self._config.tracking.recovery and not history.knows_speed
 
     def _is_doubtful(self, tracked: TrackedFrame) -> bool:
