@@ -149,8 +149,9 @@ class GlobalMapping:
         if last is None:
             store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(np.eye(4), False))
             return
-        moved = inverse(self._last_pose(last)) @ pose
-        if self._is_far(moved):
+        known = self._last_pose(last)
+        if self._is_far(known, pose):
+            moved = inverse(known) @ pose
             relocalized = bool(state.frames.lost[last:number].any()) or last < state.frames.opened
             store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(moved, relocalized))
             self._reference = number, pose
@@ -243,11 +244,13 @@ class GlobalMapping:
             self._reference = newest, pose7_to_matrix(pose.double().numpy())
         return self._reference[1]
 
-    def _is_far(self, moved: np.ndarray) -> bool:
+    def _is_far(self, known: np.ndarray, pose: np.ndarray) -> bool:
+        """Whether a pose is to be a keyframe's, `known` being that of the newest one; every frame asks."""
         graph = self._config.graph
-        if float(np.degrees(rotation_angle(moved[:3, :3]))) > graph.max_rotation_deg:
+        cosine = (float((known[:3, :3] * pose[:3, :3]).sum()) - 1) / 2
+        if cosine < math.cos(math.radians(graph.max_rotation_deg)):
             return True
-        distance = float(np.linalg.norm(moved[:3, 3]))
+        distance = math.dist(known[:3, 3], pose[:3, 3])
         if distance > graph.max_translation_m:
             return True
         return distance > NEAR_SHARE * self._store.keyframes[-1].median_m
