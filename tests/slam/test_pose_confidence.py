@@ -65,6 +65,20 @@ def test_the_correlation_of_right_poses_makes_no_difference():
     assert error_probability(wall, brightness_correlation=0.0) > 0.5
 
 
+def test_image_features_hold_what_surface_leaves_free():
+    """A textured wall that fills the view: its eigenvalue is 0 whatever the pose."""
+    wall = dict(min_eigenvalue=0.0, feature_share=0.95)
+    assert error_probability(GOOD, **wall, feature_inliers=10) > 0.5
+    assert error_probability(GOOD, **wall, feature_inliers=200) < 0.01
+    slid = {**wall, "feature_share": 0.7}
+    assert error_probability(GOOD, **slid, feature_inliers=200) > 0.5
+    # Not where the camera may be anywhere: there may be such a wall elsewhere.
+    anywhere = dict(prediction_error_cm=math.nan, prediction_error_deg=math.nan)
+    assert error_probability(GOOD, **wall, **anywhere, feature_inliers=200) > 0.5
+    # Nor where colors are not where depth is, which leaves the share unknown.
+    assert error_probability(GOOD, **{**wall, "feature_share": math.nan}, feature_inliers=200) > 0.5
+
+
 def test_an_unknown_measure_counts_between_right_and_wrong():
     for name, wrong in (("free_space_violation", 0.3), ("prediction_error_cm", 50.0)):
         unknown = error_probability(GOOD, **{name: math.nan})

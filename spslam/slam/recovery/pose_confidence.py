@@ -36,6 +36,7 @@ class PoseConfidenceModel:
         min_brightness_correlation: minimum of correct poses.
         max_occluded_share: above it the frame is occluded.
         min_feature_inliers: with as many the pose is known without the motion model.
+        min_holding_inliers, min_holding_share: with as many the pose is held where surface leaves it free.
     """
 
     intercept: float
@@ -59,6 +60,8 @@ class PoseConfidenceModel:
     min_feature_inliers: float
     per_missing_feature_share: float
     min_feature_share: float
+    min_holding_inliers: float
+    min_holding_share: float
 
     @classmethod
     def load(cls) -> "PoseConfidenceModel":
@@ -102,9 +105,16 @@ class PoseConfidenceModel:
         return min(fit.mean_robust_weight * self.expected_map_coverage / fit.map_coverage, 1.0)
 
     def _log10_min_eigenvalue(self, fit: Fit) -> float:
-        """log10 of the smallest eigenvalue, falling faster below `firm_eigenvalue`."""
-        lg = math.log10(max(fit.min_eigenvalue, self.eigenvalue_floor))
+        """log10 of the smallest eigenvalue, falling faster below `firm_eigenvalue` unless features hold the pose."""
+        least = self.firm_eigenvalue if self._is_held_by_features(fit) else self.eigenvalue_floor
+        lg = math.log10(max(fit.min_eigenvalue, least))
         return lg + (self.weak_eigenvalue_factor - 1) * min(lg - math.log10(self.firm_eigenvalue), 0.0)
+
+    def _is_held_by_features(self, fit: Fit) -> bool:
+        """Whether image features hold the pose; where the camera may be anywhere, places alike have them alike."""
+        is_anywhere = math.isnan(fit.prediction_error_cm)
+        agrees = fit.feature_inliers >= self.min_holding_inliers and fit.feature_share >= self.min_holding_share
+        return agrees and not is_anywhere
 
     def _prediction_error(self, fit: Fit) -> float:
         error = math.log1p(
