@@ -49,12 +49,12 @@ class DoubtfulFrame:
             return fit
         inliers = [self.image.inliers(one, pose) for one in self.matches]
         shares: list[float] = []
-        if self._colors_are_registered:
+        if self.colors_are_registered:
             shares = [n / one.agreeing for n, one in zip(inliers, self.matches, strict=True) if one.agreeing]
         return replace(fit, feature_inliers=max(inliers, default=0), feature_share=min(shares, default=math.nan))
 
     @property
-    def _colors_are_registered(self) -> bool:
+    def colors_are_registered(self) -> bool:
         """Whether colors are where depth is, as far as was measured: neither late nor of another lens."""
         noise = self.problem.constraints.noise
         return noise is None or float(noise[3]) <= REGISTERED_PX**2

@@ -159,17 +159,18 @@ class Recovery:
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), self._features(pixels))
         frame, starts = self._starts_at_last(frame, first)
         candidates, iterations = self._track_from(frame, first, starts), 0
+        seen = self._seen(frame, starts)
         # After lost frames with consistent poses, the prediction does not come from the last trusted pose.
         found = None
         if history.consecutive_lost_frames <= SHORT_LOSS and not history.consistent_frames:
-            found = self._likeliest(frame, candidates)
+            found = self._likeliest(frame, candidates, seen=seen)
             if found.lost and problem.constraints.reference is not None:
                 # Late colors may be what led tracking astray; these starts need no help of a coarse image.
                 constraints = replace(problem.constraints, reference=None)
                 frame = replace(frame, problem=replace(problem, constraints=constraints))
                 iterations = sum(candidate.iterations for candidate in candidates[1:])
                 candidates = self._track_from(frame, first, starts)
-                found = self._likeliest(frame, candidates)
+                found = self._likeliest(frame, candidates, seen=seen)
         if found is None or found.lost:
             found = self._relocalize(frame, candidates)
         iterations += sum(candidate.iterations for candidate in candidates)
@@ -215,13 +216,28 @@ class Recovery:
         others = [self.judge(self._tracker.track_from(frame.problem, start)) for start in starts]
         return [first, *(replace(other, recovered=True) for other in others)]
 
-    def _likeliest(self, frame: DoubtfulFrame, candidates: list[TrackedFrame], anywhere: bool = False) -> TrackedFrame:
+    def _seen(self, frame: DoubtfulFrame, starts: list[torch.Tensor]) -> TrackedFrame | None:
+        """The pose that image features alone give, the first starts, with that earlier frame with which most agree."""
+        if not frame.matches or not frame.colors_are_registered:
+            return None
+        most = max(range(len(frame.matches)), key=lambda i: frame.matches[i].agreeing)
+        return replace(self.judge(self._tracker.measure(frame.problem, starts[most])), recovered=True)
+
+    def _likeliest(
+        self,
+        frame: DoubtfulFrame,
+        candidates: list[TrackedFrame],
+        anywhere: bool = False,
+        seen: TrackedFrame | None = None,
+    ) -> TrackedFrame:
         """The candidate of the smallest error probability when verified; only the best fits of distinct poses are.
 
         Args:
             frame: the frame.
             candidates: the first is taken among equals.
             anywhere: whether the camera may be anywhere, so that the predicted pose says nothing.
+            seen: the pose of image features alone; as noise moves it by centimeters, it counts only where far more
+                features agree with it than with the likeliest.
         """
         distinct: list[TrackedFrame] = []
         weights = [candidate.weight + MIN_GAIN * (i == 0) for i, candidate in enumerate(candidates)]
@@ -232,7 +248,10 @@ class Recovery:
                 distinct.append(candidates[i])
         verified = [self._verify(frame, candidate) for candidate in distinct[:MAX_VERIFIED]]
         found = min(verified, key=lambda tracked: self._rank(tracked, anywhere))
-        return found if anywhere else _by_features(found, verified)
+        if anywhere:
+            return found
+        others = [] if seen is None else [self._verify(frame, seen)]
+        return _by_features(found, [*verified, *others])
 
     def _rank(self, tracked: TrackedFrame, anywhere: bool) -> float:
         fit = tracked.fit
