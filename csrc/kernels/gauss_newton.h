@@ -140,8 +140,8 @@ SPS_INLINE double held_damping(const Measurement& measure, const double* terms) 
 }
 
 // Solves the joint normal equations, with `held` added to the diagonal, and moves the pose. `steps` gets |dt| (m) and
-// |domega| (rad). `hessian` gets the map's matrix as if pixels had on average their score weights and no certainties: it
-// says how firmly the surface holds the pose, whatever its distance and the width of the kernel.
+// |domega| (rad). `hessian` gets the map's matrix as if pixels had on average their score weights and no certainties:
+// it says how firmly the surface holds the pose, whatever its distance and the width of the kernel.
 SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, double held, float* pose,
                               float* steps, float* hessian) {
   double h[36], g[6], cost, delta[6];

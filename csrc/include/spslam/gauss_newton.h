@@ -49,12 +49,12 @@ struct DepthKeyframes {
 
 // The scalars of GaussNewtonOptions, type and name, in the order of the fields of ops.GaussNewtonOptions: a line here
 // and a field there are a new one, from Python down to the kernels.
-#define SPS_GAUSS_NEWTON_SCALARS(FIELD)                                                 \
-  FIELD(float, truncation)   /* m */                                                    \
-  FIELD(float, kernel_start) /* m, width of the robust kernel at the first iteration */ \
-  FIELD(float, kernel_end)   /* m, at the last iterations */                            \
-  FIELD(double, damping)     /* relative Levenberg damping */                           \
-  FIELD(float, score_kernel) /* m, of cost and mean weight; 0: the iteration's own */   \
+#define SPS_GAUSS_NEWTON_SCALARS(FIELD)                                                      \
+  FIELD(float, truncation)        /* m */                                                    \
+  FIELD(float, kernel_start)      /* m, width of the robust kernel at the first iteration */ \
+  FIELD(float, kernel_end)        /* m, at the last iterations */                            \
+  FIELD(double, damping)          /* relative Levenberg damping */                           \
+  FIELD(float, score_kernel)      /* m, of cost and mean weight; 0: the iteration's own */   \
   FIELD(double, held_information) /* per weight: directions of less move little before depth keyframes take part */
 #define SPS_DECLARE_FIELD(type, name) type name;
 
