@@ -11,9 +11,8 @@
 
 namespace spslam {
 
-// Deviations that are left of noise however small, of the steps of images.
-constexpr float kLeastDepthDeviation = 2e-4f;      // m
-constexpr float kLeastIntensityDeviation = 1e-3f;  // of [0, 1]
+// m, that is left of noise however small, of the steps of depth images.
+constexpr float kLeastDepthDeviation = 2e-4f;
 
 // A pair's rows, and whether there are such.
 struct ImagePair {
@@ -72,7 +71,7 @@ SPS_INLINE Vec3<float> intensity_slope(const DepthKeyframes& images, const std::
   const std::int64_t above = row > 0 ? row - 1 : 0, below = row + 1 < h ? row + 1 : h - 1;
   const float across = 0.5f * kStep * (static_cast<float>(image[row * w + right]) - image[row * w + left]);
   const float down = 0.5f * kStep * (static_cast<float>(image[below * w + column]) - image[above * w + column]);
-  const float deviation = std::fmax(intensity_deviation(&noise, across, down), kLeastIntensityDeviation);
+  const float deviation = intensity_deviation(&noise, across, down);
   const float scale = std::sqrt(intensity_share(noise)) / deviation, inverse_z = 1.0f / point.z;
   const float u = scale * across * images.intrinsics.fx * inverse_z;
   const float v = scale * down * images.intrinsics.fy * inverse_z;

@@ -16,6 +16,8 @@ constexpr float kSurfaceDeviation = 0.003f;
 constexpr float kLeastSurfaceDeviation = 0.0001f;
 // A difference of intensities of one deviation counts as so many of a keyframe's surface.
 constexpr float kIntensityGain = 2.0f;
+// Of [0, 1]: that of the rounding of two intensities to 8 bits.
+constexpr float kRoundingVariance = 2.6e-6f;
 // px, of images that are registered: what remains is alike for few pixels only.
 constexpr float kRegistrationError = 0.3f;
 // Width of the robust kernel of intensities, in deviations.
@@ -25,9 +27,11 @@ SPS_INLINE SensorNoise load_sensor_noise(const float* numbers) {
   return {{numbers[0], numbers[1]}, numbers[2], numbers[3]};
 }
 
-// Of a difference between intensities where the image has these derivatives (1/px).
+// Of a difference between intensities where the image has these derivatives (1/px). Never 0, whatever was measured: a
+// flat pixel would weigh infinitely.
 SPS_INLINE float intensity_deviation(const SensorNoise* noise, float by_u, float by_v) {
-  return std::sqrt(noise->intensity_floor + noise->intensity_growth * (by_u * by_u + by_v * by_v));
+  const float floor = std::fmax(noise->intensity_floor, kRoundingVariance);
+  return std::sqrt(floor + noise->intensity_growth * (by_u * by_u + by_v * by_v));
 }
 
 // Share of the weight of intensities: images that are not registered are so alike for neighboring pixels, and that does

@@ -23,9 +23,9 @@ SPS_INLINE constexpr float first_bin(int histogram) {
 SPS_INLINE constexpr float first_level(int histogram) {
   return histogram == 0 ? 0x1p-18f : 0x1p-15f;
 }
-// Of a bin, m^2; of [0, 1]: that of the rounding of two intensities to 8 bits.
+// Of a bin, m^2; of [0, 1].
 SPS_INLINE constexpr double least_variance(int histogram) {
-  return histogram == 0 ? 1e-10 : 2.6e-6;
+  return histogram == 0 ? 1e-10 : static_cast<double>(kRoundingVariance);
 }
 // A residual adds so much, so that counts fade by whole numbers; after every frame they lose a share of 1/16.
 constexpr std::int32_t kResidualCount = 256;

@@ -208,6 +208,25 @@ def test_photometric_residuals_are_those_of_autograd(device, generator):
     torch.testing.assert_close(pose[4:].cpu().double() - torch.tensor(start[:3, 3]), delta[:3], rtol=0.02, atol=2e-5)
 
 
+def test_a_plain_image_of_a_sensor_without_noise_holds_nothing(device, generator):
+    """A measured floor of 0 and pixels without gradient: they would weigh infinitely, and nothing would move."""
+    depth = torch.full(SHAPE, 1.5, dtype=torch.float64)
+    u, v = _places(generator, 300)
+    records = _records(u, v, depth[v, u], torch.full((300,), 90)).to(device)
+    keyframe = _keyframe(depth, torch.full(SHAPE, 90, dtype=torch.uint8), device)
+    start = np.eye(4)
+    start[2, 3] = 0.02
+    poses = [
+        ops.track_gauss_newton(
+            ops.SceneView.empty(device=device), records, pose7(start, device), CAMERA, ONE_STEP,
+            noise=noise_model(4e-6, 0.0, 0.0, 1.0, device=device), depth_keyframes=each,
+        )[0]
+        for each in (keyframe, keyframe._replace(intensities=None))
+    ]  # fmt: skip
+    torch.testing.assert_close(poses[0], poses[1], rtol=0, atol=1e-6)
+    assert abs(float(poses[0][6])) < 0.005
+
+
 def test_devices_agree_on_counts(device, generator):
     depth, u, v = _planes([0.6, 1.1, 2.0], generator), *_places(generator, 1000)
     intensities = torch.randint(0, 256, SHAPE, generator=generator, dtype=torch.uint8)
