@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +100,9 @@ class Outcome:
         recovered_after: number of frames of the way back up to the first pose within 3 cm; None where there is none.
         error_cm: position error at the end; infinite if lost.
         voxels_added: voxels allocated by frames of the fault whose pose was wrong.
+        seen: frames between the fault and the return that show something.
+        kept: how many of them have a pose in the map at the end.
+        kept_apart: how many more have one in a map of their own that did not join.
     """
 
     trial: Trial
@@ -108,6 +111,9 @@ class Outcome:
     recovered_after: int | None
     error_cm: float
     voxels_added: int
+    seen: int = 0
+    kept: int = 0
+    kept_apart: int = 0
 
     @property
     def passed(self) -> bool:
@@ -143,17 +149,31 @@ def plan(dataset: RgbdDataset, count: int, seed: int) -> list[Trial]:
     return sorted(trials, key=lambda trial: trial.place)
 
 
-def plan_black_outs(dataset: RgbdDataset, count: int, seed: int, seconds: Sequence[float]) -> list[Trial]:
-    """`count` black-outs of each length, at places spread over the run, each with another mapped place to return to."""
+def plan_black_outs(
+    dataset: RgbdDataset, count: int, seed: int, seconds: Sequence[float], between: int = 0
+) -> list[Trial]:
+    """`count` black-outs of each length, at places spread over the run, each with another mapped place to return to.
+
+    Args:
+        dataset: with ground-truth poses.
+        count: trials of each length.
+        seed: of the places to return to.
+        seconds: lengths of the black-outs.
+        between: frames that the camera sees between the black-out and its return: those that it has moved on to
+            meanwhile, known or not. A recording too short for them has fewer.
+    """
     random = np.random.default_rng(seed)
     rows = len(dataset) // STEP
     trials = []
     for place in np.linspace(0.25 * rows, rows - 1, count).astype(int).tolist():
         for length in seconds:
             goal = int(random.integers(0, max(place - BACK_FRAMES, 1)))
-            during = (Shown(STEP * place, black_out),) * round(length * FRAMES_PER_SECOND)
+            black = round(length * FRAMES_PER_SECOND)
+            during = [Shown(STEP * place, black_out)] * black
+            ahead = min(STEP * place + black, len(dataset) - between)
+            during += [Shown(i) for i in range(max(ahead, STEP * place), min(ahead + between, len(dataset)))]
             back = tuple(Shown(STEP * (goal + i) + 1) for i in range(BACK_FRAMES))
-            trials.append(Trial(f"black-out of {length:g} s", place, during, back, seed + place))
+            trials.append(Trial(f"black-out of {length:g} s", place, tuple(during), back, seed + place))
     return trials
 
 
@@ -186,26 +206,41 @@ def run_trials(config: Config, dataset: RgbdDataset, trials: list[Trial], device
 def try_fault(system: SlamSystem, dataset: RgbdDataset, trial: Trial) -> Outcome:
     """Runs one trial on a system that has mapped `trial.place` frames; the system is not usable afterwards."""
     random, ground_truth = np.random.default_rng(trial.seed), gt_poses(dataset)
-    lost, wrong, added = [], [], 0
-    for shown in trial.during:
+    first = len(system.state.frames)
+    lost, wrong, errors, added = [], [], [], 0
+    for i, shown in enumerate((*trial.during, *trial.back)):
         voxels = system.state.scene.volume.num_voxels
-        report = system.process(_shown_frame(dataset, shown, random))
+        timestamp = float(system.state.frames.timestamps[-1]) + 1 / FRAMES_PER_SECOND
+        report = system.process(replace(_shown_frame(dataset, shown, random), timestamp=timestamp))
         apart_cm, apart_deg = _error(system, ground_truth, trial.place, shown.index)
         lost.append(report.lost)
-        wrong.append(shown.change is not None or apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
-        added += system.state.scene.volume.num_voxels - voxels if wrong[-1] else 0
-    errors = []
-    for shown in trial.back:
-        report = system.process(_shown_frame(dataset, shown, random))
-        apart_cm, apart_deg = _error(system, ground_truth, trial.place, shown.index)
-        lost.append(report.lost)
-        wrong.append(apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
-        errors.append(np.inf if report.lost or apart_deg > FOUND_DEG else apart_cm)
+        is_black = shown.change is not None
+        wrong.append(is_black or apart_cm > WRONG_CM or apart_deg > WRONG_DEG)
+        if i >= len(trial.during):
+            errors.append(np.inf if report.lost or apart_deg > FOUND_DEG else apart_cm)
+        elif wrong[-1] and not report.lost:
+            added += system.state.scene.volume.num_voxels - voxels
     found = [i for i, error in enumerate(errors, 1) if error < FOUND_CM]
     unflagged = [a and not b for a, b in zip(wrong, lost, strict=True)]
     return Outcome(
-        trial, _flagged_after(unflagged, wrong), sum(unflagged), found[0] if found else None, errors[-1], added
+        trial,
+        _flagged_after(unflagged, wrong),
+        sum(unflagged),
+        found[0] if found else None,
+        errors[-1],
+        added,
+        *_kept(system, [first + i for i, shown in enumerate(trial.during) if shown.change is None]),
     )
+
+
+def _kept(system: SlamSystem, numbers: Sequence[int]) -> tuple[int, int, int]:
+    """How many frames there are of given numbers, how many have a pose in the map, and how many in one apart."""
+    in_map = {number for number in numbers if not system.state.frames.lost[number]}
+    segment = system.state.segment
+    apart = {int(n) for unjoined in system.state.unjoined for n in unjoined.rows}
+    if segment is not None:
+        apart |= {segment.first + int(n) for n in (~segment.state.frames.lost).nonzero()[:, 0]}
+    return len(numbers), len(in_map), len((apart & set(numbers)) - in_map)
 
 
 def _flagged_after(unflagged: list[bool], wrong: list[bool]) -> int:
@@ -228,7 +263,7 @@ def _error(system: SlamSystem, ground_truth: np.ndarray, place: int, index: int)
     return apart(system.state.frames.matrices(-1)[0], expected_pose(system, ground_truth, place, index))
 
 
-def expected_pose(system: SlamSystem, ground_truth: np.ndarray, place: int, index: int) -> np.ndarray:
+def expected_pose(system: SlamSystem, ground_truth: np.ndarray, place: int, index: int, step: int = STEP) -> np.ndarray:
     """Expected pose of a frame in the map: the nearest mapped frame's estimated pose, moved by the true motion from it.
 
     So neither drift of the map nor errors of the ground truth over long distances count.
@@ -238,11 +273,12 @@ def expected_pose(system: SlamSystem, ground_truth: np.ndarray, place: int, inde
         ground_truth: float64 [F, 4, 4] of the dataset.
         place: number of mapped frames.
         index: of the frame in the dataset.
+        step: between mapped frames.
 
     Returns:
         float64 [4, 4] T_world_camera.
     """
-    mapped = ground_truth[: STEP * place : STEP]
+    mapped = ground_truth[: step * place : step]
     turned = rotation_angle(np.swapaxes(mapped[:, :3, :3], 1, 2) @ ground_truth[index, :3, :3])
     nearest = int(np.argmin(np.linalg.norm(mapped[:, :3, 3] - ground_truth[index, :3, 3], axis=1) + turned))
     return system.state.frames.matrices()[nearest] @ inverse(mapped[nearest]) @ ground_truth[index]

@@ -1,5 +1,6 @@
 """Read access to earlier frames, for tracking and recovery."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -55,6 +56,16 @@ class FrameHistory:
         """How many frames at the end are lost."""
         known = (~self._state.frames.lost).nonzero()
         return len(self._state.frames) - (int(known[-1]) + 1 if len(known) else 0)
+
+    def seconds_since(self, row: int) -> float:
+        """From the frame in a row to the next one, if that comes as long after the last as that after the one before.
+
+        Infinite where that is not known: with one frame only, or where time does not go on.
+        """
+        times = self._state.frames.timestamps
+        interval = float(times[-1] - times[-2]) if len(times) > 1 else 0.0
+        since = float(times[-1] - times[row])
+        return since + interval if interval > 0 and since >= 0 else math.inf
 
     @property
     def poses(self) -> torch.Tensor:

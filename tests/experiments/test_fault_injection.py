@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from experiments.fault_injection import BACK_FRAMES, STEP, copy_of, plan
+from experiments.fault_injection import BACK_FRAMES, STEP, copy_of, plan, plan_black_outs, try_fault
 from spslam.datasets.generated import GeneratedDataset
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
@@ -34,3 +34,22 @@ def test_a_copy_tracks_as_the_system_does(tmp_path):
     for each in (system, copy):
         each.process(dataset[2])
     assert torch.equal(copy.state.frames.poses, system.state.frames.poses)
+
+
+def test_black_outs_end_elsewhere_and_time_goes_on():
+    """The camera is found after it, and what it saw in between has poses."""
+    dataset = Recorded(40)
+    (trial,) = plan_black_outs(dataset, 1, 0, [0.2], between=4)
+    assert [shown.change is None for shown in trial.during] == [False] * 6 + [True] * 4
+    assert trial.during[6].index == STEP * trial.place + 6
+    none = plan_black_outs(dataset, 1, 0, [0.2])[0]
+    assert len(none.during) == 6
+    assert none.back == trial.back
+    system = SlamSystem(settings("device=cpu", preset="fast"), dataset.camera, dataset.poses()[0])
+    for i in range(trial.place):
+        system.process(dataset[STEP * i])
+    outcome = try_fault(system, dataset, trial)
+    times = system.state.frames.timestamps
+    assert bool((times[1:] > times[:-1]).all())
+    assert outcome.seen == 4
+    assert outcome.kept + outcome.kept_apart <= 4

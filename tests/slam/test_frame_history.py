@@ -47,6 +47,18 @@ def state_of(dataset, pixels, device=CPU, lost=()):
     return state
 
 
+def test_the_next_frame_is_expected_at_the_same_interval(dataset, pixels):
+    state = state_of(dataset, pixels)
+    history = FrameHistory(state)
+    assert history.seconds_since(FRAMES - 1) == pytest.approx(1 / 30)
+    assert history.seconds_since(FRAMES - 4) == pytest.approx(4 / 30)
+    state.frames.timestamps[-1] = state.frames.timestamps[-2]
+    assert history.seconds_since(0) == np.inf
+    state.frames.timestamps[-1] = 1.0
+    state.frames.timestamps[0] = 2.0  # of an opened map
+    assert history.seconds_since(0) == np.inf
+
+
 def test_difference_of_depth_images(device):
     depth_thumbnail = torch.tensor([[1.0, 2.0, 0.0, 0.0]], dtype=torch.float16, device=device)
     others = torch.tensor(

@@ -19,7 +19,7 @@ from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery import place_recognition
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
-from spslam.slam.recovery.feature_alignment import MIN_INLIERS, FeatureAlignment, ratio_matches
+from spslam.slam.recovery.feature_alignment import MIN_INLIERS, FeatureAlignment, joined_too, ratio_matches
 from spslam.slam.recovery.place_recognition import retrieve_by_features
 from spslam.slam.state import SlamState
 from spslam.slam.system import SlamSystem
@@ -122,6 +122,27 @@ def test_few_or_contradictory_matches_give_no_pose(dataset, features):
     assert alignment.pose(nonsense, CPU) is None
 
 
+def test_matches_with_several_frames_give_a_pose_together(dataset, features):
+    """Each has too few; the same features matched twice are no more than they are once."""
+    alignment = FeatureAlignment(features[4], dataset.camera)
+    found = [alignment.matches(features[i].with_depth(), pose_of(dataset, i)) for i in (0, 2)]
+    positions = alignment.features.positions.astype(np.float64)
+    first = {tuple(position) for position in positions[: len(positions) // 2]}
+    halves = []
+    for matches, wanted in zip(found, (True, False), strict=True):
+        good = np.array([(tuple(at) in first) == wanted for at in matches.positions])
+        near = np.flatnonzero(good)[:: good.sum() // MIN_INLIERS][: MIN_INLIERS - 1]  # all over the image
+        halves.append(type(matches)(matches.points[near], matches.positions[near]))
+    assert [alignment.pose(matches, CPU) for matches in halves] == [None, None]
+    *each, together = joined_too(halves)
+    assert each == halves
+    error = inverse(dataset.poses()[4]) @ pose_matrix(alignment.pose(together, CPU))
+    assert np.linalg.norm(error[:3, 3]) < BASIN_M
+    assert alignment.pose(joined_too([halves[0], halves[0]])[-1], CPU) is None
+    assert joined_too(halves[:1]) == halves[:1]
+    assert joined_too([]) == []
+
+
 def test_the_store_keeps_what_has_depth_and_comes_back_from_a_checkpoint():
     store = FeatureStore()
     for frame in (0, 10, 13):
@@ -199,3 +220,36 @@ def test_they_contradict_a_pose_only_where_colors_are_where_depth_is(dataset, fe
     fit = frame.with_features(Fit(), pose_of(dataset, 12))
     assert fit.feature_inliers < MIN_INLIERS
     assert fit.feature_share < 0.5 if counts else np.isnan(fit.feature_share)
+
+
+@pytest.mark.parametrize(("seconds", "is_turn"), [(1 / 30, True), (1.0, True), (1 / 300, False), (np.inf, True)])
+def test_colors_of_a_turning_camera_may_be_late(dataset, features, seconds, is_turn):
+    """By 20 ms of what the image moves in; not those of a camera that has jumped."""
+    image = FeatureAlignment(features[4], dataset.camera)
+    found = image.matches(features[2].with_depth(), pose_of(dataset, 2))
+    assert found.motion_px > 3
+    noise = torch.tensor([1e-6, 1e-6, 1e-4, 0.01])
+    history = SimpleNamespace(seconds_since=lambda row: seconds)
+    problem = SimpleNamespace(constraints=Constraints(noise=noise))
+    frame = DoubtfulFrame(problem, None, history, None, image, (image.counted(found, pose_of(dataset, 4)),))
+    late = frame.with_speed(2, [found])
+    assert late.late_px == pytest.approx(0.02 * found.motion_px / seconds if is_turn else 0.0)
+    assert frame.with_speed(2, []).late_px == 0
+    # One frame's motion off: more than 20 ms of 33.
+    off = pose_of(dataset, 3)
+    assert late.with_features(Fit(), off).feature_share >= frame.with_features(Fit(), off).feature_share
+    assert late.with_features(Fit(), pose_of(dataset, 4)).feature_share <= 1
+
+
+def test_features_that_may_be_late_hold_a_pose_less(dataset, features):
+    image = FeatureAlignment(features[4], dataset.camera)
+    matches = [image.matches(features[2].with_depth(), pose_of(dataset, 2))]
+    off = pose_of(dataset, 4)
+    off[4] += 0.02
+    information = np.diag([1e5] * 6)
+
+    def moved_m(late_px):
+        return float((image.held(off, information, matches, late_px) - off)[4:].norm())
+
+    assert moved_m(0.0) == moved_m(0.5 * image.max_error_px)
+    assert moved_m(10.0) < 0.5 * moved_m(0.0)

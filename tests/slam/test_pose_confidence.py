@@ -56,6 +56,17 @@ def test_the_robust_weight_is_scaled_by_map_coverage():
     assert error_probability(wrong, prediction_error_cm=18.0, map_coverage=0.4) > 0.99
 
 
+def test_where_features_confirm_a_pose_what_was_not_seen_yet_does_not_count():
+    half = replace(GOOD, mean_robust_weight=0.4, inlier_share=0.5, prediction_error_cm=40.0, prediction_error_deg=20.0)
+    confirmed = replace(half, feature_inliers=60, feature_share=0.9)
+    assert error_probability(half) > 0.5 > 0.05 > error_probability(confirmed)
+    everywhere = replace(confirmed, mean_robust_weight=0.8, inlier_share=1.0)
+    assert error_probability(confirmed) == pytest.approx(error_probability(everywhere))
+    for unsure in ({"feature_inliers": 15}, {"feature_share": 0.4}, {"feature_share": math.nan}):
+        assert error_probability(confirmed, **unsure) > 0.1
+    assert error_probability(confirmed, inlier_share=0.0, mean_robust_weight=0.0) > 0.5
+
+
 def test_the_correlation_of_right_poses_makes_no_difference():
     for brightness_correlation in (0.71, 0.9, math.nan):
         assert error_probability(GOOD, brightness_correlation=brightness_correlation) == error_probability(GOOD)

@@ -14,6 +14,10 @@ from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.tracker import TrackingProblem
 
 REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones features say where colors are, not depth
+# By so much the moments of a frame's depth and color may differ, or those of an image's rows: as in recordings whose
+# images are paired by time, and with a rolling shutter.
+LATE_S = 0.02
+MAX_TURN_DEG_S = 300.0  # of a camera; what moves faster in the image has jumped
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,7 @@ class DoubtfulFrame:
         alignment: by ICP.
         image: by image features; None where these are not used.
         matches: of the image's features with those of earlier frames.
+        late_px: by how much its colors may be off where it moves, see `with_speed`.
     """
 
     problem: TrackingProblem
@@ -35,6 +40,7 @@ class DoubtfulFrame:
     alignment: IcpAlignment
     image: FeatureAlignment | None = None
     matches: tuple[FeatureMatches, ...] = ()
+    late_px: float = 0.0
 
     def matched(self, rows: Sequence[int]) -> list[FeatureMatches]:
         """Matches with the features of the earlier frames in rows that have some."""
@@ -43,6 +49,14 @@ class DoubtfulFrame:
         known = [(self.history.features(row), self.history.poses[row]) for row in rows]
         return [self.image.matches(features, pose) for features, pose in known if features is not None]
 
+    def with_speed(self, row: int, matches: Sequence[FeatureMatches]) -> "DoubtfulFrame":
+        """The frame, with how far its image moves in `LATE_S` by the first of its matches, which are with `row`."""
+        if self.image is None or not matches:
+            return self
+        speed_px = matches[0].motion_px / self.history.seconds_since(row)
+        is_turn = speed_px < self.image.focal_px * math.radians(MAX_TURN_DEG_S)
+        return replace(self, late_px=LATE_S * speed_px if is_turn else 0.0)
+
     def with_features(self, fit: Fit, pose: torch.Tensor) -> Fit:
         """The fit of a pose float32 [7] with what the matches say of it; the fit where there are no image features."""
         if self.image is None:
@@ -50,7 +64,8 @@ class DoubtfulFrame:
         inliers = [self.image.inliers(one, pose) for one in self.matches]
         shares: list[float] = []
         if self.colors_are_registered:
-            shares = [n / one.agreeing for n, one in zip(inliers, self.matches, strict=True) if one.agreeing]
+            within = [self.image.inliers(one, pose, self.late_px) for one in self.matches]
+            shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, self.matches, strict=True) if one.agreeing]
         return replace(fit, feature_inliers=max(inliers, default=0), feature_share=min(shares, default=math.nan))
 
     @property

@@ -41,11 +41,13 @@ class FeatureMatches:
         points: float64 [M, 3] in the world, m.
         positions: float64 [M, 2] in px of the intensity image.
         agreeing: how many of them agree with the pose that they give.
+        motion_px: by how much they moved in the image since the earlier frame, their median; 0 without any.
     """
 
     points: np.ndarray
     positions: np.ndarray
     agreeing: int = 0
+    motion_px: float = 0.0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -60,20 +62,28 @@ class FeatureAlignment:
 
     Attributes:
         max_error_px: farther from where the frame shows them, points do not agree with a pose.
+        focal_px: focal length of the intensity image.
     """
 
     def __init__(self, features: ImageFeatures, camera: Camera):
         self.features = features
         k = depth_image_intrinsics(camera)
         self._matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+        self.focal_px = k.fx
         self.max_error_px = max(k.fx * math.tan(math.radians(MAX_ERROR_DEG)), MIN_ERROR_PX)
 
     def matches(self, earlier: ImageFeatures, pose: torch.Tensor) -> FeatureMatches:
         """Matches with the features of an earlier frame at a pose float32 [7]."""
         pairs = ratio_matches(self.features.descriptors, earlier.descriptors)
         to_world = pose_matrix(pose)
-        points = earlier.points[pairs[:, 1]].astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
-        return FeatureMatches(points, self.features.positions[pairs[:, 0]].astype(np.float64))
+        local, positions = (
+            one.astype(np.float64) for one in (earlier.points[pairs[:, 1]], self.features.positions[pairs[:, 0]])
+        )
+        known = local[:, 2] > 0
+        before = (local[known] @ self._matrix.T)[:, :2] / local[known, 2:]
+        moved = np.linalg.norm(positions[known] - before, axis=1)
+        motion_px = float(np.median(moved)) if len(moved) else 0.0
+        return FeatureMatches(local @ to_world[:3, :3].T + to_world[:3, 3], positions, motion_px=motion_px)
 
     def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
@@ -89,9 +99,11 @@ class FeatureAlignment:
             confidence=RANSAC_CONFIDENCE,
             flags=cv2.SOLVEPNP_AP3P,
         )
-        if not found or inliers is None or len(inliers) < MIN_INLIERS:
+        if not found or inliers is None:
             return None
         rows = inliers[:, 0]
+        if len(np.unique(matches.positions[rows], axis=0)) < MIN_INLIERS:
+            return None
         rotation, translation = cv2.solvePnPRefineLM(
             matches.points[rows], matches.positions[rows], self._matrix, None, rotation, translation
         )
@@ -104,7 +116,7 @@ class FeatureAlignment:
         return replace(matches, agreeing=self.inliers(matches, pose))
 
     def held(
-        self, pose: torch.Tensor, information: np.ndarray, matches: Sequence[FeatureMatches]
+        self, pose: torch.Tensor, information: np.ndarray, matches: Sequence[FeatureMatches], late_px: float = 0.0
     ) -> torch.Tensor | None:
         """The pose that surface and image features agree on best; None where fewer than `MIN_INLIERS` agree.
 
@@ -114,18 +126,20 @@ class FeatureAlignment:
             pose: float32 [7], where surface has put the camera.
             information: float64 [6, 6] of that pose, see `PoseEstimate`.
             matches: with earlier frames.
+            late_px: by how much the features may be off, where that is more than `max_error_px`.
         """
         points = np.concatenate([np.zeros((0, 3)), *(one.points for one in matches)])
         positions = np.concatenate([np.zeros((0, 2)), *(one.positions for one in matches)])
         at = before = pose_matrix(pose)
+        error_px = max(self.max_error_px, late_px)
         agreeing = 0
         for _ in range(HELD_ITERATIONS):
             residuals, jacobians = self._reprojection(points, positions, at)
-            ratio = (residuals**2).sum(1) / self.max_error_px**2
+            ratio = (residuals**2).sum(1) / error_px**2
             agreeing = int((ratio < 1).sum())
             if agreeing < MIN_INLIERS:
                 return None
-            share = min(1.0, INDEPENDENT_FEATURES / agreeing) / self.max_error_px**2
+            share = min(1.0, INDEPENDENT_FEATURES / agreeing) / error_px**2
             weights = share / (1 + ratio / WIDE**2) ** 2
             change = np.r_[at[:3, 3] - before[:3, 3], rotation_vectors(at[:3, :3] @ before[:3, :3].T)]
             normal = information + np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians)
@@ -152,19 +166,34 @@ class FeatureAlignment:
         jacobians = np.concatenate([-by_world, by_world @ cross_matrices(arms[front])], 2)
         return projected - positions[front], jacobians
 
-    def inliers(self, matches: FeatureMatches, pose: torch.Tensor) -> int:
-        """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`."""
-        to_camera = inverse(pose_matrix(pose))
+    def inliers(self, matches: FeatureMatches, pose: torch.Tensor, late_px: float = 0.0) -> int:
+        """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`.
+
+        Args:
+            matches: with an earlier frame.
+            pose: of this frame.
+            late_px: or to within so much, which the image may have moved since depth was measured.
+        """
+        to_camera, most_px = inverse(pose_matrix(pose)), max(self.max_error_px, late_px)
         points = matches.points @ to_camera[:3, :3].T + to_camera[:3, 3]
         in_front = points[:, 2] > 0
         projected = points @ self._matrix.T
         positions = projected[:, :2] / np.where(in_front, points[:, 2], 1)[:, None]
-        return int((in_front & (np.linalg.norm(positions - matches.positions, axis=1) < self.max_error_px)).sum())
+        return int((in_front & (np.linalg.norm(positions - matches.positions, axis=1) < most_px)).sum())
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""
         count = len(ratio_matches(self.features.descriptors[:COMPARED], earlier.descriptors[:COMPARED]))
         return count if count >= MIN_ALIKE else 0
+
+
+def joined_too(matches: Sequence[FeatureMatches]) -> list[FeatureMatches]:
+    """Matches with several earlier frames, and all of them as one: each may have too few to give a pose."""
+    some = [one for one in matches if len(one)]
+    if len(some) < 2:
+        return list(matches)
+    points, positions = (np.concatenate([getattr(one, name) for one in some]) for name in ("points", "positions"))
+    return [*matches, FeatureMatches(points, positions)]
 
 
 def ratio_matches(descriptors: np.ndarray, earlier: np.ndarray) -> np.ndarray:

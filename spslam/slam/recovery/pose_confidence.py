@@ -98,8 +98,17 @@ class PoseConfidenceModel:
         """Whether something that is not part of the scene is in front of the camera; False if it was not measured."""
         return fit.occluded_share > self.max_occluded_share
 
+    def is_confirmed(self, fit: Fit) -> bool:
+        """Whether enough image features agree with the pose, and most of those that agree with one another."""
+        return fit.feature_inliers >= self.min_feature_inliers and fit.feature_share >= self.min_feature_share
+
     def _weight_where_mapped(self, fit: Fit) -> float:
-        """The mean robust weight, as it would be on a map with as few holes as those of the calibration."""
+        """The mean robust weight, as it would be on a map with as few holes as those of the calibration.
+
+        Where image features confirm the pose, pixels off the map are of what was not seen yet, and do not count.
+        """
+        if self.is_confirmed(fit) and fit.inlier_share > 0:
+            return min(fit.mean_robust_weight / fit.inlier_share, 1.0)
         if not 0 < fit.map_coverage < self.expected_map_coverage:
             return fit.mean_robust_weight
         return min(fit.mean_robust_weight * self.expected_map_coverage / fit.map_coverage, 1.0)

@@ -12,7 +12,7 @@ from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import extract_features
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
-from spslam.slam.recovery.feature_alignment import FeatureAlignment
+from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches, joined_too
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
@@ -129,8 +129,10 @@ class Recovery:
         if row is None or image is None or tracked.information is None:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
-        matches = frame.matched([row, *self._anchors(history, row)])
-        pose = image.held(tracked.pose, tracked.information, matches)
+        matches = frame.matched([row])
+        frame = frame.with_speed(row, matches)
+        matches += frame.matched(self._anchors(history, row))
+        pose = image.held(tracked.pose, tracked.information, matches, frame.late_px)
         if pose is None:
             return replace(tracked, features=image.features)
         estimate = self._tracker.measure(problem, pose)
@@ -191,7 +193,9 @@ class Recovery:
         if row is None:
             return frame, []
         last = history.frame(row)
-        frame, by_features = self._match(frame, [row, *self._anchors(frame.history, row)])
+        matches = frame.matched([row])
+        frame = frame.with_speed(row, matches)
+        frame, by_features = self._match(frame, [*matches, *frame.matched(self._anchors(history, row))])
         from_poses = (*by_features, frame.problem.predicted, last.pose)
         return frame, [*by_features, *(frame.alignment.pose(last, start) for start in from_poses)]
 
@@ -199,12 +203,12 @@ class Recovery:
         """Rows of the newest stored frames with image features before `row`: from frame to frame a pose may slide."""
         return [known for known in history.feature_rows() if known < row - 1][-ANCHORS:]
 
-    def _match(self, frame: DoubtfulFrame, rows: list[int]) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
-        """The frame with its matches with earlier frames' features, and the poses that these give."""
+    def _match(self, frame: DoubtfulFrame, found: list[FeatureMatches]) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
+        """The frame with those of the matches found that agree on a pose, and these poses."""
         if frame.image is None:
             return frame, []
         matches, starts = list(frame.matches), []
-        for matched in frame.matched(rows):
+        for matched in joined_too(found):
             start = frame.image.pose(matched, frame.problem.predicted.device)
             if start is not None:
                 matches.append(frame.image.counted(matched, start))
@@ -270,7 +274,7 @@ class Recovery:
         starts = [frame.alignment.pose(candidate.earlier, candidate.start) for candidate in alike]
         if frame.image is not None and count:
             rows = retrieve_by_features(frame.history, frame.image, frame.problem.frame)
-            frame, by_features = self._match(frame, rows)
+            frame, by_features = self._match(frame, frame.matched(rows))
             starts = [*by_features, *starts]
         candidates += self._track_from(frame, candidates[0], starts)[1:]
         found = self._likeliest(frame, candidates, anywhere=True)
