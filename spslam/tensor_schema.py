@@ -262,6 +262,8 @@ CHECKPOINT = TensorSchema(
         "unjoined.counts": TensorRule(torch.int64, ("segments",), low=0),
         "noise.model": TensorRule(torch.float32, (4,), low=0),
         "noise.counts": TensorRule(torch.int32, (2, 32, 128), low=0),
+        "noise.timing": TensorRule(torch.float32, (2,), low=-1, high=1),
+        "noise.timing_state": TensorRule(torch.float64, (2, 2), low=-1, high=2e6),
         "features.frames": TensorRule(torch.int64, ("feature_frames",), low=0),
         "features.counts": TensorRule(torch.int64, ("feature_frames",), low=0),
         "features.descriptors": TensorRule(torch.uint8, ("features_kept", 32)),

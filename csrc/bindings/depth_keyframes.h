@@ -11,8 +11,18 @@ namespace spslam::bindings {
 
 // Places in the lists of numbers; spslam/ops/earlier_frames.py fills them.
 enum class KeyframeScalar { kFx, kFy, kCx, kCy, kUnit, kKernelEnd, kCount };
-// Before the rows of each depth keyframe's image and pose.
-enum class KeyframeInteger { kFirstIteration, kCount };
+// Before the places of each depth keyframe. Times are in ns; a motion's row is negative where it is unknown.
+enum class KeyframeInteger { kFirstIteration, kMotionRow, kMotionNs, kCount };
+enum class KeyframePlace { kImage, kPose, kMotionRow, kMotionNs, kCount };
+
+// A motion's row and time.
+inline FrameMotion load_motion(const char* name, const std::int64_t* integers, std::int64_t poses) {
+  if (integers[0] < 0) return {-1, 1.0f};
+  SPS_CHECK(integers[0] < poses && integers[1] > 0, name,
+            ": timing must name poses that are there and positive times, got ", integers[0], " and ", integers[1],
+            " ns");
+  return {integers[0], 1e-9f * static_cast<float>(integers[1])};
+}
 
 inline std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
   std::vector<Tensor> result;
@@ -20,24 +30,28 @@ inline std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
   return result;
 }
 
-// Of the images, the poses and the intensities, if any; none without tensors. They must outlive the launch.
+// Of the images, the poses and, if any, the intensities and after them the delay of colors; none without tensors. They
+// must outlive the launch.
 inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<Tensor>& tensors,
                                            const std::vector<double>& numbers,
                                            const std::vector<std::int64_t>& integers) {
   if (tensors.empty()) return {};
   const Scalars<KeyframeScalar> scalars(name, "depth_keyframe_scalars", numbers);
-  SPS_CHECK((tensors.size() == 2 || tensors.size() == 3) && tensors[0].dim() == 3 && tensors[1].dim() == 2 &&
+  SPS_CHECK(tensors.size() >= 2 && tensors.size() <= 4 && tensors[0].dim() == 3 && tensors[1].dim() == 2 &&
                 tensors[1].size(1) == kPoseSize && (tensors.size() == 2 || same_shape(tensors[2], tensors[0])),
             name, ": depth_keyframes must be images [R, H, W], poses [F, 7] and, if any, intensities [R, H, W]");
+  SPS_CHECK(tensors.size() < 4 || tensors[3].numel() == 1, name, ": color_delay must have one element");
   SPS_CHECK(scalars[KeyframeScalar::kUnit] > 0.0 && scalars[KeyframeScalar::kKernelEnd] > 0.0, name,
             ": depth_keyframes must have a positive unit and kernel_end");
-  constexpr std::size_t kFirstRow = static_cast<std::size_t>(KeyframeInteger::kCount);
-  SPS_CHECK(integers.size() % 2 == kFirstRow % 2 && integers.size() >= kFirstRow &&
-                integers.size() <= kFirstRow + 2 * kMaxDepthKeyframes,
+  constexpr std::size_t kFirst = static_cast<std::size_t>(KeyframeInteger::kCount),
+                        kEach = static_cast<std::size_t>(KeyframePlace::kCount);
+  SPS_CHECK(integers.size() >= kFirst && (integers.size() - kFirst) % kEach == 0 &&
+                integers.size() <= kFirst + kEach * kMaxDepthKeyframes,
             name, ": depth_keyframes must be at most ", kMaxDepthKeyframes);
   DepthKeyframes keyframes{};
   keyframes.images = data<std::uint16_t>(tensors[0]);
-  keyframes.intensities = tensors.size() == 3 ? data<std::uint8_t>(tensors[2]) : nullptr;
+  keyframes.intensities = tensors.size() > 2 ? data<std::uint8_t>(tensors[2]) : nullptr;
+  keyframes.color_delay = tensors.size() == 4 ? data<float>(tensors[3]) : nullptr;
   keyframes.poses = data<float>(tensors[1]);
   keyframes.height = tensors[0].size(1);
   keyframes.width = tensors[0].size(2);
@@ -45,13 +59,18 @@ inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<T
   keyframes.unit = scalars.as<float>(KeyframeScalar::kUnit);
   keyframes.kernel_end = scalars.as<float>(KeyframeScalar::kKernelEnd);
   keyframes.first_iteration = integers[static_cast<std::size_t>(KeyframeInteger::kFirstIteration)];
-  keyframes.count = static_cast<int>((integers.size() - kFirstRow) / 2);
+  const std::int64_t poses = tensors[1].size(0);
+  keyframes.frame_motion = load_motion(name, &integers[static_cast<std::size_t>(KeyframeInteger::kMotionRow)], poses);
+  keyframes.count = static_cast<int>((integers.size() - kFirst) / kEach);
   for (int k = 0; k < keyframes.count; ++k) {
-    const std::int64_t image = integers[kFirstRow + 2 * k], pose = integers[kFirstRow + 2 * k + 1];
-    SPS_CHECK(image >= 0 && image < tensors[0].size(0) && pose >= 0 && pose < tensors[1].size(0), name,
+    const std::int64_t* of = &integers[kFirst + kEach * k];
+    const std::int64_t image = of[static_cast<int>(KeyframePlace::kImage)];
+    const std::int64_t pose = of[static_cast<int>(KeyframePlace::kPose)];
+    SPS_CHECK(image >= 0 && image < tensors[0].size(0) && pose >= 0 && pose < poses, name,
               ": depth_keyframes must name images and poses that are there, got ", image, " and ", pose);
     keyframes.image_rows[k] = image;
     keyframes.pose_rows[k] = pose;
+    keyframes.motions[k] = load_motion(name, of + static_cast<int>(KeyframePlace::kMotionRow), poses);
   }
   return keyframes;
 }

@@ -78,6 +78,14 @@ SPS_INLINE Quaternion<T> quaternion_exp(const Vec3<T>& omega) {
   return {std::cos(half), s * omega.x, s * omega.y, s * omega.z};
 }
 
+// Rotation vector of a unit quaternion, the shorter way.
+template <class T>
+SPS_INLINE Vec3<T> quaternion_log(const Quaternion<T>& q) {
+  const T sign = q.w < T(0) ? T(-1) : T(1), sine = std::sqrt(q.x * q.x + q.y * q.y + q.z * q.z);
+  const T s = sine > T(1e-6) ? T(2) * std::atan2(sine, sign * q.w) / sine : T(2);
+  return {sign * s * q.x, sign * s * q.y, sign * s * q.z};
+}
+
 // A camera pose T_world_camera.
 template <class T>
 struct Pose {

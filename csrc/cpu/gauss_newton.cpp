@@ -20,19 +20,21 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
   const GaussNewtonOptions& options = *measure.options;
   GeometryTile tile(net);
   SurfacePoint points[kTileRows];
+  Pixel pixels[kTileRows];
   Vec3<float> gradients[kTileRows];
   PixelNoise noise[kTileRows];
   float sdf[kTileRows];
   const float inverse_voxel = 1.0f / scene.voxel_size;
-  const auto add_keyframes = [&](const SurfacePoint& point, const PixelNoise& own, const MapResidual& map) {
-    add_keyframe_residuals(measure, point, own, map, 0, 1, terms + kTrackingTerms);
+  const auto add_keyframes = [&](const Pixel& pixel, const SurfacePoint& point, const PixelNoise& own,
+                                 const MapResidual& map) {
+    add_keyframe_residuals(measure, pixel, point, own, map, 0, 1, terms + kTrackingTerms);
   };
   const auto flush = [&] {
     tile.decode(sdf);
     tile.position_gradient(scene, gradients);
     for (std::int64_t i = 0; i < tile.size(); ++i) {
       const bool known = is_tracking_inlier(1.0f, true, sdf[i]);
-      add_keyframes(points[i], noise[i], {sdf[i] * options.truncation, known});
+      add_keyframes(pixels[i], points[i], noise[i], {sdf[i] * options.truncation, known});
       if (known) add_map_residual(measure, points[i].offset, sdf[i], gradients[i], noise[i].map_certainty, terms);
     }
     tile.clear();
@@ -45,10 +47,11 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
     const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
     const PixelNoise own = noise_of(measure, pixel);
     if (!cell.corner_ids) {
-      add_keyframes(point, own, {0.0f, false});
+      add_keyframes(pixel, point, own, {0.0f, false});
       continue;
     }
     points[tile.size()] = point;
+    pixels[tile.size()] = pixel;
     noise[tile.size()] = own;
     tile.add(scene, point.world, cell);
     if (tile.full()) flush();
@@ -95,6 +98,7 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
     const Measurement measure = measurement(options, &frames, iteration);
+    load_color_pose(options, pose, frames);
     sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
                terms);
     float* own_stats = stats + kTrackingStatSize * iteration;

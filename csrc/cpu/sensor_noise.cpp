@@ -16,14 +16,16 @@ void measure_noise<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t num_pixels
   const Pose<float> T_world_camera = load_pose(pose);
   DepthKeyframe loaded[kMaxDepthKeyframes];
   for (int k = 0; k < keyframes.count; ++k) loaded[k] = load_depth_keyframe(keyframes, k);
+  const ColorPose color = color_pose(keyframes.poses, keyframes.frame_motion, keyframes.color_delay, pose);
   // Whole numbers: their sums do not depend on the order.
   const auto add = [counts](std::int64_t at) { __atomic_fetch_add(counts + at, kResidualCount, __ATOMIC_RELAXED); };
   parallel_for(num_pixels, kPixelGrain, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
       if (!(pixel.depth > 0.0f)) continue;
-      const Vec3<float> world = surface_point(pixel, T_world_camera, intrinsics).world;
-      for (int k = 0; k < keyframes.count; ++k) count_residuals(keyframes, loaded[k], pixel, world, add);
+      const PixelPoints points =
+          pixel_points(pixel, surface_point(pixel, T_world_camera, intrinsics), color, intrinsics);
+      for (int k = 0; k < keyframes.count; ++k) count_residuals(keyframes, loaded[k], pixel, points, add);
     }
   });
   for (int histogram = 0; histogram < kNoiseHistograms; ++histogram) {

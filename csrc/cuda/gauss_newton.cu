@@ -68,7 +68,8 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   const bool adds = lane % 4 < 2, known = is_tracking_inlier(pixel.depth, voxel != kNoVoxel, sdf);
   const PixelNoise noise = noise_of(measure, pixel);
   if (pixel.depth > 0.0f) {
-    add_keyframe_residuals(measure, point, noise, {sdf * options.truncation, known}, lane % 4 / 2, 2, keyframe_terms);
+    add_keyframe_residuals(measure, pixel, point, noise, {sdf * options.truncation, known}, lane % 4 / 2, 2,
+                           keyframe_terms);
   }
   if (adds && known) add_map_residual(measure, point.offset, sdf, gradient, noise.map_certainty, terms);
   if (adds) add_reference_residual(measure, pixel, point, terms);
@@ -167,6 +168,8 @@ __global__ void __launch_bounds__(kThreads, 1)
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     const Measurement measure = measurement(options, &frames, iteration);
+    if (threadIdx.x == 0) load_color_pose(options, own_pose, frames);
+    __syncthreads();
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
     double* shared_sums = partials + (iteration % 2) * gridDim.x * kSums;

@@ -17,8 +17,9 @@ __global__ void __launch_bounds__(kThreads)
   if (i >= num_pixels) return;
   const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
   if (!(pixel.depth > 0.0f)) return;
-  const Vec3<float> world = surface_point(pixel, load_pose(pose), intrinsics).world;
-  count_residuals(keyframes, load_depth_keyframe(keyframes, static_cast<int>(blockIdx.y)), pixel, world,
+  const ColorPose color = color_pose(keyframes.poses, keyframes.frame_motion, keyframes.color_delay, pose);
+  const PixelPoints points = pixel_points(pixel, surface_point(pixel, load_pose(pose), intrinsics), color, intrinsics);
+  count_residuals(keyframes, load_depth_keyframe(keyframes, static_cast<int>(blockIdx.y)), pixel, points,
                   [&](std::int64_t at) { atomicAdd(counts + at, kResidualCount); });
 }
 

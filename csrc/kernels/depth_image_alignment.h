@@ -30,6 +30,7 @@ SPS_INLINE void load_target(const GaussNewtonOptions& options, std::int64_t targ
   frames.noise = options.noise ? load_sensor_noise(options.noise) : SensorNoise{};
   const Pose<float> origin{{{1.0f, 0.0f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 1.0f}}, {0.0f, 0.0f, 0.0f}};
   frames.keyframes[0] = keyframe_image(options.depth_keyframes, target, origin);
+  frames.color.lever = 0.0f;
 }
 
 // Adds the residuals of one drawn pixel of a source to terms [kKeyframeTerms].
@@ -39,7 +40,7 @@ SPS_INLINE void add_alignment_residuals(const Measurement& measure, const std::i
   const Pixel pixel = unpack_pixel(record);
   if (!(pixel.depth > 0.0f)) return;
   const SurfacePoint point = surface_point(pixel, pose, measure.options->intrinsics);
-  add_keyframe_residuals(measure, point, noise_of(measure, pixel), {0.0f, false}, 0, 1, terms);
+  add_keyframe_residuals(measure, pixel, point, noise_of(measure, pixel), {0.0f, false}, 0, 1, terms);
 }
 
 // The step that the sums over a pair's pixels give.

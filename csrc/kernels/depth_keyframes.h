@@ -7,6 +7,7 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/color_pose.h"
 #include "kernels/earlier_frame.h"
 #include "kernels/pixel_noise.h"
 #include "kernels/robust_residual.h"
@@ -24,22 +25,26 @@ constexpr float kMaxDepthDifference = 0.05f;
 // The least and the most weight of the map against one keyframe's pixel.
 constexpr double kMinMapShare = 1e-3, kMaxMapShare = 4.0;
 
-// One of them with its pose read.
+// One of them with its poses read.
 struct DepthKeyframe {
   const std::uint16_t* image;
   const std::uint8_t* intensities;  // null where there are none
   Pose<float> pose;
+  ColorPose color;
 };
 
 // The image in a row, of a frame at a pose.
 SPS_INLINE DepthKeyframe keyframe_image(const DepthKeyframes& keyframes, std::int64_t row, const Pose<float>& pose) {
   const std::int64_t first = row * keyframes.height * keyframes.width;
-  return {keyframes.images + first, keyframes.intensities ? keyframes.intensities + first : nullptr, pose};
+  return {
+      keyframes.images + first, keyframes.intensities ? keyframes.intensities + first : nullptr, pose, {pose, 0.0f}};
 }
 
 SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& keyframes, int k) {
-  return keyframe_image(keyframes, keyframes.image_rows[k],
-                        load_pose(keyframes.poses + kPoseSize * keyframes.pose_rows[k]));
+  const float* pose = keyframes.poses + kPoseSize * keyframes.pose_rows[k];
+  DepthKeyframe keyframe = keyframe_image(keyframes, keyframes.image_rows[k], load_pose(pose));
+  keyframe.color = color_pose(keyframes.poses, keyframes.motions[k], keyframes.color_delay, pose);
+  return keyframe;
 }
 
 // How many take part in an iteration.
@@ -95,34 +100,55 @@ SPS_INLINE IntensityDifference intensity_difference(const DepthKeyframes& keyfra
   return {value.value - intensity, value.by_u, value.by_v};
 }
 
-// Adds the difference of intensities in meters: as many as the deviation of the sensor's noise is worth.
+// The derivative of the difference by the point in the keyframe's camera axes, 1/m.
+SPS_INLINE Vec3<float> intensity_by_point(const DepthKeyframes& keyframes, const IntensityDifference& difference,
+                                          const FrameProjection& at) {
+  const float x = difference.by_u * keyframes.intrinsics.fx * at.inverse_z;
+  const float y = difference.by_v * keyframes.intrinsics.fy * at.inverse_z;
+  return {x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
+}
+
+// Adds the difference of intensities in meters: as many as the deviation of the sensor's noise is worth. `lever` is by
+// how much the color's pose moves with a step of the frame's.
 template <class T>
 SPS_INLINE void add_keyframe_intensity(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
                                        const FrameProjection& at, const PixelNoise& noise, float width,
-                                       const Vec3<float>& offset, T* terms) {
+                                       const Vec3<float>& offset, float lever, T* terms) {
   const IntensityDifference difference = intensity_difference(keyframes, keyframe, at, noise.intensity);
   const float deviation = intensity_deviation(noise.sensor, difference.by_u, difference.by_v);
   const float meters = noise.intensity_meters / deviation;
-  const float x = difference.by_u * keyframes.intrinsics.fx * at.inverse_z;
-  const float y = difference.by_v * keyframes.intrinsics.fy * at.inverse_z;
-  const Vec3<float> by_point{x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
-  add_weighted_residual(offset, meters * difference.value, keyframe.pose.rotation * (meters * by_point),
+  const Vec3<float> by_point = intensity_by_point(keyframes, difference, at);
+  add_weighted_residual(offset, meters * difference.value, keyframe.color.pose.rotation * (lever * meters * by_point),
                         static_cast<T>(robust_weight(difference.value, kRobustDeviations * width * deviation)), terms);
 }
 
-// Adds what a keyframe measured at a world point to terms of type T: the distance from its surface, and where the noise
-// of intensities is known their difference; nothing where the point falls off the image or its surface is unknown.
+// Where a keyframe's color image shows a pixel's color, `at` being where its depth image shows the pixel's surface.
+SPS_INLINE FrameProjection color_projection(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
+                                            const PixelPoints& points, const FrameProjection& at) {
+  if (points.lever == 0.0f && keyframe.color.lever == 0.0f) return at;
+  return project_into_frame(keyframe.color.pose, keyframes.intrinsics, keyframes.height, keyframes.width,
+                            points.color.world);
+}
+
+// Adds what a keyframe measured at a pixel's points to terms of type T: the distance from its surface, and where the
+// noise of intensities is known their difference; nothing where the point falls off the image or its surface is
+// unknown.
 template <class T>
 SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
-                                            const Vec3<float>& world, const Vec3<float>& offset, float kernel,
-                                            const PixelNoise& noise, const MapResidual& map, T* terms) {
+                                            const PixelPoints& points, float kernel, const PixelNoise& noise,
+                                            const MapResidual& map, T* terms) {
+  const Vec3<float>&world = points.depth.world, &offset = points.depth.offset;
   const FrameProjection at =
       project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, world);
   if (!at.inside) return;
   const SurfaceDistance surface = surface_distance(keyframes, keyframe, at);
   if (!surface.known) return;
   if (noise.sensor && keyframe.intensities && surface.near) {
-    add_keyframe_intensity(keyframes, keyframe, at, noise, kernel / keyframes.kernel_end, offset, terms);
+    const FrameProjection color_at = color_projection(keyframes, keyframe, points, at);
+    if (color_at.inside) {
+      add_keyframe_intensity(keyframes, keyframe, color_at, noise, kernel / keyframes.kernel_end, points.color.offset,
+                             1.0f + points.lever, terms);
+    }
   }
   const float residual = surface.value, certainty = noise.keyframe_certainty;
   const T weight = static_cast<T>(certainty) * static_cast<T>(robust_weight(residual, kernel));

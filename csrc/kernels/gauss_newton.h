@@ -11,6 +11,7 @@
 #include "kernels/pixel_record.h"
 #include "kernels/reference_image.h"
 #include "kernels/robust_residual.h"
+#include "kernels/surface_point.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
@@ -26,6 +27,7 @@ struct EarlierFrames {
   SensorNoise noise;
   Pose<float> reference;
   DepthKeyframe keyframes[kMaxDepthKeyframes];
+  ColorPose color;  // of the frame itself, where it is in the running iteration
 };
 constexpr int kMaxEarlierFrames = 1 + kMaxDepthKeyframes;
 
@@ -38,6 +40,12 @@ SPS_INLINE void load_earlier_frame(const GaussNewtonOptions& options, int i, Ear
   }
 }
 
+// Of the frame, while its pose [7] is what the last iteration found.
+SPS_INLINE void load_color_pose(const GaussNewtonOptions& options, const float* pose, EarlierFrames& frames) {
+  const DepthKeyframes& keyframes = options.depth_keyframes;
+  frames.color = color_pose(keyframes.poses, keyframes.frame_motion, keyframes.color_delay, pose);
+}
+
 // What the pixels of an iteration are measured against. It points to what all iterations and threads share.
 struct Measurement {
   const GaussNewtonOptions* options;
@@ -45,16 +53,6 @@ struct Measurement {
   int num_keyframes;            // that take part in the iteration
   KernelWidths kernel;
 };
-
-struct SurfacePoint {
-  Vec3<float> world;   // m
-  Vec3<float> offset;  // world - camera center
-};
-
-SPS_INLINE SurfacePoint surface_point(const Pixel& pixel, const Pose<float>& pose, const Intrinsics& intrinsics) {
-  const Vec3<float> offset = pose.rotation * (pixel.depth * pixel_ray(pixel, intrinsics));
-  return {offset + pose.translation, offset};
-}
 
 // Adds an inlier's residual against the map, from its normalized SDF and the SDF's gradient by the world point (1/m).
 template <class T>
@@ -71,11 +69,14 @@ SPS_INLINE PixelNoise noise_of(const Measurement& measure, const Pixel& pixel) {
 
 // Adds a point's residuals against every stride-th depth keyframe of the iteration, from `first` on.
 template <class T>
-SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const SurfacePoint& point, const PixelNoise& noise,
-                                       const MapResidual& map, int first, int stride, T* terms) {
+SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const Pixel& pixel, const SurfacePoint& point,
+                                       const PixelNoise& noise, const MapResidual& map, int first, int stride,
+                                       T* terms) {
+  if (measure.num_keyframes == 0) return;
+  const PixelPoints points = pixel_points(pixel, point, measure.frames->color, measure.options->intrinsics);
   for (int k = first; k < measure.num_keyframes; k += stride) {
-    add_depth_keyframe_residual(measure.options->depth_keyframes, measure.frames->keyframes[k], point.world,
-                                point.offset, measure.kernel.keyframe, noise, map, terms);
+    add_depth_keyframe_residual(measure.options->depth_keyframes, measure.frames->keyframes[k], points,
+                                measure.kernel.keyframe, noise, map, terms);
   }
 }
 

@@ -75,15 +75,17 @@ SPS_INLINE std::int64_t noise_count_at(int histogram, float by, float residual) 
 // Calls add(place in counts) for each residual of a pixel against a keyframe.
 template <class Add>
 SPS_INLINE void count_residuals(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe, const Pixel& pixel,
-                                const Vec3<float>& world, const Add& add) {
+                                const PixelPoints& points, const Add& add) {
   const FrameProjection at =
-      project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, world);
+      project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, points.depth.world);
   if (!at.inside) return;
   const SurfaceDistance surface = surface_distance(keyframes, keyframe, at);
   if (!(surface.known && surface.near)) return;
   add(noise_count_at(0, pixel.depth, surface.value));
   if (!keyframe.intensities) return;
-  const IntensityDifference difference = intensity_difference(keyframes, keyframe, at, luma(pixel.color));
+  const FrameProjection color_at = color_projection(keyframes, keyframe, points, at);
+  if (!color_at.inside) return;
+  const IntensityDifference difference = intensity_difference(keyframes, keyframe, color_at, luma(pixel.color));
   const float gradient = std::sqrt(difference.by_u * difference.by_u + difference.by_v * difference.by_v);
   add(noise_count_at(1, gradient, difference.value));
 }

@@ -2,6 +2,7 @@
 
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.alpha_composite import Composite, alpha_composite, neus_alpha, pack_rays, volsdf_density
+from spslam.ops.capture_timing import CaptureTiming, measure_capture_timing_
 from spslam.ops.covisibility import frame_overlap, select_covisible_frames
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.depth_image_alignment import (
@@ -13,7 +14,14 @@ from spslam.ops.depth_image_alignment import (
     compare_depth_images,
 )
 from spslam.ops.depth_planes import measure_planes
-from spslam.ops.earlier_frames import LUMA_WEIGHTS, DepthKeyframes, ReferenceImage
+from spslam.ops.earlier_frames import (
+    LUMA_WEIGHTS,
+    NO_MOTION,
+    ColorTiming,
+    DepthKeyframes,
+    FrameMotion,
+    ReferenceImage,
+)
 from spslam.ops.encode_frame import EncodedFrame, FrameFusion, VolumeBuffers, encode_frame_
 from spslam.ops.gauss_newton import GaussNewtonOptions, gauss_newton_poses, predict_pose, track_gauss_newton
 from spslam.ops.grid_levels import GridLevel, TriPlaneLevels, VolumeLevels, tri_planes_from_chw
@@ -30,6 +38,7 @@ from spslam.ops.prior_fusion import ENCODER_PARAMETERS, depth_normals, encode_po
 from spslam.ops.projective_icp import projective_icp
 from spslam.ops.ray_sampling import RandomStream, philox_uniform, sample_along_rays, sample_indices
 from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGradients, render_step
+from spslam.ops.rolling_shutter import ShutterMotion, rectify_shutter_images_, rectify_shutter_records_
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
 from spslam.ops.sensor_noise import SensorNoise, measure_noise_
@@ -52,10 +61,13 @@ __all__ = [
     "CUDA_OFF_REASON",
     "ENCODER_PARAMETERS",
     "LUMA_WEIGHTS",
+    "NO_MOTION",
     "Activation",
     "AdamMoments",
     "AdamTable",
     "AlignmentOptions",
+    "CaptureTiming",
+    "ColorTiming",
     "Composite",
     "DepthImageComparison",
     "DepthImages",
@@ -63,6 +75,7 @@ __all__ = [
     "DrawnPixels",
     "EncodedFrame",
     "FrameFusion",
+    "FrameMotion",
     "GaussNewtonOptions",
     "GridLevel",
     "Intrinsics",
@@ -77,6 +90,7 @@ __all__ = [
     "SceneGradients",
     "SceneView",
     "SensorNoise",
+    "ShutterMotion",
     "Sine",
     "TriPlaneLevels",
     "TsdfVolume",
@@ -98,6 +112,7 @@ __all__ = [
     "interpolate_tri_planes",
     "interpolate_volumes",
     "marching_cubes",
+    "measure_capture_timing_",
     "measure_noise_",
     "measure_planes",
     "mlp",
@@ -118,6 +133,8 @@ __all__ = [
     "query_sdf",
     "query_sdf_gradient",
     "random_embeddings",
+    "rectify_shutter_images_",
+    "rectify_shutter_records_",
     "render_step",
     "rendering_losses",
     "sample_along_rays",

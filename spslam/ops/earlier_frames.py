@@ -45,6 +45,45 @@ class ReferenceImage(NamedTuple):
         return [self.cells, self.pose], [*self.intrinsics, self.weight, self.kernel]
 
 
+class FrameMotion(NamedTuple):
+    """How the camera came to a frame.
+
+    Attributes:
+        row: of the pose before, in `DepthKeyframes.poses`; negative where it is unknown.
+        seconds: since that pose, s.
+    """
+
+    row: int
+    seconds: float
+
+
+NO_MOTION = FrameMotion(-1, 1.0)
+
+
+class ColorTiming(NamedTuple):
+    """When color images are taken; the camera is taken to move on as it came from the frame before.
+
+    Attributes:
+        delay: float32 [1] from a frame's depth image to its color image, s, negative where color comes first (see
+            `measure_color_delay_`).
+        keyframes: the motion of each keyframe.
+        frame: that of the frame which is compared with them.
+    """
+
+    delay: torch.Tensor
+    keyframes: tuple[FrameMotion, ...]
+    frame: FrameMotion
+
+    def check(self, function: str, like: torch.Tensor, keyframes: int, poses: int) -> None:
+        """Raises TypeError or ValueError, naming `function`, where something does not fit."""
+        name = "depth_keyframes.timing"
+        check_tensor(function, f"{name}.delay", self.delay, (1,), torch.float32, like=like)
+        check(len(self.keyframes) == keyframes, function, name, f"have {keyframes} motions", len(self.keyframes))
+        for motion in (self.frame, *self.keyframes):
+            fits = motion.row < 0 or (motion.row < poses and 1e-9 <= motion.seconds < 1e9)
+            check(fits, function, name, "name poses that are there and positive times", motion)
+
+
 class DepthKeyframes(NamedTuple):
     """Depth images of earlier frames, to align a frame's surface with.
 
@@ -59,6 +98,7 @@ class DepthKeyframes(NamedTuple):
         first_iteration: from which on they take part; the map alone has the larger basin of convergence.
         intensities: uint8 [R, H, W] intensity (`LUMA_WEIGHTS`) in 1/255, compared where the depth is and agrees with
             the point's own to 5 %; None compares none.
+        timing: when they were taken; None takes each to be of the moment of its depth image.
     """
 
     images: torch.Tensor
@@ -69,6 +109,7 @@ class DepthKeyframes(NamedTuple):
     kernel_end: float
     first_iteration: int = 0
     intensities: torch.Tensor | None = None
+    timing: ColorTiming | None = None
 
     def check(self, function: str, like: torch.Tensor) -> None:
         """Raises TypeError or ValueError, naming `function`, where something does not fit."""
@@ -87,10 +128,16 @@ class DepthKeyframes(NamedTuple):
         for image, pose in self.rows:
             inside = 0 <= image < len(self.images) and 0 <= pose < len(self.poses)
             check(inside, function, f"{name}.rows", "name images and poses that are there", (image, pose))
+        if self.timing is not None:
+            check(self.intensities is not None, function, f"{name}.timing", "come with intensities", "none")
+            self.timing.check(function, like, count, len(self.poses))
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
         """What schemas take: the enums KeyframeScalar and KeyframeInteger in csrc/bindings/depth_keyframes.h."""
-        rows = [row for pair in self.rows for row in pair]
+        timing, count = self.timing, len(self.rows)
+        motions = [NO_MOTION] * (1 + count) if timing is None else [timing.frame, *timing.keyframes]
+        frame, *others = ((motion.row, round(1e9 * motion.seconds)) for motion in motions)
+        places = [place for row, motion in zip(self.rows, others, strict=True) for place in (*row, *motion)]
+        tensors = [self.images, self.poses, self.intensities, None if timing is None else timing.delay]
         scalars = [*self.intrinsics, self.unit, self.kernel_end]
-        intensities = [] if self.intensities is None else [self.intensities]
-        return [self.images, self.poses, *intensities], scalars, [self.first_iteration, *rows]
+        return [one for one in tensors if one is not None], scalars, [self.first_iteration, *frame, *places]

@@ -77,6 +77,11 @@ def noise_figures(model: torch.Tensor) -> dict[str, float]:
     return {"depth_noise_floor_m2": floor, "depth_noise_growth_m2": growth}
 
 
+def timing_figures(color_delay: torch.Tensor, readout: torch.Tensor) -> dict[str, float]:
+    """When the sensor took its images, as was measured: float32 [1] each, s."""
+    return {"color_delay_ms": 1e3 * float(color_delay), "readout_ms": 1e3 * float(readout)}
+
+
 def decoding_figures(clock: RunClock) -> dict[str, float]:
     """Time of decoding."""
     return {"decode_ms": 1e3 * clock.decode_s / max(clock.frames, 1)}

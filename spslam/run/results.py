@@ -23,6 +23,7 @@ from spslam.run.figures import (
     noise_figures,
     origin,
     scene_figures,
+    timing_figures,
     timings,
     tracking_figures,
     truth_figures,
@@ -131,8 +132,10 @@ def write_results(
         missing = []
     if session.warnings or missing:
         metrics["warnings"] = [*session.warnings, *missing]
-    noise = system.state.noise.model
+    sensor = system.state.noise
+    noise = sensor.model
     metrics |= {**truth_figures(trajectory, source.poses), **noise_figures(noise)}
+    metrics |= timing_figures(sensor.color_delay, sensor.readout)
     if request.mesh:
         # The trajectory is the file's, so that `spslam mesh` makes the same one.
         job = MeshJob(system.state.scene, written, system.camera, config.mesh, noise_of_model(noise), earlier)

@@ -24,12 +24,15 @@ class Constraints:
         depth_keyframes: depth images of earlier frames; None uses the map alone.
         keyframes_from_start: whether these take part in all iterations. Normally they join in the second half, as the
             map alone has the larger convergence basin; but with little depth the map does not constrain the pose.
+        shutter: how the camera is predicted to move while the frame is read, by which its records are rectified and its
+            images are not; None where that does not matter.
     """
 
     noise: torch.Tensor | None = None
     reference: ops.ReferenceImage | None = None
     depth_keyframes: ops.DepthKeyframes | None = None
     keyframes_from_start: bool = False
+    shutter: ops.ShutterMotion | None = None
 
     def depth_keyframes_of(self, iterations: int) -> ops.DepthKeyframes | None:
         """The depth keyframes for a call of so many iterations."""
@@ -48,16 +51,18 @@ class ConstraintSource:
 
     def __init__(self, config: Config, camera: Camera):
         weight_m, kernel = config.tracking.color_weight_m, config.tracking.color_kernel
-        self._color = config.tracking.color
+        self._color, self._timing = config.tracking.color, config.tracking.capture_timing
         self._references = ReferenceCache(camera, weight_m, kernel) if weight_m > 0 else None
         self._mapping_every = config.mapping.every
 
-    def gather(self, history: FrameHistory, pixels: FramePixels) -> Constraints:
-        """The constraints of the next frame, of the given pixels."""
+    def gather(self, history: FrameHistory, pixels: FramePixels, timestamp: float | None = None) -> Constraints:
+        """The constraints of the next frame, of the given pixels and, where it is known, time stamp (s)."""
         from_start = pixels.valid_depth_share < LITTLE_DEPTH_SHARE
-        keyframes = history.depth_keyframes()
+        keyframes = history.depth_keyframes(timestamp)
+        if keyframes is not None and not self._timing:
+            keyframes = keyframes._replace(timing=None)
         if keyframes is not None and not self._color:
-            keyframes = keyframes._replace(intensities=None)
+            keyframes = keyframes._replace(intensities=None, timing=None)
         return Constraints(history.noise, self._reference(history), keyframes, from_start)
 
     def _reference(self, history: FrameHistory) -> ops.ReferenceImage | None:

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 import torch
 
 from spslam import ops
+from spslam.slam.color_motion import ColorMotion
 from spslam.slam.image_features import ImageFeatures, features_of_images
+from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.state import SlamState
 
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
 RECENT_COMPARED = 16
+MAX_MOTION_S = 0.12  # between two frames; over a longer time the camera hardly moves evenly
 
 
 @dataclass(frozen=True)
@@ -108,12 +111,39 @@ class FrameHistory:
         """float32 [4] what was measured of the sensor's noise, on the device; see `ops.SensorNoise`."""
         return self._state.noise.model
 
-    def depth_keyframes(self) -> ops.DepthKeyframes | None:
-        """Earlier images to align the next frame with; None if there is none with a trusted pose."""
+    def depth_keyframes(self, timestamp: float | None = None) -> ops.DepthKeyframes | None:
+        """Earlier images to align the next frame with, of a time stamp if known; None if none has a trusted pose."""
         state = self._state
         if state.depth_keyframes is None:
             return None
-        return state.depth_keyframes.select(len(state.frames), state.frames.lost, state.frames.poses)
+        selected = state.depth_keyframes.select(len(state.frames), state.frames.lost, state.frames.poses)
+        if selected is None:
+            return None
+        motions = tuple(self.motion(row, float(state.frames.timestamps[row])) for _, row in selected.rows)
+        timing = ops.ColorTiming(state.noise.color_delay, motions, self.motion(len(state.frames), timestamp))
+        return selected._replace(timing=timing)
+
+    def motion(self, row: int, timestamp: float | None) -> ops.FrameMotion:
+        """How the camera came to the frame of a row, or to the next one, from the frame before."""
+        frames = self._state.frames
+        if timestamp is None or row < 1 or bool(frames.lost[row - 1]):
+            return ops.NO_MOTION
+        seconds = timestamp - float(frames.timestamps[row - 1])
+        return ops.FrameMotion(row - 1, seconds) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
+
+    def color_motion(self, motion: ops.FrameMotion) -> ColorMotion | None:
+        """How a frame's color image moved on from its depth image; None where the two are of one moment, or nothing
+        is known of the motion. Waits for the device."""
+        delay = float(self._state.noise.color_delay)
+        if motion.row < 0 or delay == 0:
+            return None
+        return ColorMotion(pose_matrix(self.poses[motion.row]), delay / motion.seconds)
+
+    def color_pose(self, row: int) -> torch.Tensor:
+        """float32 [7] where the camera took the color image of the frame in a row, on the device."""
+        motion = self.color_motion(self.motion(row, float(self._state.frames.timestamps[row])))
+        pose = self.poses[row]
+        return pose if motion is None else pose_tensor(motion.color_pose(pose_matrix(pose)), pose.device)
 
     def features(self, row: int) -> ImageFeatures | None:
         """Image features of the frame in a row, if they are kept or its images still are; may wait for the device."""

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.errors import DatasetError
@@ -29,6 +30,7 @@ from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.recovery import Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
+from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.state import SlamState
 from spslam.slam.tracker import Tracker, TrackingProblem
 from spslam.slam.upload import Upload
@@ -78,6 +80,7 @@ class FramePipeline:
         self.device = torch.device(device)
         prior = load_prior(config.prior.weights, config.prior.neighborhood)
         self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
+        self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
         confidence = PoseConfidenceModel.load()
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
         self.recovery = Recovery(config, camera, self.tracker, confidence)
@@ -137,18 +140,25 @@ class FramePipeline:
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
-        pixels = self._receive(frame, events)
+        read = self._receive(frame, events)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
-        constraints = Constraints() if begins_map else self.constraints.gather(self.history, pixels)
+        shutter = self._shutter_motion(frame.timestamp)
+        pixels = read if shutter is None else self._rectifier.records(read, shutter)
+        constraints = Constraints()
+        if not begins_map:
+            constraints = replace(self.constraints.gather(self.history, pixels, frame.timestamp), shutter=shutter)
         tracked = self._track(pixels, constraints, number, events)
+        if shutter is not None and not tracked.lost:
+            shutter = shutter._replace(pose=tracked.pose)
+            pixels = self._rectifier.frame(read, shutter)
         self._store(frame, pixels, constraints, tracked)
         if not begins_map:
             self._tell(on_pose)
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
             self._tell(on_pose)
-        self._keep_features(frame, pixels, tracked, number)
+        self._keep_features(frame, read, tracked, number, shutter)
         self._follow_other_maps(frame, pixels)
         is_keyframe = not tracked.occluded and not self.state.frames.lost[-1] and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
@@ -252,6 +262,16 @@ class FramePipeline:
             self._task = self.mapper.begin(self.state, self._task.left)  # it was begun for the map before
         return loops
 
+    def _shutter_motion(self, timestamp: float) -> ops.ShutterMotion | None:
+        """How the camera is predicted to move while the next frame is read; None where that does not matter."""
+        frames, readout = self.state.frames, self.state.noise.readout
+        if not self.config.tracking.capture_timing or not frames.knows_speed:
+            return None
+        motion = self.history.motion(len(frames), timestamp)
+        if motion.row < 0 or (readout.device.type == "cpu" and float(readout) == 0):
+            return None
+        return ops.ShutterMotion(frames.poses[-1].clone(), self.tracker.predict(frames), motion.seconds, readout)
+
     def _receive(self, frame: PreparedFrame, events: FrameEvents) -> FramePixels:
         if not isinstance(frame.pixels, Upload):
             return frame.pixels.to(self.device)
@@ -291,7 +311,14 @@ class FramePipeline:
                 state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes)
             state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image)
 
-    def _keep_features(self, frame: PreparedFrame, pixels: FramePixels, tracked: TrackedFrame, number: int) -> None:
+    def _keep_features(
+        self,
+        frame: PreparedFrame,
+        read: FramePixels,
+        tracked: TrackedFrame,
+        number: int,
+        shutter: ops.ShutterMotion | None,
+    ) -> None:
         """Keeps image features of a doubtful frame, and of every 30th one unless there are enough of its view.
 
         Those that are due and were not extracted ahead are extracted now.
@@ -304,7 +331,9 @@ class FramePipeline:
                 return
             features = frame.features
             if features is None:
-                features = extract_features(pixels, self.camera, self.config.dataset.max_depth_m)
+                features = extract_features(read, self.camera, self.config.dataset.max_depth_m)
+            if shutter is not None:
+                features = self._rectifier.features(features, shutter)
         if features is not None:
             self.state.features.add(number, features)
 

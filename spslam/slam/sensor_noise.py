@@ -1,4 +1,4 @@
-"""The noise of the recording's depth and color, measured while it is tracked."""
+"""The noise of the recording's depth and color, and when they are taken, measured while it is tracked."""
 
 import torch
 
@@ -7,6 +7,7 @@ from spslam.camera import Camera
 from spslam.slam.pixels import FramePixels
 
 PIXELS = 3000  # of a frame, that residuals are counted of
+TIMING_PIXELS = 1000  # that say when images were taken
 
 
 class SensorNoiseEstimate:
@@ -21,6 +22,7 @@ class SensorNoiseEstimate:
     def __init__(self, camera: Camera, depth_noise_m: float | None = None, device: torch.device | str = "cpu"):
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self._noise = ops.SensorNoise.unknown(device)
+        self._timing = ops.CaptureTiming.unknown(device)
         self._depth_noise_m = depth_noise_m
         self._fix_depth()
 
@@ -29,14 +31,27 @@ class SensorNoiseEstimate:
         """float32 [4] for `ops.track_gauss_newton`, on the device."""
         return self._noise.model
 
+    @property
+    def color_delay(self) -> torch.Tensor:
+        """float32 [1] from a frame's depth image to its color image, s, on the device; 0 where it does not matter."""
+        return self._timing.color_delay
+
+    @property
+    def readout(self) -> torch.Tensor:
+        """float32 [1] from the first row of a frame that is read to the last, s; as `color_delay`."""
+        return self._timing.seconds[1:]
+
     def measure(self, pixels: FramePixels, pose: torch.Tensor, depth_keyframes: ops.DepthKeyframes) -> None:
         """Takes account of a frame at a trusted pose, float32 [7]; asynchronously."""
+        if depth_keyframes.timing is not None:
+            records = pixels.records[:TIMING_PIXELS]
+            ops.measure_capture_timing_(self._timing, records, pose, self._intrinsics, self.model, depth_keyframes)
         ops.measure_noise_(self._noise, pixels.records[:PIXELS], pose, self._intrinsics, depth_keyframes)
         self._fix_depth()
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All that a checkpoint needs."""
-        return self._noise._asdict()
+        return {**self._noise._asdict(), "timing": self._timing.seconds, "timing_state": self._timing.state}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replaces the content by a copy of what `tensors()` returned."""

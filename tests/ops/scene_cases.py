@@ -108,6 +108,33 @@ def measure_noise(generator, device, n):
     )
 
 
+def measure_timing(generator, device, n):
+    call = measure_noise(generator, device, n)
+    timing, motion = ops.CaptureTiming.unknown(device), ops.FrameMotion(0, 0.03)
+    colors = ops.ColorTiming(timing.color_delay, (motion, motion), motion)
+    noise = call.pop("noise").model
+    return call | dict(timing=timing, noise=noise, depth_keyframes=call["depth_keyframes"]._replace(timing=colors))
+
+
+def _shutter(device):
+    before = POSE.clone()
+    before[4:] += 0.01
+    return ops.ShutterMotion(before.to(device), POSE.to(device), 0.03, torch.tensor([0.02], device=device))
+
+
+def rectify_records(generator, device, n):
+    records = pixel_records(generator, n).to(device)
+    size = dict(height=48, width=64)
+    return dict(out=records.clone(), records=records, motion=_shutter(device), intrinsics=INTRINSICS, **size)
+
+
+def rectify_images(generator, device, n):
+    depth = (2000 + 100 * uniform(generator, 12, 16)).to(torch.int32).to(torch.uint16).to(device)
+    intensity = (255 * uniform(generator, 12, 16)).to(torch.uint8).to(device)
+    outputs = dict(out_depth=depth.clone(), out_intensity=intensity.clone())
+    return outputs | dict(depth=depth, intensity=intensity, motion=_shutter(device), intrinsics=INTRINSICS, unit=1e-3)
+
+
 def frame_equations(generator, device, n):
     scene = make_scene(generator, random_decoder=True, device=device)
     poses = torch.stack([POSE, POSE]).to(device)

@@ -31,6 +31,12 @@ struct SensorNoise {
 };
 constexpr int kSensorNoiseSize = 4;
 
+// How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown.
+struct FrameMotion {
+  std::int64_t row;
+  float seconds;
+};
+
 constexpr int kMaxDepthKeyframes = 8;
 
 // Depth images of earlier frames, which tracking aligns surface points with; none where count is 0.
@@ -45,6 +51,9 @@ struct DepthKeyframes {
   std::int64_t first_iteration;  // from which on they take part
   int count;
   std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each keyframe
+  // s, from a frame's depth image to its color image; null: they are of one moment.
+  const float* color_delay;
+  FrameMotion motions[kMaxDepthKeyframes], frame_motion;  // of each keyframe, and of the frame that is aligned
 };
 
 // The scalars of GaussNewtonOptions, type and name, in the order of the fields of ops.GaussNewtonOptions: a line here

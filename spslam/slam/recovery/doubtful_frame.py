@@ -46,8 +46,12 @@ class DoubtfulFrame:
         """Matches with the features of the earlier frames in rows that have some."""
         if self.image is None:
             return []
-        known = [(self.history.features(row), self.history.poses[row]) for row in rows]
-        return [self.image.matches(features, pose) for features, pose in known if features is not None]
+        known = [(self.history.features(row), row) for row in rows]
+        return [
+            self.image.matches(features, self.history.color_pose(row))
+            for features, row in known
+            if features is not None
+        ]
 
     def with_speed(self, row: int, matches: Sequence[FeatureMatches]) -> "DoubtfulFrame":
         """The frame, with how far its image moves in `LATE_S` by the first of its matches, which are with `row`."""

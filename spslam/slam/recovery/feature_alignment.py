@@ -15,6 +15,7 @@ import torch
 from spslam.camera import Camera
 from spslam.geometry import inverse
 from spslam.pose_graph import cross_matrices, rotation_matrices, rotation_vectors
+from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.poses import pose_matrix, pose_tensor
@@ -59,21 +60,24 @@ class FeatureAlignment:
     Args:
         features: of the frame.
         camera: of all frames.
+        motion: from the frame's depth to its color image; None where they are of one moment. Poses that are taken and
+            returned are those of depth.
 
     Attributes:
         max_error_px: farther from where the frame shows them, points do not agree with a pose.
         focal_px: focal length of the intensity image.
     """
 
-    def __init__(self, features: ImageFeatures, camera: Camera):
+    def __init__(self, features: ImageFeatures, camera: Camera, motion: ColorMotion | None = None):
         self.features = features
+        self._motion = motion
         k = depth_image_intrinsics(camera)
         self._matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
         self.focal_px = k.fx
         self.max_error_px = max(k.fx * math.tan(math.radians(MAX_ERROR_DEG)), MIN_ERROR_PX)
 
     def matches(self, earlier: ImageFeatures, pose: torch.Tensor) -> FeatureMatches:
-        """Matches with the features of an earlier frame at a pose float32 [7]."""
+        """Matches with the features of an earlier frame whose color image is of a pose float32 [7]."""
         pairs = ratio_matches(self.features.descriptors, earlier.descriptors)
         to_world = pose_matrix(pose)
         local, positions = (
@@ -89,7 +93,7 @@ class FeatureAlignment:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
         if len(matches) < MIN_INLIERS:
             return None
-        found, rotation, translation, inliers = cv2.solvePnPRansac(
+        is_found, rotation, translation, inliers = cv2.solvePnPRansac(
             matches.points,
             matches.positions,
             self._matrix,
@@ -99,7 +103,7 @@ class FeatureAlignment:
             confidence=RANSAC_CONFIDENCE,
             flags=cv2.SOLVEPNP_AP3P,
         )
-        if not found or inliers is None:
+        if not is_found or inliers is None:
             return None
         rows = inliers[:, 0]
         if len(np.unique(matches.positions[rows], axis=0)) < MIN_INLIERS:
@@ -109,7 +113,10 @@ class FeatureAlignment:
         )
         to_camera = np.eye(4)
         to_camera[:3, :3], to_camera[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-        return pose_tensor(inverse(to_camera), device) if np.isfinite(to_camera).all() else None
+        if not np.isfinite(to_camera).all():
+            return None
+        found = inverse(to_camera)
+        return pose_tensor(found if self._motion is None else self._motion.depth_pose(found), device)
 
     def counted(self, matches: FeatureMatches, pose: torch.Tensor) -> FeatureMatches:
         """The matches, with how many agree with the pose float32 [7] that they give."""
@@ -134,7 +141,7 @@ class FeatureAlignment:
         error_px = max(self.max_error_px, late_px)
         agreeing = 0
         for _ in range(HELD_ITERATIONS):
-            residuals, jacobians = self._reprojection(points, positions, at)
+            residuals, jacobians = self._reprojection(points, positions, self._color_pose(at))
             ratio = (residuals**2).sum(1) / error_px**2
             agreeing = int((ratio < 1).sum())
             if agreeing < MIN_INLIERS:
@@ -164,7 +171,11 @@ class FeatureAlignment:
         by_point[:, 1, 1], by_point[:, 1, 2] = fy / z, -fy * y / z**2
         by_world = by_point @ pose[:3, :3].T
         jacobians = np.concatenate([-by_world, by_world @ cross_matrices(arms[front])], 2)
-        return projected - positions[front], jacobians
+        lever = 1.0 if self._motion is None else 1.0 + self._motion.share
+        return projected - positions[front], lever * jacobians
+
+    def _color_pose(self, pose: np.ndarray) -> np.ndarray:
+        return pose if self._motion is None else self._motion.color_pose(pose)
 
     def inliers(self, matches: FeatureMatches, pose: torch.Tensor, late_px: float = 0.0) -> int:
         """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`.
@@ -174,7 +185,7 @@ class FeatureAlignment:
             pose: of this frame.
             late_px: or to within so much, which the image may have moved since depth was measured.
         """
-        to_camera, most_px = inverse(pose_matrix(pose)), max(self.max_error_px, late_px)
+        to_camera, most_px = inverse(self._color_pose(pose_matrix(pose))), max(self.max_error_px, late_px)
         points = matches.points @ to_camera[:3, :3].T + to_camera[:3, 3]
         in_front = points[:, 2] > 0
         projected = points @ self._matrix.T

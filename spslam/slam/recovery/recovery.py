@@ -18,6 +18,7 @@ from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_feature
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.recovery.verifier import Verifier
+from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.tracker import PoseEstimate, Tracker, TrackingProblem
 
 CONSISTENT_FRAMES = 4  # lost frames in a row whose likely poses are consistent are found
@@ -48,6 +49,7 @@ class Recovery:
     def __init__(self, config: Config, camera: Camera, tracker: Tracker, confidence: PoseConfidenceModel):
         self._config, self._camera, self._tracker, self._confidence = config, camera, tracker, confidence
         self._verifier = Verifier(config, camera, confidence)
+        self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
 
     def judge(self, estimate: PoseEstimate) -> TrackedFrame:
         """The estimate, trusted or not by its fit alone."""
@@ -125,7 +127,7 @@ class Recovery:
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
         """The pose held by image features in directions that surface leaves free, where there are enough of them."""
-        row, image = history.last_row(), self._features(pixels)
+        row, image = history.last_row(), self._features(problem, pixels, history)
         if row is None or image is None or tracked.information is None:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
@@ -158,7 +160,9 @@ class Recovery:
         self, problem: TrackingProblem, first: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
         """The best result from the prediction and the last trusted frame; if that is lost, also from similar frames."""
-        frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), self._features(pixels))
+        frame = DoubtfulFrame(
+            problem, pixels, history, IcpAlignment(pixels, self._camera), self._features(problem, pixels, history)
+        )
         frame, starts = self._starts_at_last(frame, first)
         candidates, iterations = self._track_from(frame, first, starts), 0
         seen = self._seen(frame, starts)
@@ -178,12 +182,19 @@ class Recovery:
         iterations += sum(candidate.iterations for candidate in candidates)
         return replace(found, iterations=iterations, features=frame.image.features if frame.image else None)
 
-    def _features(self, pixels: FramePixels) -> FeatureAlignment | None:
+    def _features(
+        self, problem: TrackingProblem, pixels: FramePixels, history: FrameHistory
+    ) -> FeatureAlignment | None:
         tracking = self._config.tracking
         if not (tracking.features and tracking.recovery):
             return None
         features = extract_features(pixels, self._camera, self._config.dataset.max_depth_m)
-        return FeatureAlignment(features, self._camera)
+        if problem.constraints.shutter is not None:
+            features = self._rectifier.features(features, problem.constraints.shutter)
+        keyframes = problem.constraints.depth_keyframes
+        timing = None if keyframes is None else keyframes.timing
+        motion = None if timing is None else history.color_motion(timing.frame)
+        return FeatureAlignment(features, self._camera, motion)
 
     def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
         """Poses against the last trusted frame: by image features, by ICP from the predicted pose and from its own."""

@@ -1,0 +1,40 @@
+// Frames of a rolling shutter as a camera would have them that takes all rows at the middle row's moment.
+#pragma once
+
+#include <cstdint>
+
+#include "core/device.h"
+#include "spslam/types/camera.h"
+
+namespace spslam {
+
+// How the camera moves while it reads a frame out: `before` [7] is the pose of the frame `seconds` earlier, `pose` [7]
+// that of the frame's middle row, readout [1] (s) the time from its first row to its last.
+struct ShutterMotion {
+  const float *before, *pose, *readout;
+  float seconds;
+};
+
+// The camera of a frame's images.
+struct ShutterCamera {
+  Intrinsics intrinsics;
+  std::int64_t height, width;
+};
+
+// records [num_records, 3] to out, which may be the same.
+template <class Device>
+void rectify_shutter_records(Device device, const std::int32_t* records, std::int64_t num_records,
+                             const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out);
+
+// Depth (in `unit` m, 0 where unknown) and intensity, both [height, width] of the camera.
+struct FrameImages {
+  const std::uint16_t* depth;
+  const std::uint8_t* intensity;
+  float unit;
+};
+
+template <class Device>
+void rectify_shutter_images(Device device, const FrameImages& images, const ShutterMotion& motion,
+                            const ShutterCamera& camera, std::uint16_t* depth, std::uint8_t* intensity);
+
+}  // namespace spslam

@@ -1,0 +1,104 @@
+// The maths of a rolling shutter: the camera moves evenly while it reads a frame out (Hedborg et al. 2012), to first
+// order. A point x of a row in camera axes is at the middle row's moment x + s (w x x + c), with s the time from the
+// middle row to the point's, w the angular and c the linear velocity in camera axes.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/macros.h"
+#include "core/vec.h"
+#include "kernels/color_pose.h"
+#include "kernels/earlier_frame.h"
+#include "kernels/pixel_record.h"
+#include "spslam/rolling_shutter.h"
+
+namespace spslam {
+
+// rad, m: what moves by more during the readout has jumped.
+constexpr float kMaxReadoutMotion = 0.15f;
+
+// The velocity in camera axes (rad/s, m/s), and the readout (s); 0 where the frame is to stay as it is.
+struct ReadoutMotion {
+  Vec3<float> turn, way;
+  float readout;
+};
+
+SPS_INLINE Vec3<float> to_camera(const Mat3<float>& rotation, const Vec3<float>& v) {
+  const float* r = rotation.m;
+  return {r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z,
+          r[2] * v.x + r[5] * v.y + r[8] * v.z};
+}
+
+SPS_INLINE ReadoutMotion readout_motion(const ShutterMotion& motion) {
+  const CameraVelocity world = camera_velocity(motion.before, {0, motion.seconds}, motion.pose);
+  const Mat3<float> rotation = load_pose(motion.pose).rotation;
+  const float readout = *motion.readout, turn = readout * std::sqrt(dot(world.turn, world.turn)),
+              way = readout * std::sqrt(dot(world.way, world.way));
+  const bool moves_evenly = std::fabs(turn) < kMaxReadoutMotion && std::fabs(way) < kMaxReadoutMotion;
+  return {to_camera(rotation, world.turn), to_camera(rotation, world.way), moves_evenly ? readout : 0.0f};
+}
+
+SPS_INLINE Vec3<float> at_middle_row(const ReadoutMotion& motion, const Vec3<float>& point, float row,
+                                     std::int64_t height) {
+  const float s = motion.readout * (row / static_cast<float>(height - 1) - 0.5f);
+  return point + s * (cross(motion.turn, point) + motion.way);
+}
+
+// A record at the middle row's moment: its depth and, to the nearest pixel, its place; as it was where that is off the
+// image. `out` may be `words`.
+SPS_INLINE void rectify_record(const ReadoutMotion& motion, const ShutterCamera& camera, const std::int32_t* words,
+                               std::int32_t* out) {
+  const Pixel pixel = unpack_pixel(words);
+  const Intrinsics& k = camera.intrinsics;
+  for (int w = 0; w < kPixelWords; ++w) out[w] = words[w];
+  if (!(pixel.depth > 0.0f) || motion.readout == 0.0f) return;
+  const Vec3<float> moved = at_middle_row(motion, pixel.depth * pixel_ray(pixel, k), pixel.v, camera.height);
+  const float u = std::rint(moved.x / moved.z * k.fx + k.cx), v = std::rint(moved.y / moved.z * k.fy + k.cy);
+  const bool inside =
+      u >= 0.0f && v >= 0.0f && u < static_cast<float>(camera.width) && v < static_cast<float>(camera.height);
+  if (!(moved.z > 0.0f && inside)) return;
+  out[0] = static_cast<std::int32_t>(static_cast<std::uint32_t>(u) | static_cast<std::uint32_t>(v) << 16);
+  __builtin_memcpy(out + 1, &moved.z, sizeof(float));
+}
+
+// Which pixel, as it was read, shows what a pixel is to show, in px; its depth times scale is that of the pixel.
+struct ReadPixel {
+  float column, row, scale;
+};
+
+// Of pixel (y, x), by its own depth: the motion is alike for its neighbors. Without depth only the turn is heeded, as
+// for points far away.
+SPS_INLINE ReadPixel look_up(const FrameImages& images, const ReadoutMotion& motion, const ShutterCamera& camera,
+                             std::int64_t y, std::int64_t x) {
+  const Intrinsics& k = camera.intrinsics;
+  const float u = static_cast<float>(x), v = static_cast<float>(y);
+  const float depth = images.unit * static_cast<float>(images.depth[y * camera.width + x]);
+  const float inverse_z = depth > 0.0f ? 1.0f / depth : 0.0f;
+  const Vec3<float> ray{(u - k.cx) * (1.0f / k.fx), (v - k.cy) * (1.0f / k.fy), 1.0f};
+  const ReadoutMotion per_depth{motion.turn, inverse_z * motion.way, motion.readout};
+  const Vec3<float> moved = at_middle_row(per_depth, ray, v, camera.height);
+  const float by_z = 1.0f / std::fmax(moved.z, 0.5f);
+  const float column = 2.0f * u - (moved.x * by_z * k.fx + k.cx), row = 2.0f * v - (moved.y * by_z * k.fy + k.cy);
+  return {std::fmin(std::fmax(column, 0.0f), static_cast<float>(camera.width - 1)),
+          std::fmin(std::fmax(row, 0.0f), static_cast<float>(camera.height - 1)), moved.z};
+}
+
+// What a pixel of the images shows at the middle row's moment: depth of the nearest pixel that was read, intensity
+// between four.
+SPS_INLINE void rectify_pixel(const FrameImages& images, const ShutterCamera& camera, const ReadPixel& from,
+                              std::uint16_t* depth, std::uint8_t* intensity) {
+  const std::int64_t nearest =
+      static_cast<std::int64_t>(from.row + 0.5f) * camera.width + static_cast<std::int64_t>(from.column + 0.5f);
+  *depth =
+      static_cast<std::uint16_t>(std::fmin(from.scale * static_cast<float>(images.depth[nearest]) + 0.5f, 65535.0f));
+  const std::int64_t left = static_cast<std::int64_t>(std::fmin(from.column, static_cast<float>(camera.width - 2)));
+  const std::int64_t top = static_cast<std::int64_t>(std::fmin(from.row, static_cast<float>(camera.height - 2)));
+  const std::uint8_t* corner = images.intensity + top * camera.width + left;
+  const float a = from.column - static_cast<float>(left), b = from.row - static_cast<float>(top);
+  const BilinearValue value =
+      bilinear_value(corner[0], corner[1], corner[camera.width], corner[camera.width + 1], a, b);
+  *intensity = static_cast<std::uint8_t>(value.value + 0.5f);
+}
+
+}  // namespace spslam

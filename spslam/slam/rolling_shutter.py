@@ -1,0 +1,68 @@
+"""Frames of a rolling shutter, as of their middle row's moment; see `spslam.ops.rolling_shutter`."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.pose_graph import rotation_vectors
+from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
+from spslam.slam.image_features import ImageFeatures
+from spslam.slam.pixels import FramePixels
+from spslam.slam.poses import pose_matrix
+
+
+class ShutterRectifier:
+    """Rectifies frames of one camera.
+
+    Args:
+        camera: of all frames.
+        max_depth_m: the largest depth that images hold.
+    """
+
+    def __init__(self, camera: Camera, max_depth_m: float):
+        self._camera, self._unit = camera, depth_unit(max_depth_m)
+        self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+
+    def records(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
+        """The frame with its records rectified; images, normals and thumbnail are as they were read."""
+        rectified = pixels.holding(pixels.buffer.clone())
+        if pixels.count:
+            size = {"height": self._camera.height, "width": self._camera.width}
+            ops.rectify_shutter_records_(rectified.records, pixels.records, motion, self._intrinsics, **size)
+        return rectified
+
+    def frame(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
+        """The frame with its records and images rectified."""
+        rectified = self.records(pixels, motion)
+        if min(pixels.depth_image_shape) > 1:
+            images = pixels.depth_image, pixels.intensity_image
+            ops.rectify_shutter_images_(
+                rectified.depth_image,
+                rectified.intensity_image,
+                *images,
+                motion,
+                depth_image_intrinsics(self._camera),
+                unit=self._unit,
+            )
+        return rectified
+
+    def features(self, features: ImageFeatures, motion: ops.ShutterMotion) -> ImageFeatures:
+        """Image features of the frame as it was read, rectified; waits for the device."""
+        readout = float(motion.readout)
+        if readout == 0 or len(features) == 0:
+            return features
+        before, pose = pose_matrix(motion.before), pose_matrix(motion.pose)
+        turn = rotation_vectors(before[:3, :3].T @ pose[:3, :3]) / motion.seconds
+        way = pose[:3, :3].T @ (pose[:3, 3] - before[:3, 3]) / motion.seconds
+        k, height = depth_image_intrinsics(self._camera), -(-self._camera.height // depth_image_step(self._camera))
+        positions = features.positions.astype(np.float64)
+        known = features.points[:, 2:] > 0
+        rays = np.concatenate([(positions - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(positions), 1))], 1)
+        points = np.where(known, features.points, rays)
+        share = readout * (positions[:, 1:] / max(height - 1, 1) - 0.5)
+        points = points + share * (np.cross(turn, points) + np.where(known, way, 0))
+        moved = points[:, :2] / points[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
+        kept = np.where(known, points, 0)
+        return replace(features, positions=moved.astype(np.float32), points=kept.astype(np.float32))

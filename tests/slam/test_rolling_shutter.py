@@ -1,0 +1,139 @@
+"""Late colors and rolling shutters through the whole system: their times are found, and poses are those of depth."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from spslam import ops
+from spslam.config import load_config
+from spslam.datasets.registry import open_sequence
+from spslam.evaluation.trajectory_metrics import ate
+from spslam.geometry import inverse
+from spslam.pose_graph import rotation_matrices
+from spslam.slam.color_motion import ColorMotion
+from spslam.slam.depth_keyframes import depth_image_intrinsics
+from spslam.slam.image_features import extract_features
+from spslam.slam.pixels import sample_frame
+from spslam.slam.poses import pose_tensor
+from spslam.slam.recovery.feature_alignment import FeatureAlignment
+from spslam.slam.rolling_shutter import ShutterRectifier
+from spslam.slam.system import SlamSystem
+from tests.system.sequences import Recorded, settings
+
+CPU = torch.device("cpu")
+INTERVAL = 1 / 30
+
+
+def pose_of(turn, way):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_matrices(np.array(turn)), way
+    return pose
+
+
+BEFORE = pose_of((0.02, -0.3, 0.1), (1.0, 2.0, -0.5))
+POSE = BEFORE @ pose_of((0.03, 0.06, -0.01), (0.02, -0.01, 0.03))
+
+
+@pytest.mark.parametrize("share", [0.4, -0.3])
+def test_colors_move_on_and_back(share):
+    motion = ColorMotion(BEFORE, share)
+    color = motion.color_pose(POSE)
+    np.testing.assert_allclose(motion.depth_pose(color), POSE, atol=1e-12)
+    step = inverse(BEFORE) @ POSE
+    further = inverse(BEFORE) @ color
+    np.testing.assert_allclose(further[:3, 3], (1 + share) * step[:3, 3], atol=1e-12)
+    far = POSE.copy()
+    far[0, 3] += 3.0
+    np.testing.assert_array_equal(motion.color_pose(far), far)  # it has jumped
+
+
+def test_features_of_late_colors_give_the_pose_of_depth():
+    """A frame that has the depth of frame 8 and, as late as frame 0 is before, the color of frame 16."""
+    dataset = Recorded(17)
+    first, last = (
+        extract_features(sample_frame(dataset[i], dataset.camera, settings()), dataset.camera, 8.0) for i in (0, 16)
+    )
+    truth = dataset.poses()
+    plain = FeatureAlignment(last, dataset.camera)
+    late = FeatureAlignment(last, dataset.camera, ColorMotion(truth[0], 1.0))
+    matches = plain.matches(first.with_depth(), pose_tensor(truth[0], CPU))
+    at_color, at_depth = plain.pose(matches, CPU), late.pose(matches, CPU)
+    errors = [np.linalg.norm(pose[4:].numpy() - truth[8][:3, 3]) for pose in (at_color, at_depth)]
+    assert errors[1] < 0.5 * errors[0]
+    assert late.inliers(matches, at_depth) == plain.inliers(matches, at_color) > late.inliers(matches, at_color)
+
+
+def test_features_are_rectified_as_records_are():
+    dataset = Recorded(3)
+    pixels = sample_frame(dataset[2], dataset.camera, settings())
+    rectifier = ShutterRectifier(dataset.camera, 8.0)
+    motion = ops.ShutterMotion(pose_tensor(BEFORE, CPU), pose_tensor(POSE, CPU), INTERVAL, torch.tensor([0.02]))
+    features = extract_features(pixels, dataset.camera, 8.0)
+    moved = rectifier.features(features, motion)
+    shares = 0.02 * (features.positions[:, 1] / (dataset.camera.height - 1) - 0.5) / INTERVAL
+    known = features.points[:, 2] > 0
+    step = inverse(BEFORE) @ POSE
+    for i in np.flatnonzero(known)[::40]:
+        along = np.eye(4)
+        along[:3, :3] = rotation_matrices(shares[i] * np.array((0.03, 0.06, -0.01)))
+        along[:3, 3] = shares[i] * (step[:3, :3].T @ step[:3, 3])
+        wanted = along[:3, :3] @ features.points[i] + along[:3, 3]
+        np.testing.assert_allclose(moved.points[i], wanted, atol=0.002)
+    k = depth_image_intrinsics(dataset.camera)
+    projected = moved.points[known, :2] / moved.points[known, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
+    np.testing.assert_allclose(moved.positions[known], projected, atol=0.01)
+    assert not moved.points[~known].any()
+    still = motion._replace(readout=torch.zeros(1))
+    assert rectifier.features(features, still) is features
+
+
+def test_unknown_motion_is_not_made_up():
+    system = SlamSystem(settings("device=cpu", preset="fast"), Recorded(5).camera)
+    for i in range(4):
+        system.process(Recorded(5)[i])
+    history, frames = system.history, system.state.frames
+    assert history.motion(2, float(frames.timestamps[2])).row == 1
+    assert history.motion(0, 0.0) == history.motion(4, None) == ops.NO_MOTION
+    assert history.motion(4, float(frames.timestamps[3])) == ops.NO_MOTION  # time stands still
+    assert history.motion(4, float(frames.timestamps[3]) + 1.0) == ops.NO_MOTION
+    frames.lost[-1] = True
+    assert history.motion(4, 4 * INTERVAL) == ops.NO_MOTION
+
+
+def turning(delay_ms, readout_ms, *overrides):
+    """A generated apartment seen by a turning camera: the system after 75 frames, and its error, cm."""
+    options = ["place=apartment", "motion=fast_turns", "seed=41", "width=240", "height=180", "frames=75"]
+    options += [f"color_delay_ms={delay_ms}", f"rolling_shutter_ms={readout_ms}"]
+    changed = [
+        *(f"dataset.{option}" for option in options),
+        "device=cpu",
+        "graph.enabled=false",
+        "mapping.first_iterations=50",
+        *overrides,
+    ]
+    config = load_config("places", None, changed)
+    dataset = open_sequence(config.dataset)
+    system = SlamSystem(config, dataset.camera, dataset.poses()[0])
+    for i in range(len(dataset)):
+        system.process(dataset[i])
+    trajectory = system.trajectory()
+    assert not trajectory.lost.any()
+    return SimpleNamespace(system=system, ate_cm=ate(trajectory.poses, dataset.poses())["ate_rmse_cm"])
+
+
+@pytest.mark.slow
+def test_times_are_found_and_heeded():
+    heeded, ignored = turning(15, 20), turning(15, 20, "tracking.capture_timing=false")
+    noise = heeded.system.state.noise
+    assert float(noise.color_delay) == pytest.approx(0.015, abs=0.004)
+    assert float(noise.readout) == pytest.approx(0.020, abs=0.005)
+    assert heeded.ate_cm < 0.7 * ignored.ate_cm
+    assert not ignored.system.state.noise.tensors()["timing_state"].any()
+
+
+@pytest.mark.slow
+def test_a_camera_of_one_moment_is_found_to_be_one():
+    noise = turning(0, 0).system.state.noise
+    assert float(noise.color_delay) == float(noise.readout) == 0.0
