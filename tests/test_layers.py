@@ -33,6 +33,7 @@ GROUND = {
     "errors",
     "geometry",
     "io",
+    "loading",
     "notebook",
     "options",
     "pose_graph",

@@ -17,6 +17,8 @@ namespace spslam {
 // sums in flight for the multiply-add units, and they fit the registers.
 constexpr int kRowBlock = kVectorRegisters == 32 ? 8 : 4;
 constexpr int kColumnVectors = 2;
+// The same for layers of eight vectors or more, where 16 registers hold four rows of three.
+constexpr int kWideColumnVectors = kVectorRegisters == 32 ? 2 : 3;
 
 // Samples of a tile whose forward and backward values stay in the L1 cache.
 constexpr std::int64_t kTileRows = 64;
@@ -32,8 +34,9 @@ inline __attribute__((always_inline)) void accumulate(const T* a, std::int64_t a
     Vector<T> right[N];
 #pragma GCC unroll 8
     for (int n = 0; n < N; ++n) {
-      right[n] = load_vector<Vector<T>>(b + k * b_stride + n * kLanes<T>);
-      hold_in_register(right[n]);
+      Vector<T> loaded = load_vector<Vector<T>>(b + k * b_stride + n * kLanes<T>);
+      hold_in_register(loaded);
+      right[n] = loaded;
     }
 #pragma GCC unroll 8
     for (int m = 0; m < M; ++m) {
@@ -44,21 +47,21 @@ inline __attribute__((always_inline)) void accumulate(const T* a, std::int64_t a
   }
 }
 
-// Splits `columns` (a multiple of the vector) into blocks of two vectors and a last one of one.
-template <class T, class F>
-inline __attribute__((always_inline)) void for_column_blocks(std::int64_t columns, const F& f) {
-  std::int64_t column = 0;
-  for (; column + kColumnVectors * kLanes<T> <= columns; column += kColumnVectors * kLanes<T>) {
-    f(column, std::integral_constant<int, kColumnVectors>{});
+// Splits `columns` (a multiple of the vector) from `column` on into blocks of kVectors, and the rest into smaller ones.
+template <class T, int kVectors = kColumnVectors, class F>
+inline __attribute__((always_inline)) void for_column_blocks(std::int64_t columns, const F& f,
+                                                             std::int64_t column = 0) {
+  for (; column + kVectors * kLanes<T> <= columns; column += kVectors * kLanes<T>) {
+    f(column, std::integral_constant<int, kVectors>{});
   }
-  for (; column < columns; column += kLanes<T>) f(column, std::integral_constant<int, 1>{});
+  if constexpr (kVectors > 1) for_column_blocks<T, kVectors - 1>(columns, f, column);
 }
 
 // out[r] = relu(x[r] W + bias) for `rows` rows, a multiple of kRowBlock.
-template <class T>
+template <class T, int kVectors = kColumnVectors>
 inline void hidden_layer(const T* x, std::int64_t x_stride, std::int64_t inputs, const T* weights, const T* bias,
                          std::int64_t outputs, std::int64_t rows, T* out) {
-  for_column_blocks<T>(outputs, [&](std::int64_t column, auto vectors) {
+  for_column_blocks<T, kVectors>(outputs, [&](std::int64_t column, auto vectors) {
     constexpr int N = decltype(vectors)::value;
     for (std::int64_t row = 0; row < rows; row += kRowBlock) {
       Vector<T> sums[kRowBlock][N];

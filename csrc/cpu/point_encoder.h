@@ -151,8 +151,8 @@ class PointEncoder {
     for (std::int64_t r = rows_; r % kRowBlock != 0; ++r) {
       std::memset(h1_ + r * kEncoderHidden, 0, kEncoderHidden * sizeof(float));
     }
-    detail::hidden_layer<float>(h1_, kEncoderHidden, kEncoderHidden, net_.w2, net_.b2, kEncoderHidden,
-                                round_up(rows_, kRowBlock), h2_);
+    detail::hidden_layer<float, kWideColumnVectors>(h1_, kEncoderHidden, kEncoderHidden, net_.w2, net_.b2,
+                                                    kEncoderHidden, round_up(rows_, kRowBlock), h2_);
     for (std::int64_t r = 0; r < rows_; ++r) {
       float* sum = sums_ + static_cast<std::int64_t>(entry_[r]) * kEncoderHidden;
       for (int c = 0; c < kEncoderHidden; c += kLanes<float>) {

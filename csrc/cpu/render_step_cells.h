@@ -122,20 +122,22 @@ inline void compact_samples(const RenderOptions& options, Chunk& chunk) {
   for (std::int64_t i = 0; i < chunk.num_rays; ++i) {
     Ray& ray = chunk.rays[i];
     ray.begin = n;
-    ray.num_free = ray.num_near = 0;
+    std::int32_t num_free = 0, num_near = 0;
     const float* depths = chunk.depths + i * count;
     const std::int32_t* cell_of = chunk.cell_of + i * count;
     for (std::int32_t s = 0; ray.valid && s < count; ++s) {
       const std::int32_t voxel = cell_of[s] < 0 ? kNoVoxel : chunk.cells[cell_of[s]].voxel_id;
       const bool inside = voxel != kNoVoxel;
-      const SampleTarget<float> target = sample_target(ray.pixel.depth, depths[s], ray.cosine, truncation, inside);
-      ray.num_free += target.free;
-      ray.num_near += target.near;
+      const float distance = target_distance(ray.pixel.depth, depths[s], ray.cosine);
+      num_free += in_free_space(distance, truncation);
+      num_near += near_surface(distance, truncation, inside);
       chunk.t[n] = depths[s];
       chunk.voxel_of[n] = voxel;
       chunk.ray_of[n] = static_cast<std::int32_t>(i);
       n += inside;
     }
+    ray.num_free = num_free;
+    ray.num_near = num_near;
     ray.end = n;
   }
   chunk.num_inside = n;

@@ -59,6 +59,8 @@ struct PlaneFraction {
 // assigned in turn.
 constexpr int kEmbeddingParts = 4, kEmbeddingBlockShift = 6;
 
+static_assert(kEmbeddingParts * kCellCorners <= 32, "one bit for each corner in each part");
+
 // Consecutive samples in one cell: those from the end of the run before to `end`.
 struct EmbeddingRun {
   std::int32_t corners[kCellCorners];

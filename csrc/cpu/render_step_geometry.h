@@ -128,10 +128,15 @@ inline std::int64_t store_embedding_runs(const SceneView& scene, std::int64_t fi
     if (i == 0 || chunk.voxel_of[i] != chunk.voxel_of[i - 1]) {
       EmbeddingRun& run = runs[count++];
       const std::int32_t* corners = scene.corner_ids + kCellCorners * std::int64_t{chunk.voxel_of[i]};
-      for (std::uint8_t& owned : run.owned) owned = 0;
+      // In a register: a byte in memory that is read just after it was written is waited for.
+      std::uint32_t owned = 0;
       for (int k = 0; k < kCellCorners; ++k) {
         run.corners[k] = corners[k];
-        run.owned[(corners[k] >> kEmbeddingBlockShift) % kEmbeddingParts] |= static_cast<std::uint8_t>(1 << k);
+        const std::uint32_t part = (static_cast<std::uint32_t>(corners[k]) >> kEmbeddingBlockShift) % kEmbeddingParts;
+        owned |= 1u << (kCellCorners * part + k);
+      }
+      for (int part = 0; part < kEmbeddingParts; ++part) {
+        run.owned[part] = static_cast<std::uint8_t>(owned >> (kCellCorners * part));
       }
     }
     runs[count - 1].end = static_cast<std::int32_t>(i + 1);

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 from spslam.cli.parser import Parser
 from spslam.errors import SpslamError
+from spslam.loading import collector_paused
 
 EXIT_UNEXPECTED = 1
 EXIT_USER_ERROR = 2
@@ -65,7 +66,8 @@ def exit_code(run: Callable[[], None], arguments: Sequence[str]) -> int:
 
 def _run(arguments: list[str]) -> None:
     command = next((argument for argument in arguments if not argument.startswith("-")), None)
-    parser = _build_parser(command)
+    with collector_paused():
+        parser = _build_parser(command)
     args = parser.parse_args(arguments)
     if args.command is None:
         parser.print_help()

@@ -15,6 +15,7 @@ from spslam.cli.progress import make_progress, print_summary
 from spslam.cli.viewing import add_view, opened_viewer
 from spslam.config import Config, load_config
 from spslam.errors import DeviceError
+from spslam.loading import collector_paused
 from spslam.run.reader_launch import end_standby, launch_standby
 from spslam.run.request import RunRequest
 from spslam.run_folder import RunFolder
@@ -86,18 +87,18 @@ def run(
         SpslamError: as of `run_sequence`.
         KeyboardInterrupt: after Ctrl-C; its message says how to resume.
     """
-    from spslam.datasets import open_sequence
+    from spslam.run.data_check import OpenedData
 
-    # Report unusable data before torch is loaded, which takes seconds.
-    open_sequence(request.config.dataset, request.data_dir, request.frames)
-
+    # Loading torch takes seconds: unusable data are reported before, and a thread looks at the frames meanwhile.
+    opened = OpenedData(request)
     launch_standby(request.config)
-    from spslam.run.sequence import run_sequence
+    with collector_paused():
+        from spslam.run.sequence import run_sequence
 
     progress = make_progress(quiet)
     resume = f"{command} --output {request.output_dir} --resume continues"
     try:
-        return run_sequence(request, progress, observer)
+        return run_sequence(request, progress, observer, opened)
     except KeyboardInterrupt:
         if _can_resume(request.output_dir):
             raise KeyboardInterrupt(resume) from None

@@ -6,15 +6,17 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.frame_arrays import UNNUMBERED, checked_arrays
-from spslam.datasets.solids import SolidScene
 from spslam.errors import DatasetError
+
+if TYPE_CHECKING:
+    from spslam.datasets.solids import SolidScene
 
 # Most frames of a sequence that one file tells of: almost five hours at 30 Hz.
 MAX_FRAMES = 1 << 19

@@ -1,31 +1,18 @@
-"""The kinds of dataset by name, and how each takes its options from a configuration."""
+"""The kinds of dataset by name, and how each takes its options from a configuration.
+
+A kind's module is imported when a dataset of it is opened: a run needs one of twenty.
+"""
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from spslam.datasets.arkitscenes import open_arkitscenes
-from spslam.datasets.azure_kinect import open_azure_kinect
 from spslam.datasets.base import RgbdDataset, Subset
-from spslam.datasets.folder import open_folder
-from spslam.datasets.generated import GeneratedDataset
-from spslam.datasets.icl_nuim import open_icl_nuim
-from spslam.datasets.open3d_recording import open_open3d
-from spslam.datasets.places import Capture, PlacesDataset
-from spslam.datasets.record3d import open_record3d
-from spslam.datasets.replica import open_replica
-from spslam.datasets.rosbag import RosOptions, open_realsense, open_rosbag
-from spslam.datasets.scannet import open_scannet
-from spslam.datasets.scannetpp import open_scannetpp
-from spslam.datasets.seven_scenes import SPLITS, list_sequences, open_seven_scenes
-from spslam.datasets.stray_scanner import open_stray_scanner
-from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
-from spslam.datasets.tum import open_bonn, open_tum
-from spslam.datasets.video_recording import open_video_recording
 from spslam.errors import DatasetError
 from spslam.options import DatasetOptions
 
@@ -98,6 +85,8 @@ def sequence_options(options: DatasetOptions) -> list[DatasetOptions]:
     Raises:
         DatasetError: a missing folder, or a missing or malformed split file.
     """
+    from spslam.datasets.seven_scenes import SPLITS, list_sequences
+
     split = options.sequence if options.sequence in SPLITS else None
     if options.type != "7scenes" or options.path is None or (options.sequence is not None and split is None):
         return [options]
@@ -110,65 +99,64 @@ def dataset_types() -> list[str]:
     return [*_OPENERS, *_RENDERED]
 
 
-def _open_seven_scenes(config: Any, path: Path) -> RgbdDataset:
-    return open_seven_scenes(path, _option(config, "sequence"))
-
-
-def _open_synthetic_rgbd(config: Any, path: Path) -> RgbdDataset:
-    return open_synthetic_rgbd(path, _option(config, "depth_variant"))
-
-
-def _open_rosbag(config: Any, path: Path) -> RgbdDataset:
-    return open_rosbag(path, _ros_options(config))
-
-
-def _open_realsense(config: Any, path: Path) -> RgbdDataset:
-    return open_realsense(path, _ros_options(config))
-
-
-def _ros_options(config: Any) -> RosOptions:
-    given = _given(config, [field.name for field in fields(RosOptions)])
-    return RosOptions(**given, **_given_as(config, view="register_to"))
-
-
-def _open_with(opener: Callable[..., RgbdDataset], *names: str, **renamed: str) -> _Opener:
-    """An opener that takes options by their names, or by those of its own."""
+def _open_with(module: str, opener: str, *names: str, **renamed: str) -> _Opener:
+    """An opener of a module of this package, which takes options by their names, or by those of its own."""
 
     def open_path(config: Any, path: Path) -> RgbdDataset:
-        return opener(path, **_given(config, names), **_given_as(config, **renamed))
+        return _load(module, opener)(path, **_given(config, names), **_given_as(config, **renamed))
+
+    return open_path
+
+
+def _open_ros_with(opener: str) -> _Opener:
+    """An opener of ROS bags, which takes options as one object."""
+
+    def open_path(config: Any, path: Path) -> RgbdDataset:
+        options = _load("rosbag", "RosOptions")
+        given = _given(config, [field.name for field in fields(options)])
+        return _load("rosbag", opener)(path, options(**given, **_given_as(config, view="register_to")))
 
     return open_path
 
 
 def _open_generated(config: Any) -> RgbdDataset:
-    return GeneratedDataset(**_given(config, ("frames", "width", "height", "noise", "seed")))
+    return _load("generated", "GeneratedDataset")(**_given(config, ("frames", "width", "height", "noise", "seed")))
 
 
 def _open_places(config: Any) -> RgbdDataset:
-    capture = Capture(**_given(config, [field.name for field in fields(Capture)]))
+    capture = _load("places", "Capture")
+    captured = capture(**_given(config, [field.name for field in fields(capture)]))
     names = ("place", "motion", "sensor", "frames", "seed", "texture")
-    return PlacesDataset(**_given(config, names), capture=capture)
+    return _load("places", "PlacesDataset")(**_given(config, names), capture=captured)
+
+
+def _load(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(f"spslam.datasets.{module}"), name)
 
 
 _Opener = Callable[[Any, Path], RgbdDataset]
 _OPENERS: dict[str, _Opener] = {
-    "7scenes": _open_seven_scenes,
-    "synthetic_rgbd": _open_synthetic_rgbd,
-    "tum": _open_with(open_tum),
-    "replica": _open_with(open_replica),
-    "scannet": _open_with(open_scannet),
-    "folder": _open_with(open_folder, "depth_scale", "min_confidence", view="register_to"),
-    "rosbag": _open_rosbag,
-    "realsense": _open_realsense,
-    "azure_kinect": _open_with(open_azure_kinect, tolerance_s="pair_tolerance_s", view="register_to"),
-    "stray_scanner": _open_with(open_stray_scanner, "min_confidence", view="register_to"),
-    "record3d": _open_with(open_record3d, "min_confidence", view="register_to"),
-    "scannetpp": _open_with(open_scannetpp, view="register_to"),
-    "arkitscenes": _open_with(open_arkitscenes, "min_confidence", tolerance_s="pair_tolerance_s", view="register_to"),
-    "open3d": _open_with(open_open3d, "depth_scale", view="register_to"),
-    "video": _open_with(open_video_recording, "depth_scale", tolerance_s="pair_tolerance_s", view="register_to"),
-    "bonn": _open_with(open_bonn),
-    "icl_nuim": _open_with(open_icl_nuim),
+    "7scenes": _open_with("seven_scenes", "open_seven_scenes", "sequence"),
+    "synthetic_rgbd": _open_with("synthetic_rgbd", "open_synthetic_rgbd", "depth_variant"),
+    "tum": _open_with("tum", "open_tum"),
+    "replica": _open_with("replica", "open_replica"),
+    "scannet": _open_with("scannet", "open_scannet"),
+    "folder": _open_with("folder", "open_folder", "depth_scale", "min_confidence", view="register_to"),
+    "rosbag": _open_ros_with("open_rosbag"),
+    "realsense": _open_ros_with("open_realsense"),
+    "azure_kinect": _open_with("azure_kinect", "open_azure_kinect", tolerance_s="pair_tolerance_s", view="register_to"),
+    "stray_scanner": _open_with("stray_scanner", "open_stray_scanner", "min_confidence", view="register_to"),
+    "record3d": _open_with("record3d", "open_record3d", "min_confidence", view="register_to"),
+    "scannetpp": _open_with("scannetpp", "open_scannetpp", view="register_to"),
+    "arkitscenes": _open_with(
+        "arkitscenes", "open_arkitscenes", "min_confidence", tolerance_s="pair_tolerance_s", view="register_to"
+    ),
+    "open3d": _open_with("open3d_recording", "open_open3d", "depth_scale", view="register_to"),
+    "video": _open_with(
+        "video_recording", "open_video_recording", "depth_scale", tolerance_s="pair_tolerance_s", view="register_to"
+    ),
+    "bonn": _open_with("tum", "open_bonn"),
+    "icl_nuim": _open_with("icl_nuim", "open_icl_nuim"),
 }
 _RENDERED: dict[str, Callable[[Any], RgbdDataset]] = {"generated": _open_generated, "places": _open_places}
 

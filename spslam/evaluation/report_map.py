@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from spslam.camera import Camera
@@ -11,6 +13,8 @@ from spslam.evaluation.run_output import Mesh, Preview, RunOutput
 from spslam.meshing.render import render_mesh
 
 VIEWS = 3
+# Of rendering; each needs some 200 MB.
+_THREADS = 2
 
 
 def outward_mesh(run: RunOutput) -> Mesh | None:
@@ -38,7 +42,9 @@ def views_section(run: RunOutput, mesh: Mesh | None) -> str:
     """Input images beside the mesh as seen from there; empty without a mesh or a preview."""
     if mesh is None or run.camera is None:
         return ""
-    rows = [_view(run, mesh, run.camera, preview) for preview in _spread(run.previews(), VIEWS)]
+    camera = run.camera
+    with ThreadPoolExecutor(_THREADS) as threads:  # NumPy works without Python's lock
+        rows = list(threads.map(lambda preview: _view(run, mesh, camera, preview), _spread(run.previews(), VIEWS)))
     return section("Views", "".join(rows), "Input images, and the mesh rendered from the estimated poses")
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spslam.errors import DatasetError, brief
+from spslam.meshing.ply import decode_own_ply
 from spslam.notebook import mesh_html
 from spslam.reading import read_bytes
 
@@ -62,25 +63,31 @@ def load_mesh(path: Path) -> Mesh:
         DatasetError: no such file, another format, damaged, a count beyond what the file can hold, a face that names no
             vertex, or a coordinate that isn't finite or lies beyond `MAX_COORDINATE_M`. One line that names the file.
     """
-    import trimesh
-
     suffix = path.suffix.lower()
     if suffix not in READ_FORMATS:
         raise DatasetError(f"{path}: a mesh must be one of {', '.join(READ_FORMATS)}, got {suffix or 'no suffix'}")
     content = read_bytes(path, MAX_MESH_BYTES, DatasetError)
     try:
-        if suffix == ".ply":
-            _check_ply_counts(content)
-        loaded = trimesh.load(io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True)
-        mesh = _as_one(loaded, len(content))
-        if not len(mesh.faces):
+        vertices, faces, colors = (decode_own_ply(content) if suffix == ".ply" else None) or _decode(content, suffix)
+        if not len(faces):
             return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.uint8))
-        vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
         _check(vertices, faces)
-        return Mesh(vertices, faces, _vertex_colors(mesh))
+        return Mesh(vertices, faces, colors)
     except Exception as error:  # trimesh raises whatever the parser stumbles over
         text = brief(str(error) or type(error).__name__, 200)
         raise DatasetError(f"{path}: can't be read as a mesh: {text}") from error
+
+
+def _decode(content: bytes, suffix: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and colors of a file of any origin."""
+    import trimesh
+
+    if suffix == ".ply":
+        _check_ply_counts(content)
+    loaded = trimesh.load(io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True)
+    mesh = _as_one(loaded, len(content))
+    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    return vertices, faces, _vertex_colors(mesh) if len(faces) else np.zeros((0, 3), np.uint8)
 
 
 def _check_ply_counts(content: bytes) -> None:

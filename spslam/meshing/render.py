@@ -9,27 +9,11 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.geometry import inverse
+from spslam.meshing.shading import Raster, barycentric, cross, shade
 
 NEAREST_M = 0.02
 # Largest number of fragments in memory; some 40 bytes each.
 _FRAGMENTS = 2_000_000
-_BACKGROUND = 255
-# A headlight slightly above the camera, and ambient light.
-_LIGHT = np.array([0.25, -0.5, -1.0]) / np.linalg.norm([0.25, -0.5, -1.0])
-_AMBIENT, _DIFFUSE = 0.55, 0.55
-
-
-@dataclass(frozen=True)
-class Raster:
-    """Depth and visible face of each pixel.
-
-    Attributes:
-        depth: float32 [H, W], meters along the optical axis; 0 for background.
-        face_ids: int32 [H, W], -1 for background.
-    """
-
-    depth: np.ndarray
-    face_ids: np.ndarray
 
 
 def render_mesh(
@@ -59,7 +43,7 @@ def render_mesh(
     fine = camera.resized(camera.width * supersampling, camera.height * supersampling)
     points, faces = _to_camera(np.asarray(vertices), T_world_camera), np.asarray(faces).reshape(-1, 3)
     raster = _rasterize(points, faces, fine, cull_back)
-    image = _shade(points, faces, colors, fine, raster)
+    image = shade(points, faces, colors, fine, raster)
     if supersampling == 1:
         return image, raster.depth
     size = camera.width, camera.height
@@ -110,8 +94,8 @@ def render_colors(
     hit = raster.face_ids >= 0
     shown = faces[raster.face_ids[hit]]
     corners = points.astype(np.float32)[shown]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    weights = _barycentric(corners, (camera.ray_directions() * raster.depth[..., None])[hit], normals)
+    normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    weights = barycentric(corners, (camera.ray_directions() * raster.depth[..., None])[hit], normals)
     image[hit] = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[shown, :3].astype(np.float32)).round()
     return image, raster.depth
 
@@ -265,46 +249,3 @@ def _pixel_range(coordinates: np.ndarray, size: int) -> tuple[np.ndarray, np.nda
     first = np.clip(np.ceil(coordinates.min(axis=1)), 0, size)
     last = np.clip(np.floor(coordinates.max(axis=1)), -1, size - 1)
     return first.astype(np.int64), last.astype(np.int64)
-
-
-def _shade(
-    points: np.ndarray, faces: np.ndarray, colors: np.ndarray | None, camera: Camera, raster: Raster
-) -> np.ndarray:
-    hit = raster.face_ids >= 0
-    image = np.full((*hit.shape, 3), _BACKGROUND, dtype=np.uint8)
-    if not hit.any():
-        return image
-    shown = faces[raster.face_ids[hit]]
-    corners = points.astype(np.float32)[shown]
-    places = (camera.ray_directions() * raster.depth[..., None])[hit]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    light = _lighting(normals, places, hit)
-    if colors is None:
-        base: np.ndarray | float = 200.0
-    else:
-        weights = _barycentric(corners, places, normals)
-        base = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[shown, :3].astype(np.float32))
-    image[hit] = np.clip(base * light[:, None], 0, 255).astype(np.uint8)
-    return image
-
-
-def _lighting(normals: np.ndarray, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Brightness of each foreground pixel; normals face the viewer and are blurred slightly, to hide facets."""
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    normals = np.where((normals * points).sum(axis=1, keepdims=True) > 0, -normals, normals)
-    image = np.zeros((*hit.shape, 3), dtype=np.float32)
-    image[hit] = normals
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)[hit]
-    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-6)
-    return _AMBIENT + _DIFFUSE * np.clip(smooth @ _LIGHT.astype(np.float32), 0, 1)
-
-
-def _barycentric(corners: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Barycentric weights [N, 3] of points in the planes of triangles."""
-    area = np.maximum((normals * normals).sum(axis=1), 1e-30)
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    wb = (np.cross(points - a, c - a) * normals).sum(axis=1) / area
-    wc = (np.cross(b - a, points - a) * normals).sum(axis=1) / area
-    weights = np.clip(np.stack([1 - wb - wc, wb, wc], axis=1), 0, 1)
-    return (weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)).astype(np.float32)

@@ -16,7 +16,6 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError, OutputError
-from spslam.evaluation.html_report import write_report
 from spslam.io import atomic_write, writing
 from spslam.run.chunk_options import ChunkPlan
 from spslam.run_folder import RunFolder
@@ -196,6 +195,8 @@ class OutputFolder(RunFolder):
 
     def write_report(self) -> None:
         """Writes the report from the other files."""
+        from spslam.evaluation.html_report import write_report  # needed after the last frame only
+
         write_report(self.path)
 
 

@@ -48,7 +48,11 @@ def launch() -> LaunchedReader:
     """
     shared = os.memfd_create("spslam-frames")
     own, other = Pipe()
-    code = f"from {SERVICE_MODULE} import {SERVICE_FUNCTION}; {SERVICE_FUNCTION}({other.fileno()}, {shared})"
+    code = (
+        "from spslam.loading import collector_paused\n"
+        f"with collector_paused(): from {SERVICE_MODULE} import {SERVICE_FUNCTION}\n"
+        f"{SERVICE_FUNCTION}({other.fileno()}, {shared})"
+    )
     try:
         process = subprocess.Popen(
             [sys.executable, "-c", code],

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 
 from spslam.config import Config
-from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
 from spslam.notebook import RunProgress, in_notebook
-from spslam.run.data_check import check_data
+from spslam.run.data_check import OpenedData
 from spslam.run.device import explained_failures, resolve_device
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.loop import Progress, RunLoop
@@ -28,7 +27,10 @@ __all__ = ["Progress", "RunRequest", "first_pose", "run_sequence"]
 
 
 def run_sequence(
-    request: RunRequest, progress: Progress | None = None, observer: RunObserver | None = None
+    request: RunRequest,
+    progress: Progress | None = None,
+    observer: RunObserver | None = None,
+    opened: OpenedData | None = None,
 ) -> dict[str, Any]:
     """Runs SLAM over a sequence and writes trajectory, map, mesh, metrics, log and report.
 
@@ -39,6 +41,7 @@ def run_sequence(
         progress: called after each frame with (frames done, total frames, report of the frame or None if the frame
             could not be read). In a notebook, None shows a progress bar in the cell.
         observer: watches the run, as the viewer does (`spslam.viewer`); results are the same without it.
+        opened: the request's data, where they were opened before; None opens them.
 
     Returns:
         What is written to metrics.json.
@@ -57,14 +60,22 @@ def run_sequence(
     if progress is None and in_notebook():
         progress = RunProgress()
     with library_threads_limited(), explained_failures(device):
-        return _run(request, device, progress, observer or RunObserver())
+        opened = opened or OpenedData(request)
+        started = time.perf_counter() - opened.opening_s
+        return _run(request, opened, device, progress, observer or RunObserver(), started)
 
 
-def _run(request: RunRequest, device: torch.device, progress: Progress | None, observer: RunObserver) -> dict[str, Any]:
-    started = time.perf_counter()
-    dataset = open_sequence(request.config.dataset, request.data_dir, request.frames)
-    warnings = check_data(request, dataset)
+def _run(
+    request: RunRequest,
+    opened: OpenedData,
+    device: torch.device,
+    progress: Progress | None,
+    observer: RunObserver,
+    started: float,
+) -> dict[str, Any]:
+    dataset = opened.dataset
     system = SlamSystem(request.config, dataset.camera, first_pose(request.config, dataset), device)
+    warnings = opened.doubts()
     if request.map is not None:
         system.open_map(request.map)
     with OutputFolder(Path(request.output_dir)).locked():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,6 +15,8 @@ from spslam.datasets.plausibility.edges import TURNS, EdgeMatch
 from spslam.datasets.plausibility.flow_fit import Points, fit_flow
 from spslam.datasets.plausibility.lens import FOCAL, Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
+from spslam.datasets.plausibility.tracks import Followed, follow
+from spslam.datasets.plausibility.views import read_views
 from spslam.errors import DatasetError
 
 FRAMES = 60
@@ -264,3 +267,21 @@ def test_focal_lengths_off_by_5_and_10_percent_are_refused(sensor, factor):
     dataset = PlacesDataset("room", "handheld", sensor, 600, seed=5, capture=Capture(color_noise=2))
     recording = WrongRecording(dataset, FAULTS[f"focal length x {factor:g}"])
     assert found(recording)["intrinsics"].certain
+
+
+def test_points_are_not_followed_again_where_views_are_added(monkeypatch, apartment):
+    views = read_views(apartment, range(0, 24, 2))
+    expected, flows = follow(views), []
+    followed = Followed()
+    follow(views[:8], followed)
+    flow = cv2.calcOpticalFlowPyrLK
+    monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", lambda *args, **options: flows.append(1) or flow(*args, **options))
+    tracks = follow(views, followed)
+    with_memory = len(flows)
+    follow(views)
+    assert 0 < with_memory < len(flows) - with_memory
+    assert (tracks.steps, tracks.broken) == (expected.steps, expected.broken)
+    for segment, other in zip(tracks.segments, expected.segments, strict=True):
+        assert (segment.first, segment.last) == (other.first, other.last)
+        assert np.array_equal(segment.pixels_first, other.pixels_first)
+        assert np.array_equal(segment.pixels_last, other.pixels_last)

@@ -11,6 +11,7 @@ from spslam.errors import DatasetError
 from spslam.evaluation.surface import TriangleSurface
 from spslam.meshing import TriangleMesh, load_mesh, save_mesh
 from spslam.meshing.load import READ_FORMATS
+from spslam.meshing.ply import decode_own_ply
 
 CUBE = trimesh.creation.box()
 
@@ -67,6 +68,32 @@ end_header
 def ply(path, form="ascii", vertices=3, faces=1, body=b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"):
     path.write_bytes(PLY.format(form=form, vertices=vertices, faces=faces).encode() + body)
     return path
+
+
+def test_a_ply_written_here_is_read_as_trimesh_does(tmp_path, monkeypatch):
+    generator = np.random.default_rng(0)
+    vertices = generator.normal(size=(len(CUBE.vertices), 3)).astype(np.float32)
+    colors = generator.integers(0, 256, (len(vertices), 3), np.uint8)
+    path = tmp_path / "mesh.ply"
+    save_mesh(TriangleMesh(vertices, CUBE.faces.astype(np.int32), colors, -vertices), path)
+    other = tmp_path / "other.ply"
+    other.write_bytes(path.read_bytes().replace(b"ply\n", b"ply\ncomment another program's\n", 1))
+    assert decode_own_ply(other.read_bytes()) is None
+    expected = load_mesh(other)
+    monkeypatch.setattr(trimesh, "load", lambda *arguments, **options: pytest.fail("not needed"))
+    mesh = load_mesh(path)
+    for name in ("vertices", "faces", "colors"):
+        assert np.array_equal(getattr(mesh, name), getattr(expected, name))
+        assert getattr(mesh, name).dtype == getattr(expected, name).dtype
+
+
+@pytest.mark.parametrize("change", [lambda content: content[:-1], lambda content: content + b"\0"])
+def test_a_ply_that_was_cut_is_left_to_trimesh(tmp_path, change):
+    path = tmp_path / "mesh.ply"
+    zeros = np.zeros_like(CUBE.vertices, np.float32)
+    colors = np.zeros((len(zeros), 3), np.uint8)
+    save_mesh(TriangleMesh(CUBE.vertices.astype(np.float32), CUBE.faces.astype(np.int32), colors, zeros), path)
+    assert decode_own_ply(change(path.read_bytes())) is None
 
 
 @pytest.mark.parametrize("index", [3, -1, 2**31 - 1, -(2**31)])

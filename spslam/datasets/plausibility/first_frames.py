@@ -21,7 +21,7 @@ from spslam.datasets.plausibility.pairing import pairing_findings
 from spslam.datasets.plausibility.pose_check import pose_findings
 from spslam.datasets.plausibility.streams import depth_findings, order_findings, repetition_findings, time_findings
 from spslam.datasets.plausibility.support import PREFERRED, depth_prefers, is_supported
-from spslam.datasets.plausibility.tracks import Segment, Tracks, follow
+from spslam.datasets.plausibility.tracks import Followed, Segment, Tracks, follow
 from spslam.datasets.plausibility.views import Stretch, View, read_views, stretch_of, view_stride
 from spslam.errors import DatasetError
 
@@ -76,22 +76,23 @@ def check_stretch(dataset: RgbdDataset, start: int, most_views: int = _MOST_VIEW
     stride = min(view_stride(dataset.timestamps()), max(1, len(dataset) // _VIEWS_AT_A_TIME))
     indices = np.arange(start, len(dataset), stride)[:most_views]
     views: list[View] = []
-    judgment = Judgment([], True)
+    judgment, followed = Judgment([], True), Followed()
     for begin in range(0, len(indices), _VIEWS_AT_A_TIME):
         views += read_views(dataset, [int(index) for index in indices[begin : begin + _VIEWS_AT_A_TIME]])
         if len(views) > 1:
-            judgment = judge(dataset, views)
+            judgment = judge(dataset, views, followed)
         if judgment.is_certain or (judgment.is_settled and len(views) > 1):
             break
     return judgment
 
 
-def judge(dataset: RgbdDataset, views: Sequence[View]) -> Judgment:
+def judge(dataset: RgbdDataset, views: Sequence[View], followed: Followed | None = None) -> Judgment:
     """Judges views.
 
     Args:
         dataset: what they are of: its camera, its poses and its range of depth count.
         views: two or more, in order.
+        followed: as of `follow`.
     """
     stretch = stretch_of(dataset, views)
     is_whole = views[-1].index - views[0].index > 0.8 * len(dataset)
@@ -101,7 +102,7 @@ def judge(dataset: RgbdDataset, views: Sequence[View]) -> Judgment:
     if not has_depth or any(finding.certain for finding in findings):
         return Judgment(folded(findings), True)
     findings += [*order_findings(views), *time_findings(dataset.timestamps())]
-    tracks = follow(views)
+    tracks = follow(views, followed)
     lens = Lens(stretch.camera, float(np.median(stretch.known_depth()[::7])))
     segments, points = _with_depth(views, tracks.segments)
     estimate = estimate_lens(points, lens)

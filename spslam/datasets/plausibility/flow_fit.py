@@ -95,14 +95,8 @@ def fit_flow(points: Points, lens: Lens, free: Sequence[int] = ()) -> FlowFit:
     chosen = list(free)
     prior = np.concatenate((np.zeros(6), 1 / PRIOR[chosen] ** 2))
     for _ in range(_ITERATIONS):
-        residual = _residual(points, lens.with_numbers(numbers), rotation, translation)
-        columns = [_residual(points, lens.with_numbers(numbers), turned @ rotation, translation) for turned in _TURNS]
-        columns += [_residual(points, lens.with_numbers(numbers), rotation, translation + d) for d in _SHIFTS]
-        for number in chosen:
-            changed = numbers.copy()
-            changed[number] += _STEP
-            columns.append(_residual(points, lens.with_numbers(changed), rotation, translation))
-        jacobian = (np.stack(columns, axis=-1) - residual[..., None]) / _STEP
+        residual, *changed = _residuals(points, lens, *_variations(rotation, translation, numbers, chosen))
+        jacobian = (np.stack(changed, axis=-1) - residual[..., None]) / _STEP
         distance = np.linalg.norm(residual, axis=1)
         sigma = max(1.4826 * float(np.median(distance)), _LEAST_SIGMA_PX)
         weight = 1 / (1 + (distance / sigma) ** 2) ** 2 / sigma**2
@@ -120,16 +114,32 @@ def fit_flow(points: Points, lens: Lens, free: Sequence[int] = ()) -> FlowFit:
         motion = hessian[:6, :6] + 1e-9 * np.diag(1 + np.diag(hessian[:6, :6]))
         marginal = hessian[6:, 6:] - hessian[6:, :6] @ np.linalg.solve(motion, hessian[:6, 6:])
         information[np.ix_(chosen, chosen)] = (marginal + marginal.T) / 2
-    error = float(
-        np.median(np.linalg.norm(_residual(points, lens.with_numbers(numbers), rotation, translation), axis=1))
-    )
+    final = _residuals(points, lens, rotation[None], translation[None], numbers[None])[0]
+    error = float(np.median(np.linalg.norm(final, axis=1)))
     return FlowFit(rotation, translation, error, numbers, information)
 
 
 _SHIFTS = _STEP * np.eye(3)
-_TURNS = [cv2.Rodrigues(turn)[0] for turn in _SHIFTS]
+_TURNS = np.stack([cv2.Rodrigues(turn)[0] for turn in _SHIFTS])
 
 
-def _residual(points: Points, lens: Lens, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Pixel errors, float64 [N, 2]."""
-    return lens.pixels(lens.points(points.pixels_first, points.depth) @ rotation.T + translation) - points.pixels_last
+def _variations(
+    rotation: np.ndarray, translation: np.ndarray, numbers: np.ndarray, chosen: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motion and numbers as they are, then with each free parameter changed by a step: [K, 3, 3], [K, 3], [K, 7]."""
+    count = 7 + len(chosen)
+    rotations, translations = np.tile(rotation, (count, 1, 1)), np.tile(translation, (count, 1))
+    all_numbers = np.tile(numbers, (count, 1))
+    rotations[1:4] = _TURNS @ rotation
+    translations[4:7] += _SHIFTS
+    all_numbers[np.arange(7, count), chosen] += _STEP
+    return rotations, translations, all_numbers
+
+
+def _residuals(
+    points: Points, lens: Lens, rotations: np.ndarray, translations: np.ndarray, numbers: np.ndarray
+) -> np.ndarray:
+    """Pixel errors of K motions with as many numbers, float64 [K, N, 2]: all in one go, as N is small."""
+    lenses = lens.with_numbers(numbers)
+    moved = lenses.points(points.pixels_first, points.depth) @ rotations.transpose(0, 2, 1) + translations[:, None]
+    return lenses.pixels(moved) - points.pixels_last

@@ -19,15 +19,17 @@ class Lens:
     Args:
         camera: as a recording says.
         median_m: median depth, the unit of `OFFSET`.
-        numbers: float64 [7] in the order above; None is the camera as it is.
+        numbers: float64 [7] in the order above; None is the camera as it is. [K, 7] is K cameras at once: what they
+            give, and what points they are given, has K in front.
     """
 
     def __init__(self, camera: Camera, median_m: float, numbers: np.ndarray | None = None) -> None:
         self.camera, self.median_m = camera, median_m
         self.numbers = np.zeros(COUNT) if numbers is None else numbers
-        focal, aspect = self.numbers[FOCAL], self.numbers[ASPECT]
-        self.focal = np.array([camera.fx * np.exp(focal + aspect / 2), camera.fy * np.exp(focal - aspect / 2)])
-        self.center = np.array([camera.cx, camera.cy]) + camera.fx * self.numbers[[SHIFT_X, SHIFT_Y]]
+        focal, aspect = self.numbers[..., FOCAL], self.numbers[..., ASPECT]
+        factors = np.stack((np.exp(focal + aspect / 2), np.exp(focal - aspect / 2)), axis=-1)
+        self.focal = np.array([camera.fx, camera.fy]) * factors
+        self.center = np.array([camera.cx, camera.cy]) + camera.fx * self.numbers[..., [SHIFT_X, SHIFT_Y]]
 
     def with_numbers(self, numbers: np.ndarray) -> Lens:
         """The same camera with other numbers."""
@@ -35,14 +37,21 @@ class Lens:
 
     def points(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Camera points [N, 3] of pixels [N, 2] with depth [N]."""
-        rays = (pixels - self.center) / self.focal
-        rays = rays * (1 - self.numbers[RADIAL] * np.sum(rays * rays, axis=1))[:, None]
-        square = np.sum(rays * rays, axis=1)
-        corrected = depth * (1 + self.numbers[RAY] * square) + self.numbers[OFFSET] * self.median_m
-        return np.column_stack((rays * corrected[:, None], corrected))
+        rays = (pixels - self.center[..., None, :]) / self.focal[..., None, :]
+        rays = rays * (1 - self._each(RADIAL) * _square(rays))[..., None]
+        corrected = depth * (1 + self._each(RAY) * _square(rays)) + self._each(OFFSET) * self.median_m
+        return np.concatenate((rays * corrected[..., None], corrected[..., None]), axis=-1)
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
         """Pixels [N, 2] of camera points [N, 3]; of points behind the camera, some pixel far away."""
-        rays = points[:, :2] / np.maximum(points[:, 2:], 1e-3 * self.median_m)
-        rays = rays * (1 + self.numbers[RADIAL] * np.sum(rays * rays, axis=1))[:, None]
-        return rays * self.focal + self.center
+        rays = points[..., :2] / np.maximum(points[..., 2:], 1e-3 * self.median_m)
+        rays = rays * (1 + self._each(RADIAL) * _square(rays))[..., None]
+        return rays * self.focal[..., None, :] + self.center[..., None, :]
+
+    def _each(self, number: int) -> np.ndarray:
+        """One of the numbers, to be combined with points."""
+        return self.numbers[..., number, None]
+
+
+def _square(rays: np.ndarray) -> np.ndarray:
+    return rays[..., 0] * rays[..., 0] + rays[..., 1] * rays[..., 1]

@@ -7,7 +7,7 @@ point also followed back, and kept if it returns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -55,19 +55,34 @@ class Tracks:
     broken: int
 
 
-def follow(views: Sequence[View]) -> Tracks:
+@dataclass(frozen=True)
+class Followed:
+    """What was followed in some views, so that it is not again where more views are added behind them.
+
+    Attributes:
+        points: of a view, by its number.
+        steps: where the points that began in one view came to in another, and which returned; by both numbers.
+    """
+
+    points: dict[int, np.ndarray | None] = field(default_factory=dict)
+    steps: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+
+def follow(views: Sequence[View], followed: Followed | None = None) -> Tracks:
     """Follows points through views; see `Tracks`. Deterministic.
 
     Args:
         views: in order.
+        followed: of the same views without the last ones; brought up to date. Results are the same without it.
     """
+    followed = followed or Followed()
     segments, steps, broken, first = [], 0, 0, 0
     while first + 1 < len(views):
-        points = cv2.goodFeaturesToTrack(views[first].gray, _MOST_POINTS, _QUALITY, _DISTANCE_PX)
+        points = _points(views, first, followed)
         if points is None or len(points) < _LEAST_POINTS:
             first += 1
             continue
-        segment = _longest(views, first, points)
+        segment = _longest(views, first, points, followed)
         if segment is None:
             steps, broken, first = steps + 1, broken + 1, first + 1
         else:
@@ -76,11 +91,20 @@ def follow(views: Sequence[View]) -> Tracks:
     return Tracks(segments, steps, broken)
 
 
-def _longest(views: Sequence[View], first: int, points: np.ndarray) -> Segment | None:
+def _points(views: Sequence[View], first: int, followed: Followed) -> np.ndarray | None:
+    if first not in followed.points:
+        found = cv2.goodFeaturesToTrack(views[first].gray, _MOST_POINTS, _QUALITY, _DISTANCE_PX)
+        followed.points[first] = found
+    return followed.points[first]
+
+
+def _longest(views: Sequence[View], first: int, points: np.ndarray, followed: Followed) -> Segment | None:
     least = max(_LEAST_POINTS, _KEPT_SHARE * len(points))
     begin, here, segment = points, points, None
     for view in range(first, min(first + _MOST_STEPS, len(views) - 1)):
-        there, kept = _step(views[view].gray, views[view + 1].gray, here)
+        if (first, view + 1) not in followed.steps:
+            followed.steps[first, view + 1] = _step(views[view].gray, views[view + 1].gray, here)
+        there, kept = followed.steps[first, view + 1]
         if np.count_nonzero(kept) < least:
             break
         begin, here = begin[kept], there[kept]
