@@ -36,8 +36,7 @@ PlaneFrame load_frame(const char* name, const Tensor& planes, const Tensor& pose
 }
 
 DepthNoise load_noise(const char* name, const std::vector<double>& noise) {
-  SPS_CHECK(noise.size() == 2 && noise[0] >= 0.0 && noise[1] >= 0.0, name,
-            ": noise must be two numbers of at least 0");
+  SPS_CHECK(noise.size() == 2 && noise[0] >= 0.0 && noise[1] >= 0.0, name, ": noise must be two numbers of at least 0");
   return {static_cast<float>(noise[0]), static_cast<float>(noise[1])};
 }
 
@@ -90,10 +89,8 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
       data<std::int32_t>(block_coords),    mutable_data<float>(sdf), mutable_data<float>(weights),
       mutable_data<std::uint16_t>(colors), block_coords.size(0),     static_cast<float>(voxel_size)};
   const Tensor workspace = empty(sdf, {tsdf_integrate_workspace_bytes(frame)}, ScalarType::Byte);
-  const TsdfOptions options{static_cast<float>(truncations[0]),
-                            static_cast<float>(truncations[1]),
-                            load_noise(kName, noise),
-                            static_cast<float>(max_weight)};
+  const TsdfOptions options{static_cast<float>(truncations[0]), static_cast<float>(truncations[1]),
+                            load_noise(kName, noise), static_cast<float>(max_weight)};
   spslam::tsdf_integrate(scope.context, blocks, frame, options, mutable_data<std::uint8_t>(workspace));
 }
 

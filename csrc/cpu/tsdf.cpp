@@ -140,8 +140,8 @@ struct ColoredVoxels {
   }
 };
 
-// Adds a frame to the distances of slice i of a block; its voxels that take a color are appended. No truncation there is
-// larger than `reach`.
+// Adds a frame to the distances of slice i of a block; its voxels that take a color are appended. No truncation there
+// is larger than `reach`.
 void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const VoxelSlice& at, const PlaneFrame& frame,
                      const TsdfOptions& options, float reach, ColoredVoxels& colored_voxels) {
   PlaneLanes<kVoxelLanes> planes;
@@ -163,7 +163,7 @@ void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const Vo
   std::int32_t any = 0;
 #pragma omp simd reduction(| : any)
   for (int m = 0; m < kVoxelLanes; ++m) {
-    const TsdfObservation seen = observe_voxel(planes[m], distance[m], depth[m], seen_with);
+    const TsdfObservation seen = observe_voxel(planes[m], distance[m], depth[m], voxel_size, seen_with);
     const float seen_sdf = seen.sdf, seen_weight = seen.weight;
     const std::int32_t colored = takes_color(seen_weight, distance[m], voxel_size);
     sdf[m] = seen_sdf;

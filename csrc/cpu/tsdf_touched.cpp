@@ -154,8 +154,7 @@ std::int64_t touch_rows(const TouchGrid& grid, const TouchReach& reach, std::int
 }  // namespace
 
 template <>
-std::int64_t tsdf_touched_blocks<Cpu>(Cpu, const PlaneFrame& frame, const TouchOptions& options,
-                                      std::int32_t* coords) {
+std::int64_t tsdf_touched_blocks<Cpu>(Cpu, const PlaneFrame& frame, const TouchOptions& options, std::int32_t* coords) {
   const TouchGrid grid(frame, options.step);
   if (grid.columns == 0 || grid.rows == 0) return 0;
   const TouchReach reach{load_pose(frame.pose), 1.0f / (kTsdfBlockSide * options.voxel_size), options};

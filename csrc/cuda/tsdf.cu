@@ -80,7 +80,7 @@ __global__ void __launch_bounds__(kIntegrateThreads)
       if (pixel < 0) continue;
       const MeasuredPlane plane = load_plane(frame.planes + static_cast<std::int64_t>(kPlaneSize) * pixel);
       const float distance = plane_distance(plane, at);
-      const TsdfObservation seen = observe_voxel(plane, distance, at.z, options);
+      const TsdfObservation seen = observe_voxel(plane, distance, at.z, blocks.voxel_size, options);
       if (!(seen.weight > 0.0f)) continue;
       const std::int64_t place = kTsdfBlockVoxels * row + m;
       update_voxel(seen, options.max_weight, blocks.sdf[place], blocks.weights[place]);
@@ -126,8 +126,7 @@ std::int64_t tsdf_touched_blocks<Cuda>(Cuda device, const PlaneFrame& frame, con
   const float inverse_block_size = 1.0f / (kTsdfBlockSide * options.voxel_size);
   for_each(device, rows / kTouchedPerPixel, [=] __device__(std::int64_t i) {
     const int u = static_cast<int>(i % columns) * step, v = static_cast<int>(i / columns) * step;
-    write_touched(frame, load_pose(frame.pose), inverse_block_size, options, u, v,
-                  coords + 3 * kTouchedPerPixel * i);
+    write_touched(frame, load_pose(frame.pose), inverse_block_size, options, u, v, coords + 3 * kTouchedPerPixel * i);
   });
   return rows;
 }

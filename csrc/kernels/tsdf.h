@@ -17,8 +17,9 @@ namespace spslam {
 constexpr float kNearestIntegrated = 0.05f;  // m
 // A ray that grazes the surface is followed through the truncation as if it met it at this cosine.
 constexpr float kTouchCosine = 0.3f;
-// The truncation is at least so many deviations of the noise, up to the most (m). Within a shorter one the means of noisy
-// depth cross 0 in many places: a far wall becomes a crumpled stack of sheets. The most bounds the blocks that it takes.
+// The truncation is at least so many deviations of the noise, up to the most (m). Within a shorter one the means of
+// noisy depth cross 0 in many places: a far wall becomes a crumpled stack of sheets. The most bounds the blocks that it
+// takes.
 constexpr float kTruncationDeviations = 2.0f, kMostNoiseTruncation = 0.2f;
 // Voxels from the surface up to which colors are taken.
 constexpr float kColorBand = 1.5f;
@@ -154,9 +155,12 @@ SPS_INLINE std::int32_t pixel_at(const PlaneFrame& frame, const Vec3<float>& at)
 constexpr float kFullWeightDeviations = 1.2f, kMostFullWeight = 0.7f;
 
 // What a voxel learns from a frame: its distance from the plane of the pixel that it falls on, at most the pixel's
-// truncation; weight 0 where nothing was measured, or the voxel lies farther behind. Behind a steep plane it does not lie
-// farther along the axis either than the blocks are touched: at the edge of a table some pixels have a plane that is
-// nearly parallel to the ray, near which all lies that is hidden behind them.
+// truncation; weight 0 where nothing was measured, or the voxel lies farther behind. Behind a steep plane it is not
+// farther along the axis either than the blocks are touched, but for the voxels beside the plane, which its surface
+// needs: at the edge of a table some pixels have a plane that is nearly parallel to the ray, near which all lies that
+// they hide.
+constexpr float kBesideVoxels = 2.0f;
+
 struct TsdfObservation {
   float sdf, weight;
 };
@@ -166,14 +170,15 @@ SPS_INLINE float plane_distance(const MeasuredPlane& plane, const Vec3<float>& a
 }
 
 // Of a voxel at a depth and a distance from a plane, of which only distance and weight are used.
-SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, float distance, float depth,
+SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, float distance, float depth, float voxel_size,
                                          const TsdfOptions& options) {
   const float deviation = std::sqrt(depth_variance(options.noise, depth));
   const float wanted = options.near_truncation + deviation;
   const float truncation = noisy_truncation(wanted < options.truncation ? wanted : options.truncation, deviation);
   // Its depth less the plane's on its ray is -distance depth / along.
   const float along = plane.distance - distance;
-  const bool near = (distance > -truncation) & (-kTouchCosine * distance * depth < truncation * along);
+  const bool close = (-kTouchCosine * distance * depth < truncation * along) | (distance > -kBesideVoxels * voxel_size);
+  const bool near = (distance > -truncation) & close;
   const float noisy = kFullWeightDeviations * deviation / truncation;
   const float full = noisy < kMostFullWeight ? noisy : kMostFullWeight;
   const float fall = (1.0f + distance / truncation) / (1.0f - full);

@@ -48,8 +48,8 @@ struct TsdfBlocks {
   float voxel_size;
 };
 
-// The truncation at a depth is `near_truncation` and a deviation of the noise, at most `truncation`, m; or two deviations
-// where that is more, at most 0.2 m (kTruncationDeviations, kMostNoiseTruncation).
+// The truncation at a depth is `near_truncation` and a deviation of the noise, at most `truncation`, m; or two
+// deviations where that is more, at most 0.2 m (kTruncationDeviations, kMostNoiseTruncation).
 struct TsdfOptions {
   float truncation, near_truncation;
   DepthNoise noise;
@@ -77,8 +77,8 @@ template <class Device>
 void measure_planes(Device device, const DepthImage& image, const DepthNoise& noise, float* planes);
 
 // Coordinates [touched_rows(frame, step), 3] of the blocks within the truncation of the planes of every step-th pixel,
-// or within two deviations of the noise, see `TsdfOptions`; with repetitions; kNoBlock in rows without one. Returns how many rows it wrote, from the first one on: all of them on
-// CUDA, where it does not wait for the device.
+// or within two deviations of the noise, see `TsdfOptions`; with repetitions; kNoBlock in rows without one. Returns how
+// many rows it wrote, from the first one on: all of them on CUDA, where it does not wait for the device.
 inline std::int64_t touched_rows(const PlaneFrame& frame, std::int32_t step) {
   const std::int64_t columns = (frame.width + step - 1) / step, rows = (frame.height + step - 1) / step;
   return kTouchedPerPixel * columns * rows;
