@@ -7,13 +7,13 @@ pass an edge within two pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from spslam.datasets.base import RgbdFrame
+from spslam.datasets.prefetch import Readable
 from spslam.errors import DatasetError
 
 # Half the width of the ramps that are looked for, and how far beyond it depth must be flat again, px.
@@ -34,7 +34,7 @@ _FRAMES, _LEAST_EDGES, _BLURRED_SHARE = 8, 100, 0.8
 _NEAREST_M = 1e-3
 
 
-def edges_are_blurred(frames: Sequence[RgbdFrame], noise: tuple[float, float]) -> bool:
+def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -> bool:
     """Whether the depth of a recording is smoothed over edges, judged by a few frames spread over it.
 
     Args:

@@ -150,19 +150,24 @@ class TsdfVolume:
         planes = measure_planes(depth, intrinsics, noise)
         if color is not None:  # before blocks are added
             check_tensor("TsdfVolume.integrate", "color", color, (*depth.shape, 3), torch.uint8, like=depth)
-        sizes = {"voxel_size": self.voxel_size, "truncation": self.truncation, "noise": noise}
+        size, truncation = self.voxel_size, self.truncation
         reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
-        self.add_blocks(tsdf_touched_blocks(planes, pose, intrinsics, step=step, **sizes))
+        touched = tsdf_touched_blocks(
+            planes, pose, intrinsics, voxel_size=size, truncation=truncation, noise=noise, step=step
+        )
+        self.add_blocks(touched)
         arrays = self.block_coords, self._sdf, self._weights, self._colors
         tsdf_integrate_(
             *arrays,
             planes,
             pose,
             intrinsics,
+            voxel_size=size,
+            truncation=truncation,
             near_truncation=self.near_truncation,
+            noise=noise,
             color=color,
-            **sizes,
         )
 
     def query(self, points: torch.Tensor, min_weight: float = 1e-3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
