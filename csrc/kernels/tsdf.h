@@ -159,7 +159,7 @@ constexpr float kFullWeightDeviations = 1.2f, kMostFullWeight = 0.7f;
 // farther along the axis either than the blocks are touched, but for the voxels beside the plane, which its surface
 // needs: at the edge of a table some pixels have a plane that is nearly parallel to the ray, near which all lies that
 // they hide.
-constexpr float kBesideVoxels = 2.0f;
+constexpr float kBesideVoxels = 3.0f;
 
 struct TsdfObservation {
   float sdf, weight;

@@ -93,10 +93,10 @@ def tsdf_integrate_(
     `near_truncation` and a deviation s of the noise at the voxel's depth, at most `truncation`, but no less than 2 s,
     up to 0.2 m: noise that is larger than the truncation makes many surfaces of one. It weighs the distance by the
     plane's weight. Behind the surface that stays up to 1.2 s, at most 0.7 of the truncation, and then falls to 0 at the
-    truncation. Voxels farther behind learn nothing, nor do those more than two voxels behind whose depth is by 1 / 0.3
-    of the truncation larger than the plane's on their ray. Those in front learn that they are free, which removes what
-    has moved away. Colors within 1.5 voxels of the surface are averaged with the plane's weight squared, less where a
-    pixel is larger than a voxel.
+    truncation. Voxels farther behind learn nothing, nor do those more than three voxels behind whose depth is larger
+    than the plane's on their ray by 1 / 0.3 of the truncation. Those in front learn that they are free, which removes
+    what has moved away. Colors within 1.5 voxels of the surface are averaged with the plane's weight squared, less
+    where a pixel is larger than a voxel.
 
     Args:
         block_coords: int32 [B, 3], distinct.
