@@ -209,14 +209,14 @@ def test_a_wall_whose_noise_is_larger_than_voxels_is_one_surface(device):
 def test_a_plane_along_the_ray_says_nothing_of_what_is_far_behind(device):
     """As at the edge of a table, where depth is smooth: all that is hidden lies near the plane."""
     steep = np.array([0.98, 0.0, np.sqrt(1 - 0.98**2)])
-    volume = ops.TsdfVolume(VOXEL, 6 * VOXEL, device=device)
+    volume = ops.TsdfVolume(VOXEL, 8 * VOXEL, device=device)
     axes = [torch.arange(-1, 2), torch.arange(-1, 2), torch.arange(0, 20)]
     volume.add_blocks(torch.cartesian_prod(*axes).int().to(device))
     volume.integrate(torch.from_numpy(wall(steep, 0.3)).to(device), IDENTITY.to(device), CAMERA, noise=NOISE)
     ray = rays()[12, 15]
     depth = 0.3 / (ray @ steep)
-    points = torch.from_numpy(np.outer((depth + 0.05, depth + 0.7), ray)).float().to(device)
-    assert 0.7 * (ray @ steep) < 4 * VOXEL  # within the truncation of the plane
+    points = torch.from_numpy(np.outer((depth + 0.05, depth + 0.9), ray)).float().to(device)
+    assert 0.9 * (ray @ steep) < 5 * VOXEL  # within the truncation, two thirds of 8, of the plane
     assert volume.query(points)[2].tolist() == [True, False]
 
 
