@@ -35,20 +35,25 @@ PlaneFrame load_frame(const char* name, const Tensor& planes, const Tensor& pose
           load_intrinsics(name, intrinsics)};
 }
 
+DepthNoise load_noise(const char* name, const std::vector<double>& noise) {
+  SPS_CHECK(noise.size() == 2 && noise[0] >= 0.0 && noise[1] >= 0.0, name, ": noise must be two numbers of at least 0");
+  return {static_cast<float>(noise[0]), static_cast<float>(noise[1])};
+}
+
 Tensor tsdf_touched_blocks(Tensor planes, Tensor pose, std::vector<double> intrinsics, double voxel_size,
-                           double truncation, std::int64_t step) {
+                           double truncation, std::vector<double> noise, std::int64_t step) {
   constexpr char kName[] = "tsdf_touched_blocks";
   check_count(kName, "step", step);
   SPS_CHECK(voxel_size > 0.0 && truncation > 0.0, kName, ": voxel_size and truncation must be positive");
+  const TouchOptions options{static_cast<float>(voxel_size), static_cast<float>(truncation), load_noise(kName, noise),
+                             static_cast<std::int32_t>(step)};
   DeviceScope scope(planes);
   planes = contiguous(planes);
   pose = contiguous(pose);
   const PlaneFrame frame = load_frame(kName, planes, pose, intrinsics);
-  const std::int32_t pixels = static_cast<std::int32_t>(step);
-  Tensor coords = empty(planes, {touched_rows(frame, pixels), 3}, ScalarType::Int);
+  Tensor coords = empty(planes, {touched_rows(frame, options.step), 3}, ScalarType::Int);
   const std::int64_t written =
-      spslam::tsdf_touched_blocks(scope.context, frame, static_cast<float>(voxel_size), static_cast<float>(truncation),
-                                  pixels, mutable_data<std::int32_t>(coords));
+      spslam::tsdf_touched_blocks(scope.context, frame, options, mutable_data<std::int32_t>(coords));
   return torch::stable::narrow(coords, 0, 0, written);
 }
 
@@ -65,10 +70,9 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
   check_blocks(kName, sdf, weights, colors);
   SPS_CHECK(block_coords.dim() == 2 && block_coords.size(1) == 3 && block_coords.size(0) <= sdf.size(0), kName,
             ": block_coords must have shape [B, 3] and at most as many rows as sdf");
-  SPS_CHECK(truncations.size() == 2 && noise.size() == 2, kName, ": truncations and noise must be two numbers each");
+  SPS_CHECK(truncations.size() == 2, kName, ": truncations must be two numbers");
   SPS_CHECK(voxel_size > 0.0 && truncations[0] > 0.0 && truncations[1] > 0.0 && max_weight > 0.0, kName,
             ": voxel_size, truncations and max_weight must be positive");
-  SPS_CHECK(noise[0] >= 0.0 && noise[1] >= 0.0, kName, ": noise must not be negative");
   DeviceScope scope(sdf);
   block_coords = contiguous(block_coords);
   planes = contiguous(planes);
@@ -85,10 +89,8 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
       data<std::int32_t>(block_coords),    mutable_data<float>(sdf), mutable_data<float>(weights),
       mutable_data<std::uint16_t>(colors), block_coords.size(0),     static_cast<float>(voxel_size)};
   const Tensor workspace = empty(sdf, {tsdf_integrate_workspace_bytes(frame)}, ScalarType::Byte);
-  const TsdfOptions options{static_cast<float>(truncations[0]),
-                            static_cast<float>(truncations[1]),
-                            {static_cast<float>(noise[0]), static_cast<float>(noise[1])},
-                            static_cast<float>(max_weight)};
+  const TsdfOptions options{static_cast<float>(truncations[0]), static_cast<float>(truncations[1]),
+                            load_noise(kName, noise), static_cast<float>(max_weight)};
   spslam::tsdf_integrate(scope.context, blocks, frame, options, mutable_data<std::uint8_t>(workspace));
 }
 
@@ -165,7 +167,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("measure_planes(Tensor depth, float[] intrinsics, float noise_floor, float noise_growth) -> Tensor");
   m.def(
       "tsdf_touched_blocks(Tensor planes, Tensor pose, float[] intrinsics, float voxel_size, float truncation, "
-      "int step) -> Tensor");
+      "float[] noise, int step) -> Tensor");
   m.def(
       "tsdf_integrate_(Tensor block_coords, Tensor(a!) sdf, Tensor(b!) weights, Tensor(c!) colors, Tensor planes, "
       "Tensor[] image, Tensor pose, float[] intrinsics, float voxel_size, float[] truncations, float[] noise, "

@@ -140,9 +140,10 @@ struct ColoredVoxels {
   }
 };
 
-// Adds a frame to the distances of slice i of a block; its voxels that take a color are appended.
+// Adds a frame to the distances of slice i of a block; its voxels that take a color are appended. No truncation there
+// is larger than `reach`.
 void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const VoxelSlice& at, const PlaneFrame& frame,
-                     const TsdfOptions& options, ColoredVoxels& colored_voxels) {
+                     const TsdfOptions& options, float reach, ColoredVoxels& colored_voxels) {
   PlaneLanes<kVoxelLanes> planes;
   planes.load(frame.planes, [&](int m) { return at.pixels[m]; });
   alignas(64) float distance[kVoxelLanes];
@@ -151,7 +152,7 @@ void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const Vo
 #pragma omp simd reduction(max : most)
   for (int m = 0; m < kVoxelLanes; ++m) {
     distance[m] = plane_distance(planes[m], {at.x[m], at.y[m], at.z[m]});
-    const float near = distance[m] > -seen_with.truncation ? planes.weight[m] : 0.0f;
+    const float near = distance[m] > -reach ? planes.weight[m] : 0.0f;
     most = near > most ? near : most;
   }
   if (!(most > 0.0f)) return;
@@ -162,7 +163,7 @@ void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const Vo
   std::int32_t any = 0;
 #pragma omp simd reduction(| : any)
   for (int m = 0; m < kVoxelLanes; ++m) {
-    const TsdfObservation seen = observe_voxel(planes.weight[m], distance[m], depth[m], seen_with);
+    const TsdfObservation seen = observe_voxel(planes[m], distance[m], depth[m], voxel_size, seen_with);
     const float seen_sdf = seen.sdf, seen_weight = seen.weight;
     const std::int32_t colored = takes_color(seen_weight, distance[m], voxel_size);
     sdf[m] = seen_sdf;
@@ -185,9 +186,11 @@ void integrate_block(const TsdfBlocks& blocks, std::int64_t row, const BlockInCa
   VoxelSlice slices[kTsdfBlockSide];
   bool seen[kTsdfBlockSide];
   for (int i = 0; i < kTsdfBlockSide; ++i) seen[i] = slices[i].place(block, i, frame);
+  const float farthest = block.first.z + (kTsdfBlockSide - 1) * std::sqrt(3.0f * dot(block.i, block.i));
+  const float reach = noisy_truncation(options.truncation, std::sqrt(depth_variance(options.noise, farthest)));
   ColoredVoxels colored;
   for (int i = 0; i < kTsdfBlockSide; ++i) {
-    if (seen[i]) integrate_slice(blocks, row, i, slices[i], frame, options, colored);
+    if (seen[i]) integrate_slice(blocks, row, i, slices[i], frame, options, reach, colored);
   }
   colored.update(frame, blocks.voxel_size, blocks.colors + kTsdfColorSize * kTsdfBlockVoxels * row);
 }
@@ -204,7 +207,7 @@ void tsdf_integrate<Cpu>(Cpu, const TsdfBlocks& blocks, const PlaneFrame& frame,
   parallel_for(blocks.count, kBlockGrain, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t row = begin; row < end; ++row) {
       const BlockInCamera block = block_in_camera(pose, blocks.coords + 3 * row, blocks.voxel_size);
-      if (!block_in_view(frame, block, tiles_far, options.truncation)) continue;
+      if (!block_in_view(frame, block, tiles_far, options)) continue;
       integrate_block(blocks, row, block, frame, options);
     }
   });

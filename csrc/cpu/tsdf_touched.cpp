@@ -29,7 +29,8 @@ struct TouchGrid {
 // The world and the length of the rays in it.
 struct TouchReach {
   Pose<float> pose;
-  float inverse_block_size, truncation;
+  float inverse_block_size;
+  TouchOptions options;
 };
 
 // Blocks that the rays of a row of pixels pass: one array per sample along the rays and axis, each behind a column that
@@ -65,7 +66,7 @@ void touch_batch(const TouchGrid& grid, const TouchReach& reach, std::int64_t ro
   const float line = static_cast<float>(v);
   const float begin = static_cast<float>(first * grid.step), step = static_cast<float>(grid.step);
   SPS_SIMD for (int m = 0; m < kTouchLanes; ++m) {
-    const TouchedRay ray = touched_ray(planes[m], camera, world.truncation, begin + static_cast<float>(m) * step, line);
+    const TouchedRay ray = touched_ray(planes[m], camera, world.options, begin + static_cast<float>(m) * step, line);
     x[0][m] = ray.first.x, y[0][m] = ray.first.y, z[0][m] = ray.first.z;
     x[1][m] = ray.step.x, y[1][m] = ray.step.y, z[1][m] = ray.step.z;
     known[m] = ray.known;
@@ -153,11 +154,10 @@ std::int64_t touch_rows(const TouchGrid& grid, const TouchReach& reach, std::int
 }  // namespace
 
 template <>
-std::int64_t tsdf_touched_blocks<Cpu>(Cpu, const PlaneFrame& frame, float voxel_size, float truncation,
-                                      std::int32_t step, std::int32_t* coords) {
-  const TouchGrid grid(frame, step);
+std::int64_t tsdf_touched_blocks<Cpu>(Cpu, const PlaneFrame& frame, const TouchOptions& options, std::int32_t* coords) {
+  const TouchGrid grid(frame, options.step);
   if (grid.columns == 0 || grid.rows == 0) return 0;
-  const TouchReach reach{load_pose(frame.pose), 1.0f / (kTsdfBlockSide * voxel_size), truncation};
+  const TouchReach reach{load_pose(frame.pose), 1.0f / (kTsdfBlockSide * options.voxel_size), options};
   const std::int64_t most = 3 * kTouchedPerPixel * grid.columns;
   std::vector<std::int64_t> counts(chunk_count(grid.rows, kTouchRows));
   parallel_chunks(grid.rows, kTouchRows, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {

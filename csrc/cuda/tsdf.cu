@@ -10,10 +10,11 @@ constexpr int kIntegrateThreads = 128;
 
 // Writes the blocks that a pixel touches, but those that its left neighbor's same sample touches too.
 __device__ void write_touched(const PlaneFrame& frame, const Pose<float>& pose, float inverse_block_size,
-                              float truncation, int u, int v, int step, std::int32_t* coords) {
+                              const TouchOptions& options, int u, int v, std::int32_t* coords) {
+  const int step = options.step;
   const auto ray_at = [&](int column) {
     const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + column);
-    return touched_ray(load_plane(plane), frame.camera, truncation, static_cast<float>(column), static_cast<float>(v));
+    return touched_ray(load_plane(plane), frame.camera, options, static_cast<float>(column), static_cast<float>(v));
   };
   const TouchedRay own = ray_at(u), left = u >= step ? ray_at(u - step) : TouchedRay{{0, 0, 0}, {0, 0, 0}, false};
   const auto block = [&](const TouchedRay& ray, int k) {
@@ -69,7 +70,7 @@ __global__ void __launch_bounds__(kIntegrateThreads)
   const Pose<float> pose = load_pose(frame.pose);
   for (std::int64_t row = blockIdx.x; row < blocks.count; row += gridDim.x) {
     const BlockInCamera block = block_in_camera(pose, blocks.coords + 3 * row, blocks.voxel_size);
-    if (!block_in_view(frame, block, tiles_far, options.truncation)) continue;  // the same for all threads
+    if (!block_in_view(frame, block, tiles_far, options)) continue;  // the same for all threads
     for (int m = threadIdx.x; m < kTsdfBlockVoxels; m += kIntegrateThreads) {
       const float i = static_cast<float>(m / (kTsdfBlockSide * kTsdfBlockSide));
       const float j = static_cast<float>(m / kTsdfBlockSide % kTsdfBlockSide);
@@ -79,7 +80,7 @@ __global__ void __launch_bounds__(kIntegrateThreads)
       if (pixel < 0) continue;
       const MeasuredPlane plane = load_plane(frame.planes + static_cast<std::int64_t>(kPlaneSize) * pixel);
       const float distance = plane_distance(plane, at);
-      const TsdfObservation seen = observe_voxel(plane.weight, distance, at.z, options);
+      const TsdfObservation seen = observe_voxel(plane, distance, at.z, blocks.voxel_size, options);
       if (!(seen.weight > 0.0f)) continue;
       const std::int64_t place = kTsdfBlockVoxels * row + m;
       update_voxel(seen, options.max_weight, blocks.sdf[place], blocks.weights[place]);
@@ -118,14 +119,14 @@ void measure_planes<Cuda>(Cuda device, const DepthImage& image, const DepthNoise
 }
 
 template <>
-std::int64_t tsdf_touched_blocks<Cuda>(Cuda device, const PlaneFrame& frame, float voxel_size, float truncation,
-                                       std::int32_t step, std::int32_t* coords) {
+std::int64_t tsdf_touched_blocks<Cuda>(Cuda device, const PlaneFrame& frame, const TouchOptions& options,
+                                       std::int32_t* coords) {
+  const std::int32_t step = options.step;
   const std::int64_t columns = (frame.width + step - 1) / step, rows = touched_rows(frame, step);
-  const float inverse_block_size = 1.0f / (kTsdfBlockSide * voxel_size);
+  const float inverse_block_size = 1.0f / (kTsdfBlockSide * options.voxel_size);
   for_each(device, rows / kTouchedPerPixel, [=] __device__(std::int64_t i) {
     const int u = static_cast<int>(i % columns) * step, v = static_cast<int>(i / columns) * step;
-    write_touched(frame, load_pose(frame.pose), inverse_block_size, truncation, u, v, step,
-                  coords + 3 * kTouchedPerPixel * i);
+    write_touched(frame, load_pose(frame.pose), inverse_block_size, options, u, v, coords + 3 * kTouchedPerPixel * i);
   });
   return rows;
 }

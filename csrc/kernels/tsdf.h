@@ -17,6 +17,10 @@ namespace spslam {
 constexpr float kNearestIntegrated = 0.05f;  // m
 // A ray that grazes the surface is followed through the truncation as if it met it at this cosine.
 constexpr float kTouchCosine = 0.3f;
+// The truncation is at least so many deviations of the noise, up to the most (m). Within a shorter one the means of
+// noisy depth cross 0 in many places: a far wall becomes a crumpled stack of sheets. The most bounds the blocks that it
+// takes.
+constexpr float kTruncationDeviations = 2.0f, kMostNoiseTruncation = 0.2f;
 // Voxels from the surface up to which colors are taken.
 constexpr float kColorBand = 1.5f;
 constexpr float kColorUnit = 256.0f, kColorWeightUnit = 1024.0f, kMostUnits = 65535.0f;
@@ -43,18 +47,26 @@ SPS_INLINE bool same_block(const VoxelCoord& a, const VoxelCoord& b) {
   return (a.x == b.x) & (a.y == b.y) & (a.z == b.z);
 }
 
+// The truncation (m) of depth with a deviation of the noise, at least `shortest`.
+SPS_INLINE float noisy_truncation(float shortest, float deviation) {
+  const float wide = kTruncationDeviations * deviation;
+  const float reach = wide < kMostNoiseTruncation ? wide : kMostNoiseTruncation;
+  return shortest > reach ? shortest : reach;
+}
+
 // The part of a pixel's ray within the truncation of its plane, as camera points `first` + s `step`.
 struct TouchedRay {
   Vec3<float> first, step;
   bool known;
 };
 
-SPS_INLINE TouchedRay touched_ray(const MeasuredPlane& plane, const Intrinsics& camera, float truncation, float u,
-                                  float v) {
+SPS_INLINE TouchedRay touched_ray(const MeasuredPlane& plane, const Intrinsics& camera, const TouchOptions& options,
+                                  float u, float v) {
   const Vec3<float> ray{(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0f};
   const float along = plane.normal.x * ray.x + plane.normal.y * ray.y + plane.normal.z;
   const float depth = plane.distance / along;
   const float least = kTouchCosine * std::sqrt(dot(ray, ray));
+  const float truncation = noisy_truncation(options.truncation, std::sqrt(depth_variance(options.noise, depth)));
   const float reach = truncation / (along > least ? along : least);
   return {(depth - reach) * ray, (2.0f * reach / (kTouchedPerPixel - 1)) * ray, plane.weight > 0.0f};
 }
@@ -102,7 +114,7 @@ SPS_INLINE TileRange tile_range(float center, float radius, float nearest, float
 
 // Whether a frame may say something of a block: it lies in view, and not all behind what was measured.
 SPS_INLINE bool block_in_view(const PlaneFrame& frame, const BlockInCamera& block, const float* tiles_far,
-                              float truncation) {
+                              const TsdfOptions& options) {
   constexpr float kHalf = 0.5f * (kTsdfBlockSide - 1);
   const Vec3<float> center = block.first + kHalf * (block.i + block.j + block.k);
   const float radius = kHalf * std::sqrt(3.0f * dot(block.i, block.i));
@@ -119,7 +131,8 @@ SPS_INLINE bool block_in_view(const PlaneFrame& frame, const BlockInCamera& bloc
     }
   }
   // A plane is measured along its normal: where it is steep, the truncation reaches farther along the ray.
-  return far > 0.0f && nearest < far + truncation / kTouchCosine;
+  const float deviation = std::sqrt(depth_variance(options.noise, farthest));
+  return far > 0.0f && nearest < far + noisy_truncation(options.truncation, deviation) / kTouchCosine;
 }
 
 // The pixel that a point in camera axes falls on, as its place in the image; -1 for none.
@@ -142,7 +155,12 @@ SPS_INLINE std::int32_t pixel_at(const PlaneFrame& frame, const Vec3<float>& at)
 constexpr float kFullWeightDeviations = 1.2f, kMostFullWeight = 0.7f;
 
 // What a voxel learns from a frame: its distance from the plane of the pixel that it falls on, at most the pixel's
-// truncation; weight 0 where nothing was measured, or the voxel lies farther behind.
+// truncation; weight 0 where nothing was measured, or the voxel lies farther behind. Behind a steep plane it is not
+// farther along the axis either than the blocks are touched, but for the voxels beside the plane, which its surface
+// needs: at the edge of a table some pixels have a plane that is nearly parallel to the ray, near which all lies that
+// they hide.
+constexpr float kBesideVoxels = 3.0f;
+
 struct TsdfObservation {
   float sdf, weight;
 };
@@ -151,17 +169,21 @@ SPS_INLINE float plane_distance(const MeasuredPlane& plane, const Vec3<float>& a
   return plane.distance - dot(plane.normal, at);
 }
 
-// Of a voxel at a depth and a distance from a plane of that weight.
-SPS_INLINE TsdfObservation observe_voxel(float plane_weight, float distance, float depth, const TsdfOptions& options) {
+// Of a voxel at a depth and a distance from a plane, of which only distance and weight are used.
+SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, float distance, float depth, float voxel_size,
+                                         const TsdfOptions& options) {
   const float deviation = std::sqrt(depth_variance(options.noise, depth));
   const float wanted = options.near_truncation + deviation;
-  const float truncation = wanted < options.truncation ? wanted : options.truncation;
-  const bool known = (plane_weight > 0.0f) & (distance > -truncation);
+  const float truncation = noisy_truncation(wanted < options.truncation ? wanted : options.truncation, deviation);
+  // Its depth less the plane's on its ray is -distance depth / along.
+  const float along = plane.distance - distance;
+  const bool close = (-kTouchCosine * distance * depth < truncation * along) | (distance > -kBesideVoxels * voxel_size);
+  const bool near = (distance > -truncation) & close;
   const float noisy = kFullWeightDeviations * deviation / truncation;
   const float full = noisy < kMostFullWeight ? noisy : kMostFullWeight;
   const float fall = (1.0f + distance / truncation) / (1.0f - full);
-  const float weight = plane_weight * (fall < 1.0f ? fall : 1.0f);
-  return {distance < truncation ? distance : truncation, known ? weight : 0.0f};
+  const float weight = plane.weight * (fall < 1.0f ? fall : 1.0f);
+  return {distance < truncation ? distance : truncation, (plane.weight > 0.0f) & near ? weight : 0.0f};
 }
 
 // The running mean of a voxel's distances.

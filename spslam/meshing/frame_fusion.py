@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError, SpslamError
 from spslam.geometry import matrix_to_pose7
+from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.sdf_sampling import near_surface
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
@@ -95,7 +96,7 @@ def fuse_frames(
     scene: Scene | None = None,
     device: torch.device | str = "cpu",
 ) -> ops.TsdfVolume:
-    """Fuses all frames into a new volume.
+    """Fuses all frames into a new volume. Where a sensor smooths depth over edges, pixels there are left out.
 
     Args:
         frames: to be fused, in order; of one dataset or of several in one world.
@@ -112,6 +113,7 @@ def fuse_frames(
         SpslamError: voxels of over a hundred times the size would not fit either.
     """
     parts = [frames] if isinstance(frames, PosedFrames) else frames
+    blurred = [edges_are_blurred(part, part.noise or options.noise) for part in parts]
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
         truncations = options.truncation_m(voxel_size_m), options.near_truncation_m(voxel_size_m)
@@ -119,9 +121,11 @@ def fuse_frames(
         try:
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
-            for part in parts:
+            for part, smooth in zip(parts, blurred, strict=True):
+                noise = part.noise or options.noise
                 for frame, pose in part.read():
-                    _integrate(volume, frame, pose, part.dataset, part.noise or options.noise)
+                    depth = without_blurred_edges(frame.depth, noise) if smooth else frame.depth
+                    _integrate(volume, replace(frame, depth=depth), pose, part.dataset, noise)
             return volume
         except ops.VoxelLimitError:
             del volume

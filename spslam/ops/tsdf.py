@@ -31,6 +31,7 @@ def tsdf_touched_blocks(
     *,
     voxel_size: float,
     truncation: float,
+    noise: tuple[float, float] = DEFAULT_NOISE,
     step: int = 1,
 ) -> torch.Tensor:
     """The blocks within the truncation of the surface that a frame measured, with repetitions.
@@ -40,7 +41,8 @@ def tsdf_touched_blocks(
         pose: float32 [7] of the frame, T_world_camera: unit quaternion (w, x, y, z) and translation (m).
         intrinsics: of the image, px.
         voxel_size: m.
-        truncation: m.
+        truncation: m; where two deviations of the noise are more, these, at most 0.2 m.
+        noise: floor (m^2) and growth (1/m^2) of the variance of depth, see `measure_planes`.
         step: only every so many pixels per axis are looked at.
 
     Returns:
@@ -60,8 +62,10 @@ def tsdf_touched_blocks(
     name = "tsdf_touched_blocks"
     _check_frame(name, planes, pose, intrinsics)
     _check_sizes(name, voxel_size, truncation)
+    check_noise(name, noise)
     check_count(name, "step", step)
-    coords = torch.ops.spslam.tsdf_touched_blocks(planes, pose, list(intrinsics), voxel_size, truncation, step)
+    sizes = voxel_size, truncation, list(noise)
+    coords = torch.ops.spslam.tsdf_touched_blocks(planes, pose, list(intrinsics), *sizes, step)
     # Not by a mask, for which torch wakes its own threads, however few rows there are: they would wait for cores.
     return coords.index_select(0, (coords[:, 0] != NO_BLOCK).nonzero()[:, 0])
 
@@ -86,11 +90,13 @@ def tsdf_integrate_(
     """Adds a frame to the voxels that it sees, in place (Curless and Levoy 1996).
 
     A voxel learns its distance from the plane of the pixel that it falls on, at most the pixel's truncation: that is
-    `near_truncation` and a deviation s of the noise at the voxel's depth, at most `truncation`. It weighs the distance
-    by the plane's weight. Behind the surface that stays up to 1.2 s, at most 0.7 of the truncation, and then falls to 0
-    at the truncation; voxels farther behind learn nothing. Those in front learn that they are free, which removes what
-    has moved away. Colors within 1.5 voxels of the surface are averaged
-    with the plane's weight squared, less where a pixel is larger than a voxel.
+    `near_truncation` and a deviation s of the noise at the voxel's depth, at most `truncation`, but no less than 2 s,
+    up to 0.2 m: noise that is larger than the truncation makes many surfaces of one. It weighs the distance by the
+    plane's weight. Behind the surface that stays up to 1.2 s, at most 0.7 of the truncation, and then falls to 0 at the
+    truncation. Voxels farther behind learn nothing, nor do those more than three voxels behind whose depth is larger
+    than the plane's on their ray by 1 / 0.3 of the truncation. Those in front learn that they are free, which removes
+    what has moved away. Colors within 1.5 voxels of the surface are averaged with the plane's weight squared, less
+    where a pixel is larger than a voxel.
 
     Args:
         block_coords: int32 [B, 3], distinct.
@@ -101,7 +107,7 @@ def tsdf_integrate_(
         pose: float32 [7] of the frame, T_world_camera: unit quaternion (w, x, y, z) and translation (m).
         intrinsics: of the image, px.
         voxel_size: m.
-        truncation: the largest, m.
+        truncation: the largest but for noise, m.
         near_truncation: where there is no noise, m; `truncation` where not given.
         noise: floor (m^2) and growth (1/m^2) of the variance of depth, see `measure_planes`.
         color: uint8 [H, W, 3]; None leaves the colors.
@@ -279,7 +285,7 @@ def _check_field(name: str, field: tuple[torch.Tensor, ...], voxel_size: float) 
 
 
 @torch.library.register_fake("spslam::tsdf_touched_blocks")
-def _(planes, pose, intrinsics, voxel_size, truncation, step):
+def _(planes, *_):
     return planes.new_empty((torch.library.get_ctx().new_dynamic_size(), 3), dtype=torch.int32)
 
 

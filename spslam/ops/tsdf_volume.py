@@ -153,7 +153,9 @@ class TsdfVolume:
         size, truncation = self.voxel_size, self.truncation
         reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
-        touched = tsdf_touched_blocks(planes, pose, intrinsics, voxel_size=size, truncation=truncation, step=step)
+        touched = tsdf_touched_blocks(
+            planes, pose, intrinsics, voxel_size=size, truncation=truncation, noise=noise, step=step
+        )
         self.add_blocks(touched)
         arrays = self.block_coords, self._sdf, self._weights, self._colors
         tsdf_integrate_(

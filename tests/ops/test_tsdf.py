@@ -134,7 +134,7 @@ def test_integration_is_that_of_numpy(device):
         for i, (image, pose) in enumerate(zip(planes, matrices, strict=True)):
             if i == 0 and tuple(coords[block]) not in _first_blocks(depths[0]):
                 continue
-            sdf, weight, _ = reference.observe(point, image, CAMERA, pose, (3 * VOXEL, 2 * VOXEL), NOISE)
+            sdf, weight, _ = reference.observe(point, image, CAMERA, pose, (3 * VOXEL, 2 * VOXEL), NOISE, VOXEL)
             total += weight
             mean += (sdf - mean) * weight / total if weight else 0.0
         got = volume.weights[block, voxel].item()
@@ -189,6 +189,35 @@ def test_what_has_moved_away_is_carved():
     vertices, _ = volume.extract()
     assert len(vertices) > 100  # the wall
     assert (vertices[:, 2] > 1.3).all()
+
+
+def test_a_wall_whose_noise_is_larger_than_voxels_is_one_surface(device):
+    generator = np.random.default_rng(0)
+    noise = 0.0, (0.05 / 16) ** 2  # 5 cm at 4 m
+    volume = ops.TsdfVolume(0.01, device=device)
+    for _ in range(40):
+        depth = wall((0, 0, 1), 4.0) + 0.05 * generator.standard_normal(SIZE).astype(np.float32)
+        volume.integrate(torch.from_numpy(depth).to(device), IDENTITY.to(device), CAMERA, noise=noise)
+    vertices, faces = (tensor.cpu() for tensor in volume.extract())
+    inside = (vertices[:, :2].abs() < 1).all(1)
+    a, b, c = vertices[faces[inside[faces].all(1)]].unbind(1)
+    area = (b - a).cross(c - a, dim=1).norm(dim=1).sum().item() / 2
+    assert (vertices[inside, 2] - 4).abs().mean() < 0.012  # 8 mm is the mean of 40
+    assert area < 2.5 * 2**2  # of 2 x 2 m; steps between pixels add to it
+
+
+def test_a_plane_along_the_ray_says_nothing_of_what_is_far_behind(device):
+    """As at the edge of a table, where depth is smooth: all that is hidden lies near the plane."""
+    steep = np.array([0.98, 0.0, np.sqrt(1 - 0.98**2)])
+    volume = ops.TsdfVolume(VOXEL, 8 * VOXEL, device=device)
+    axes = [torch.arange(-1, 2), torch.arange(-1, 2), torch.arange(0, 20)]
+    volume.add_blocks(torch.cartesian_prod(*axes).int().to(device))
+    volume.integrate(torch.from_numpy(wall(steep, 0.3)).to(device), IDENTITY.to(device), CAMERA, noise=NOISE)
+    ray = rays()[12, 15]
+    depth = 0.3 / (ray @ steep)
+    points = torch.from_numpy(np.outer((depth + 0.05, depth + 0.9), ray)).float().to(device)
+    assert 0.9 * (ray @ steep) < 5 * VOXEL  # within the truncation, two thirds of 8, of the plane
+    assert volume.query(points)[2].tolist() == [True, False]
 
 
 def test_both_sides_of_a_thin_board_are_there():

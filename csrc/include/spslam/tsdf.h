@@ -48,11 +48,19 @@ struct TsdfBlocks {
   float voxel_size;
 };
 
-// A pixel's truncation is `near_truncation` and a deviation of the noise at the voxel's depth, at most `truncation`, m.
+// The truncation at a depth is `near_truncation` and a deviation of the noise, at most `truncation`, m; or two
+// deviations where that is more, at most 0.2 m (kTruncationDeviations, kMostNoiseTruncation).
 struct TsdfOptions {
   float truncation, near_truncation;
   DepthNoise noise;
   float max_weight;
+};
+
+// Which blocks are touched; `truncation` and `noise` as of `TsdfOptions`.
+struct TouchOptions {
+  float voxel_size, truncation;
+  DepthNoise noise;
+  std::int32_t step;
 };
 
 // A field that is only read, and the weight from which a voxel counts as known.
@@ -69,15 +77,15 @@ template <class Device>
 void measure_planes(Device device, const DepthImage& image, const DepthNoise& noise, float* planes);
 
 // Coordinates [touched_rows(frame, step), 3] of the blocks within the truncation of the planes of every step-th pixel,
-// with repetitions; kNoBlock in rows without one. Returns how many rows it wrote, from the first one on: all of them on
-// CUDA, where it does not wait for the device.
+// or within two deviations of the noise, see `TsdfOptions`; with repetitions; kNoBlock in rows without one. Returns how
+// many rows it wrote, from the first one on: all of them on CUDA, where it does not wait for the device.
 inline std::int64_t touched_rows(const PlaneFrame& frame, std::int32_t step) {
   const std::int64_t columns = (frame.width + step - 1) / step, rows = (frame.height + step - 1) / step;
   return kTouchedPerPixel * columns * rows;
 }
 template <class Device>
-std::int64_t tsdf_touched_blocks(Device device, const PlaneFrame& frame, float voxel_size, float truncation,
-                                 std::int32_t step, std::int32_t* coords);
+std::int64_t tsdf_touched_blocks(Device device, const PlaneFrame& frame, const TouchOptions& options,
+                                 std::int32_t* coords);
 
 // Adds a frame to all blocks that it sees.
 SPS_INLINE std::int32_t tiles_along(std::int32_t size) {

@@ -1,0 +1,148 @@
+"""Depth that was smoothed over edges, as a phone's LiDAR's is: whether a recording has it, and what pixels it spoils.
+
+Between a near and a far surface such depth has a ramp of several pixels, where there is nothing. A single frame's plane
+fit takes it for a steep surface, and all frames agree on it as long as the camera looks from one side. Other sensors
+pass an edge within two pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from spslam.datasets.base import RgbdFrame
+from spslam.datasets.prefetch import Readable
+from spslam.errors import DatasetError
+
+# Half the width of the ramps that are looked for, and how far beyond it depth must be flat again, px.
+_REACH, _BEYOND = 3, 2
+# Inverse depth of one surface differs by less than this share of it and so many deviations of the noise, as in
+# `ops.measure_planes`; at an edge it differs by so many times as much.
+_SAME_SHARE, _SAME_DEVIATIONS, _EDGE = 0.015, 4.0, 4.0
+# Beyond an edge the slope is at most this share of the mean slope across it.
+_FLAT = 0.5
+# Two neighboring steps, with one mixed pixel between them, have this share of a sharp edge.
+_SHARP = 0.8
+# The inner pixels, two to each side of the middle, have this share of the change across a ramp; of the tread of a stair
+# it is two thirds.
+_INNER, _INNER_SHARE = 2, 0.8
+# Frames that are looked at, edges that they must have, and the share of these that is blurred: at most 0.6 where a
+# sensor mixes single pixels (time of flight), 1 where it smooths.
+_FRAMES, _LEAST_EDGES, _BLURRED_SHARE = 8, 100, 0.8
+_NEAREST_M = 1e-3
+
+
+def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -> bool:
+    """Whether the depth of a recording is smoothed over edges, judged by a few frames spread over it.
+
+    Args:
+        frames: of one sensor; those that can't be read don't count.
+        noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
+    """
+    blurred = edges = 0
+    for position in np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]:
+        try:
+            depth = frames[int(position)].depth
+        except DatasetError:
+            continue
+        for profile in _profiles(depth, noise):
+            found = profile.middles() & profile.whole()
+            edges += int(found.sum())
+            blurred += int((found & ~profile.sharp()).sum())
+    return edges >= _LEAST_EDGES and blurred > _BLURRED_SHARE * edges
+
+
+def without_blurred_edges(depth: np.ndarray, noise: tuple[float, float]) -> np.ndarray:
+    """Depth without the pixels that lie between two surfaces, and those beside them.
+
+    Args:
+        depth: float32 [H, W], m, 0 where unknown.
+        noise: as of `edges_are_blurred`.
+
+    Returns:
+        float32 [H, W], 0 there; an empty image as it is. Deterministic.
+    """
+    if not depth.size:
+        return depth
+    spoiled = np.zeros(depth.shape, np.uint8)
+    for profile, along in zip(_profiles(depth, noise), ((1, 2 * _REACH + 1), (2 * _REACH + 1, 1)), strict=True):
+        middles = (profile.middles() & profile.narrow()).astype(np.uint8)
+        spoiled |= cv2.dilate(middles, np.ones(along, np.uint8)) & profile.between().astype(np.uint8)
+    return np.where(cv2.dilate(spoiled, np.ones((3, 3), np.uint8)), np.float32(0), depth)
+
+
+@dataclass(frozen=True)
+class _Profiles:
+    """Inverse depth along the rows, or the columns, around each pixel. Comparisons with what is unknown are False.
+
+    Attributes:
+        around: float32 [2 (_REACH + _BEYOND) + 1, H, W], NaN where unknown; the middle one is the pixel.
+        gate: float32 [H, W], what two pixels of one surface differ by at most.
+    """
+
+    around: np.ndarray
+    gate: np.ndarray
+
+    def middles(self) -> np.ndarray:
+        """Bool [H, W]: pixels in the middle of an edge between two flat surfaces."""
+        steps = np.nan_to_num(np.abs(np.diff(self.around[_BEYOND:-_BEYOND], axis=0)))
+        return self._edge() & (steps[_REACH - 1 : _REACH + 1].max(0) >= steps.max(0))
+
+    def whole(self) -> np.ndarray:
+        """Bool [H, W]: depth is known all around."""
+        return np.isfinite(self.around).all(0)
+
+    def narrow(self) -> np.ndarray:
+        """Bool [H, W]: most of the change is near the middle."""
+        before, after = self._sides(_INNER)
+        return np.abs(after - before) >= _INNER_SHARE * self._change()
+
+    def sharp(self) -> np.ndarray:
+        """Bool [H, W]: two neighboring steps make nearly all of the change."""
+        inner = self.around[_BEYOND:-_BEYOND]
+        return np.abs(inner[2:] - inner[:-2]).max(0) >= _SHARP * self._change()
+
+    def between(self) -> np.ndarray:
+        """Bool [H, W]: pixels at an edge that are on neither side."""
+        before, after = self._sides()
+        middle = self.around[_REACH + _BEYOND]
+        apart = np.minimum(np.abs(middle - before), np.abs(middle - after))
+        return self._edge() & (apart > self.gate)
+
+    def _edge(self) -> np.ndarray:
+        """Whether there is one within reach, flat beyond. What is unknown is taken for flat: ramps end there too."""
+        before, after = self._sides()
+        most = _FLAT * _BEYOND / (2 * _REACH) * self._change()
+        rising = (np.abs(self.around[0] - before) > most) | (np.abs(self.around[-1] - after) > most)
+        return (self._change() > _EDGE * self.gate) & ~rising
+
+    def _change(self) -> np.ndarray:
+        before, after = self._sides()
+        return np.abs(after - before)
+
+    def _sides(self, reach: int = _REACH) -> tuple[np.ndarray, np.ndarray]:
+        """The farthest known pixels within reach before and after each one, or the pixel itself."""
+        middle = _REACH + _BEYOND
+        before = after = self.around[middle]
+        for step in range(1, reach + 1):
+            before = np.where(np.isnan(self.around[middle - step]), before, self.around[middle - step])
+            after = np.where(np.isnan(self.around[middle + step]), after, self.around[middle + step])
+        return before, after
+
+
+def _profiles(depth: np.ndarray, noise: tuple[float, float]) -> tuple[_Profiles, _Profiles]:
+    """Those along rows and along columns."""
+    known = np.isfinite(depth) & (depth > _NEAREST_M)
+    safe = np.where(known, depth, np.float32(1))
+    inverse = np.where(known, 1 / safe, np.float32(np.nan))
+    deviation = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * safe**4)
+    gate = (np.float32(_SAME_SHARE) + np.float32(_SAME_DEVIATIONS) * deviation / safe) * inverse
+    margin = _REACH + _BEYOND
+    height, width = depth.shape
+    wide = np.pad(inverse, ((0, 0), (margin, margin)), constant_values=np.nan)
+    high = np.pad(inverse, ((margin, margin), (0, 0)), constant_values=np.nan)
+    steps = range(2 * margin + 1)
+    rows = _Profiles(np.stack([wide[:, step : step + width] for step in steps]), gate)
+    return rows, _Profiles(np.stack([high[step : step + height] for step in steps]), gate)
