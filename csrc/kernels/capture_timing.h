@@ -30,7 +30,7 @@ constexpr double kMostOff = 0.01;
 // 1/s^2: of less than a second's deviation a frame says nothing.
 constexpr double kLeastInformation = 1.0;
 // s: a smaller time is none.
-constexpr double kLeastTime[kTimings] = {0.0015, 0.003};
+constexpr double kLeastDelay = 0.0015, kLeastReadout = 0.003;
 
 // Arms of the cross, px, that a plane is measured by: so long that noise turns it by 1 / (2 kCrossShare) or less.
 constexpr float kCrossShare = 5.0f;
@@ -231,7 +231,8 @@ SPS_INLINE void update_capture_timing(const TimingEvidence& evidence, double* st
     own[1] = std::fmin(sum, kMost);
   }
   for (int i = 0; i < kTimings; ++i) {
-    timing[i] = std::fabs(state[2 * i]) < kLeastTime[i] ? 0.0f : static_cast<float>(state[2 * i]);
+    const double least = i == 0 ? kLeastDelay : kLeastReadout;
+    timing[i] = std::fabs(state[2 * i]) < least ? 0.0f : static_cast<float>(state[2 * i]);
   }
 }
 
