@@ -27,6 +27,8 @@ constexpr double kFirstDeviation = 0.005;
 constexpr double kLeastDeviation = 0.001;
 // s: a frame's estimate counts as being off by no more, as a difference of intensities is linear over few pixels only.
 constexpr double kMostOff = 0.01;
+// s: no estimate is larger, as images farther apart in time are not compensated.
+constexpr double kMostTime = 0.9 * static_cast<double>(kMaxColorDelay);
 // 1/s^2: of less than a second's deviation a frame says nothing.
 constexpr double kLeastInformation = 1.0;
 // s: a smaller time is none.
@@ -112,14 +114,9 @@ SPS_INLINE WidePlane wide_plane(const DepthKeyframes& keyframes, const DepthKeyf
   return {(z * value - 1.0f) * inverse_slope, kSurface + 2.0f * variance, inverse_slope * gradient, true};
 }
 
-// By what share of the readout the row of a pixel is read after the middle one.
-SPS_INLINE float row_share(float v, std::int64_t height) {
-  return v / static_cast<float>(height - 1) - 0.5f;
-}
-
 // By how much a point moves, in the world, with each second that a camera carries it along.
 SPS_INLINE Vec3<float> carried(const CameraVelocity& velocity, const Vec3<float>& offset) {
-  return velocity.way + cross(velocity.turn, offset);
+  return velocity.linear + cross(velocity.angular, offset);
 }
 
 // Adds what one pixel says against one keyframe to terms [kTimingTerms], weighted by inverse variances. The derivative
@@ -139,7 +136,9 @@ SPS_INLINE void add_timing_residuals(const DepthKeyframes& keyframes, const Movi
   if (!(surface.known && surface.near)) return;
   const FrameProjection color_at = color_projection(keyframes, keyframe, points, at);
   if (!color_at.inside) return;
-  const float own_share = pixel.v / (2.0f * intrinsics.cy) - 0.5f;
+  // The frame's images are of the keyframes' size, whatever its pixels are of.
+  const float own_row = (pixel.v - intrinsics.cy) / intrinsics.fy * keyframes.intrinsics.fy + keyframes.intrinsics.cy;
+  const float own_share = row_share(own_row, keyframes.height);
   const WidePlane plane = wide_plane(keyframes, keyframe, at, sensor.depth);
   if (plane.known) {
     const Vec3<float> facing = keyframe.pose.rotation * plane.slope, turned = cross(points.depth.offset, facing);
@@ -221,13 +220,17 @@ SPS_INLINE void update_capture_timing(const TimingEvidence& evidence, double* st
                                 (b * evidence.gradient[0] - a * evidence.gradient[1]) / determinant};
   constexpr double kFirst = 1.0 / (kFirstDeviation * kFirstDeviation),
                    kMost = 1.0 / (kLeastDeviation * kLeastDeviation);
+  double steps[kTimings];
+  for (int i = 0; i < kTimings; ++i) {
+    steps[i] = static_cast<double>(timing[i]) + off[i] - state[2 * i];
+    if (!std::isfinite(steps[i])) return;
+  }
   for (int i = 0; i < kTimings; ++i) {
     double* own = state + 2 * i;
     const double weight = 1.0 / (variance[i] + kFrameDeviation * kFrameDeviation);
     const double sum = (own[1] > kFirst ? own[1] : kFirst) + weight;
-    const double step = static_cast<double>(timing[i]) + off[i] - own[0];
-    if (!std::isfinite(step)) return;
-    own[0] += weight / sum * std::fmin(std::fmax(step, -kMostOff), kMostOff);
+    const double moved = own[0] + weight / sum * std::fmin(std::fmax(steps[i], -kMostOff), kMostOff);
+    own[0] = std::fmin(std::fmax(moved, -kMostTime), kMostTime);
     own[1] = std::fmin(sum, kMost);
   }
   for (int i = 0; i < kTimings; ++i) {

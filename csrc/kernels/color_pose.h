@@ -13,11 +13,11 @@ namespace spslam {
 // s: a color image farther from its depth image than this is none of that frame.
 constexpr float kMaxColorDelay = 0.1f;
 // rad, m, between the two: what moves by more has jumped.
-constexpr float kMaxColorTurn = 0.15f, kMaxColorWay = 0.15f;
+constexpr float kMaxColorTurn = 0.15f, kMaxColorTranslation = 0.15f;
 
 // How a camera moves at a frame, in world axes; not where that is unknown.
 struct CameraVelocity {
-  Vec3<float> turn, way;  // rad/s, m/s
+  Vec3<float> angular, linear;  // rad/s, m/s
   bool known;
 };
 
@@ -32,6 +32,11 @@ SPS_INLINE CameraVelocity camera_velocity(const float* poses, const FrameMotion&
   return {rate * quaternion_log(q1 * Quaternion<float>{q0.w, -q0.x, -q0.y, -q0.z}), rate * way, true};
 }
 
+// By what share of the readout the row of a pixel is read after the middle one.
+SPS_INLINE float row_share(float v, std::int64_t height) {
+  return v / static_cast<float>(height - 1) - 0.5f;
+}
+
 struct ColorPose {
   Pose<float> pose;
   float lever;  // by how much more than the depth image's pose it moves with a step of that; 0: it is the same pose
@@ -42,8 +47,9 @@ SPS_INLINE ColorPose color_pose(const float* poses, const FrameMotion& motion, c
   const ColorPose still{load_pose(pose), 0.0f};
   if (!delay || *delay == 0.0f || !(std::fabs(*delay) < kMaxColorDelay)) return still;
   const CameraVelocity velocity = camera_velocity(poses, motion, pose);
-  const Vec3<float> turn = *delay * velocity.turn, way = *delay * velocity.way;
-  const bool moved_on = dot(turn, turn) < kMaxColorTurn * kMaxColorTurn && dot(way, way) < kMaxColorWay * kMaxColorWay;
+  const Vec3<float> turn = *delay * velocity.angular, way = *delay * velocity.linear;
+  const bool moved_on =
+      dot(turn, turn) < kMaxColorTurn * kMaxColorTurn && dot(way, way) < kMaxColorTranslation * kMaxColorTranslation;
   if (!velocity.known || !moved_on) return still;
   const Quaternion<float> q = normalized(Quaternion<float>{pose[0], pose[1], pose[2], pose[3]});
   return {{rotation(quaternion_exp(turn) * q), still.pose.translation + way}, *delay / motion.seconds};

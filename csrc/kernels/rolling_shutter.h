@@ -20,7 +20,7 @@ constexpr float kMaxReadoutMotion = 0.15f;
 
 // The velocity in camera axes (rad/s, m/s), and the readout (s); 0 where the frame is to stay as it is.
 struct ReadoutMotion {
-  Vec3<float> turn, way;
+  Vec3<float> angular, linear;
   float readout;
 };
 
@@ -33,16 +33,16 @@ SPS_INLINE Vec3<float> to_camera(const Mat3<float>& rotation, const Vec3<float>&
 SPS_INLINE ReadoutMotion readout_motion(const ShutterMotion& motion) {
   const CameraVelocity world = camera_velocity(motion.before, {0, motion.seconds}, motion.pose);
   const Mat3<float> rotation = load_pose(motion.pose).rotation;
-  const float readout = *motion.readout, turn = readout * std::sqrt(dot(world.turn, world.turn)),
-              way = readout * std::sqrt(dot(world.way, world.way));
+  const float readout = *motion.readout, turn = readout * std::sqrt(dot(world.angular, world.angular)),
+              way = readout * std::sqrt(dot(world.linear, world.linear));
   const bool moves_evenly = std::fabs(turn) < kMaxReadoutMotion && std::fabs(way) < kMaxReadoutMotion;
-  return {to_camera(rotation, world.turn), to_camera(rotation, world.way), moves_evenly ? readout : 0.0f};
+  return {to_camera(rotation, world.angular), to_camera(rotation, world.linear), moves_evenly ? readout : 0.0f};
 }
 
 SPS_INLINE Vec3<float> at_middle_row(const ReadoutMotion& motion, const Vec3<float>& point, float row,
                                      std::int64_t height) {
-  const float s = motion.readout * (row / static_cast<float>(height - 1) - 0.5f);
-  return point + s * (cross(motion.turn, point) + motion.way);
+  const float s = motion.readout * row_share(row, height);
+  return point + s * (cross(motion.angular, point) + motion.linear);
 }
 
 // A record at the middle row's moment: its depth and, to the nearest pixel, its place; as it was where that is off the
@@ -76,7 +76,7 @@ SPS_INLINE ReadPixel look_up(const FrameImages& images, const ReadoutMotion& mot
   const float depth = images.unit * static_cast<float>(images.depth[y * camera.width + x]);
   const float inverse_z = depth > 0.0f ? 1.0f / depth : 0.0f;
   const Vec3<float> ray{(u - k.cx) * (1.0f / k.fx), (v - k.cy) * (1.0f / k.fy), 1.0f};
-  const ReadoutMotion per_depth{motion.turn, inverse_z * motion.way, motion.readout};
+  const ReadoutMotion per_depth{motion.angular, inverse_z * motion.linear, motion.readout};
   const Vec3<float> moved = at_middle_row(per_depth, ray, v, camera.height);
   const float by_z = 1.0f / std::fmax(moved.z, 0.5f);
   const float column = 2.0f * u - (moved.x * by_z * k.fx + k.cx), row = 2.0f * v - (moved.y * by_z * k.fy + k.cy);

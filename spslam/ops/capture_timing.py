@@ -57,12 +57,12 @@ def measure_capture_timing_(
     pose of each pair of frames eliminated, their normal equations M t = -g give the frame's own estimates, with the
     variances n / 300 M^-1 + (4 ms)^2, n being the differences of intensity of a pair if they are more than 300. The
     estimates are weighted means of these, in which a frame counts as off by 10 ms at most, beginning with 0 s of a
-    deviation of 5 ms; they never count as better than 1 ms, so that they follow a drift. Frames whose motion is unknown
-    say nothing.
+    deviation of 5 ms; they never count as better than 1 ms, so that they follow a drift, nor become larger than 90 ms.
+    Frames whose motion is unknown say nothing.
 
     Args:
-        timing: changed in place. What it says is heeded already: intensities are compared with its delay, and pixels
-            and images are rectified by its readout.
+        timing: changed in place. What it says is compensated already: intensities are compared with its delay, and
+            pixels and images are rectified by its readout, or by an estimate hardly older.
         pixels: int32 [P, 3] packed pixel records of the frame (see `sample_frame_pixels`).
         pose: float32 [7] of the frame, T_world_camera, as tracked.
         intrinsics: of the camera.

@@ -65,7 +65,7 @@ class ColorTiming(NamedTuple):
 
     Attributes:
         delay: float32 [1] from a frame's depth image to its color image, s, negative where color comes first (see
-            `measure_color_delay_`).
+            `measure_capture_timing_`).
         keyframes: the motion of each keyframe.
         frame: that of the frame which is compared with them.
     """

@@ -66,8 +66,8 @@ class TrackingOptions(Section):
     )
     capture_timing: bool = option(
         "Gauss-Newton: measure how much later than depth color is taken, and how long the camera reads a frame out (a "
-        "rolling shutter), and heed both",
-        needs=(need(is_("tracking.color", True)),),
+        "rolling shutter), and compensate for both",
+        needs=(need(is_("tracking.depth_keyframes", True)), need(is_("tracking.color", True))),
     )
     depth_keyframe_kernel_m: float = option(
         "Gauss-Newton: width of the robust kernel of distances to these depth images in the last iteration",

@@ -20,6 +20,7 @@ from spslam.io import atomic_write
 from spslam.run.clock import RunClock
 from spslam.run.device import explained_failures, resolve_device
 from spslam.run.figures import (
+    TIMING_FIGURES,
     decoding_figures,
     graph_figures,
     noise_figures,
@@ -239,6 +240,8 @@ def _metrics(
         "peak_rss_mb": max(run.metrics["peak_rss_mb"] for run in runs),
         **graph_figures(len(archive.keyframes), archive.edges),
         **noise_figures(next(iter(archive.noise.values()))),
+        # As it was known at the end.
+        **{name: runs[-1].metrics[name] for name in TIMING_FIGURES},
     }
 
 

@@ -19,6 +19,8 @@ from spslam.trajectory import Trajectory
 
 Log = Sequence[dict[str, Any]]
 
+TIMING_FIGURES = ("color_delay_ms", "readout_ms")
+
 
 def origin(config: Config, device: torch.device, command: str) -> dict[str, Any]:
     """By what something was made.
@@ -79,7 +81,7 @@ def noise_figures(model: torch.Tensor) -> dict[str, float]:
 
 def timing_figures(color_delay: torch.Tensor, readout: torch.Tensor) -> dict[str, float]:
     """When the sensor took its images, as was measured: float32 [1] each, s."""
-    return {"color_delay_ms": 1e3 * float(color_delay), "readout_ms": 1e3 * float(readout)}
+    return dict(zip(TIMING_FIGURES, (1e3 * float(color_delay), 1e3 * float(readout)), strict=True))
 
 
 def decoding_figures(clock: RunClock) -> dict[str, float]:

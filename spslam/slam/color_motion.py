@@ -6,6 +6,8 @@ import numpy as np
 
 from spslam.pose_graph import rotation_matrices, rotation_vectors
 
+MAX_COLOR_DELAY_S = 0.1  # as in csrc/kernels/color_pose.h: a color image farther from its depth image is none of it
+MAX_SHARE = 0.8  # of the motion from frame to frame: one image of the next or the last frame
 # rad, m, between the two images of a frame, as in csrc/kernels/color_pose.h: what moves on by more has jumped.
 MAX_TURN, MAX_DISTANCE = 0.15, 0.15
 
@@ -25,6 +27,10 @@ class ColorMotion:
     def color_pose(self, pose: np.ndarray) -> np.ndarray:
         """Pose float64 [4, 4] of the color image of a frame at a pose."""
         return self._moved(pose, 1.0 + self.share)
+
+    def lever(self, pose: np.ndarray) -> float:
+        """How much the color image's pose moves with a step of a pose float64 [4, 4]."""
+        return 1.0 if self.color_pose(pose) is pose else 1.0 + self.share
 
     def depth_pose(self, color_pose: np.ndarray) -> np.ndarray:
         """The inverse of `color_pose`."""

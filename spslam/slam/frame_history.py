@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam import ops
-from spslam.slam.color_motion import ColorMotion
+from spslam.slam.color_motion import MAX_COLOR_DELAY_S, MAX_SHARE, ColorMotion
 from spslam.slam.image_features import ImageFeatures, features_of_images
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.state import SlamState
@@ -126,7 +126,7 @@ class FrameHistory:
     def motion(self, row: int, timestamp: float | None) -> ops.FrameMotion:
         """How the camera came to the frame of a row, or to the next one, from the frame before."""
         frames = self._state.frames
-        if timestamp is None or row < 1 or bool(frames.lost[row - 1]):
+        if timestamp is None or row <= frames.opened or bool(frames.lost[row - 1]):
             return ops.NO_MOTION
         seconds = timestamp - float(frames.timestamps[row - 1])
         return ops.FrameMotion(row - 1, seconds) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
@@ -135,9 +135,10 @@ class FrameHistory:
         """How a frame's color image moved on from its depth image; None where the two are of one moment, or nothing
         is known of the motion. Waits for the device."""
         delay = float(self._state.noise.color_delay)
-        if motion.row < 0 or delay == 0:
+        share = delay / motion.seconds
+        if motion.row < 0 or delay == 0 or abs(delay) > MAX_COLOR_DELAY_S or abs(share) > MAX_SHARE:
             return None
-        return ColorMotion(pose_matrix(self.poses[motion.row]), delay / motion.seconds)
+        return ColorMotion(pose_matrix(self.poses[motion.row]), share)
 
     def color_pose(self, row: int) -> torch.Tensor:
         """float32 [7] where the camera took the color image of the frame in a row, on the device."""

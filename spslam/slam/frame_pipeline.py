@@ -81,6 +81,8 @@ class FramePipeline:
         prior = load_prior(config.prior.weights, config.prior.neighborhood)
         self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
+        tracking = config.tracking
+        self._measures_timing = tracking.depth_keyframes and tracking.color and tracking.capture_timing
         confidence = PoseConfidenceModel.load()
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
         self.recovery = Recovery(config, camera, self.tracker, confidence)
@@ -143,15 +145,17 @@ class FramePipeline:
         read = self._receive(frame, events)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
-        shutter = self._shutter_motion(frame.timestamp)
-        pixels = read if shutter is None else self._rectifier.records(read, shutter)
-        constraints = Constraints()
+        shutter = None
+        if self._measures_timing:
+            shutter = self._rectifier.motion(self.state, self.history, frame.timestamp, self.tracker.predict)
+        pixels, constraints = read, Constraints()
+        if shutter is not None and self.state.frames.knows_speed:
+            pixels = self._rectifier.records(read, shutter)
         if not begins_map:
             constraints = replace(self.constraints.gather(self.history, pixels, frame.timestamp), shutter=shutter)
         tracked = self._track(pixels, constraints, number, events)
-        if shutter is not None and not tracked.lost:
-            shutter = shutter._replace(pose=tracked.pose)
-            pixels = self._rectifier.frame(read, shutter)
+        shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
+        pixels = read if shutter is None else self._rectifier.frame(read, shutter)
         self._store(frame, pixels, constraints, tracked)
         if not begins_map:
             self._tell(on_pose)
@@ -159,7 +163,7 @@ class FramePipeline:
         if begins_map:
             self._tell(on_pose)
         self._keep_features(frame, read, tracked, number, shutter)
-        self._follow_other_maps(frame, pixels)
+        self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.lost[-1] and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
             self.global_mapping.after_frame(number, pixels, tracked.matrix())
@@ -262,16 +266,6 @@ class FramePipeline:
             self._task = self.mapper.begin(self.state, self._task.left)  # it was begun for the map before
         return loops
 
-    def _shutter_motion(self, timestamp: float) -> ops.ShutterMotion | None:
-        """How the camera is predicted to move while the next frame is read; None where that does not matter."""
-        frames, readout = self.state.frames, self.state.noise.readout
-        if not self.config.tracking.capture_timing or not frames.knows_speed:
-            return None
-        motion = self.history.motion(len(frames), timestamp)
-        if motion.row < 0 or (readout.device.type == "cpu" and float(readout) == 0):
-            return None
-        return ops.ShutterMotion(frames.poses[-1].clone(), self.tracker.predict(frames), motion.seconds, readout)
-
     def _receive(self, frame: PreparedFrame, events: FrameEvents) -> FramePixels:
         if not isinstance(frame.pixels, Upload):
             return frame.pixels.to(self.device)
@@ -332,8 +326,8 @@ class FramePipeline:
             features = frame.features
             if features is None:
                 features = extract_features(read, self.camera, self.config.dataset.max_depth_m)
-            if shutter is not None:
-                features = self._rectifier.features(features, shutter)
+        if features is not None and shutter is not None:
+            features = self._rectifier.features(features, shutter)
         if features is not None:
             self.state.features.add(number, features)
 

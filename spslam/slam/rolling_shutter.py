@@ -1,16 +1,24 @@
 """Frames of a rolling shutter, as of their middle row's moment; see `spslam.ops.rolling_shutter`."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from spslam import ops
 from spslam.camera import Camera
 from spslam.pose_graph import rotation_vectors
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
+from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import pose_matrix
+from spslam.slam.state import FrameTable, SlamState
+
+# rad, m, during the readout, as in csrc/kernels/rolling_shutter.h: what moves by more has jumped.
+MAX_READOUT_MOTION = 0.15
+MIN_DEPTH_M = 0.05  # of a point that is projected
 
 
 class ShutterRectifier:
@@ -25,10 +33,32 @@ class ShutterRectifier:
         self._camera, self._unit = camera, depth_unit(max_depth_m)
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
 
+    @staticmethod
+    def motion(
+        state: SlamState,
+        history: FrameHistory,
+        timestamp: float,
+        predict: Callable[[FrameTable], torch.Tensor],
+    ) -> ops.ShutterMotion | None:
+        """How the camera is predicted to move while the next frame is read; None where that does not matter.
+
+        Args:
+            state: before that frame.
+            history: of the state.
+            timestamp: of the frame, s.
+            predict: the next pose after those of a table.
+        """
+        frames, readout = state.frames, state.noise.readout
+        motion = history.motion(len(frames), timestamp)
+        if motion.row < 0 or (readout.device.type == "cpu" and float(readout) == 0):
+            return None
+        # A copy: the frame itself changes the estimate before its features are kept.
+        return ops.ShutterMotion(frames.poses[-1].clone(), predict(frames), motion.seconds, readout.clone())
+
     def records(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
         """The frame with its records rectified; images, normals and thumbnail are as they were read."""
         rectified = pixels.holding(pixels.buffer.clone())
-        if pixels.count:
+        if pixels.count and min(self._camera.height, self._camera.width) > 1:
             size = {"height": self._camera.height, "width": self._camera.width}
             ops.rectify_shutter_records_(rectified.records, pixels.records, motion, self._intrinsics, **size)
         return rectified
@@ -54,15 +84,18 @@ class ShutterRectifier:
         if readout == 0 or len(features) == 0:
             return features
         before, pose = pose_matrix(motion.before), pose_matrix(motion.pose)
-        turn = rotation_vectors(before[:3, :3].T @ pose[:3, :3]) / motion.seconds
-        way = pose[:3, :3].T @ (pose[:3, 3] - before[:3, 3]) / motion.seconds
+        angular = rotation_vectors(before[:3, :3].T @ pose[:3, :3]) / motion.seconds
+        linear = pose[:3, :3].T @ (pose[:3, 3] - before[:3, 3]) / motion.seconds
+        if max(np.linalg.norm(angular), np.linalg.norm(linear)) * abs(readout) > MAX_READOUT_MOTION:
+            return features
         k, height = depth_image_intrinsics(self._camera), -(-self._camera.height // depth_image_step(self._camera))
         positions = features.positions.astype(np.float64)
         known = features.points[:, 2:] > 0
         rays = np.concatenate([(positions - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(positions), 1))], 1)
         points = np.where(known, features.points, rays)
         share = readout * (positions[:, 1:] / max(height - 1, 1) - 0.5)
-        points = points + share * (np.cross(turn, points) + np.where(known, way, 0))
-        moved = points[:, :2] / points[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
-        kept = np.where(known, points, 0)
-        return replace(features, positions=moved.astype(np.float32), points=kept.astype(np.float32))
+        moved = points + share * (np.cross(angular, points) + np.where(known, linear, 0))
+        moved = np.where(moved[:, 2:] > MIN_DEPTH_M, moved, points)
+        projected = moved[:, :2] / moved[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
+        kept = np.where(known, moved, 0)
+        return replace(features, positions=projected.astype(np.float32), points=kept.astype(np.float32))

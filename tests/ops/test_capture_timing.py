@@ -7,7 +7,7 @@ from spslam import ops
 from tests.ops.arguments import opcheck
 from tests.ops.tracking_scene import noise_model
 
-CAMERA = ops.Intrinsics(120.0, 120.0, 79.5, 59.5)
+CAMERA = ops.Intrinsics(120.0, 120.0, 79.5, 50.0)  # its principal point is not the middle of the image
 SHAPE = (120, 160)
 UNIT = 1e-4
 INTERVAL = 1 / 30
@@ -122,17 +122,33 @@ def test_times_are_found(delay, readout, device):
     ]
 
 
-def test_a_camera_of_unknown_or_even_motion_tells_nothing(device):
+def test_a_camera_that_stands_still_tells_nothing(device):
     recording, noise = Recording(4, 0.02, device=device), noise_model(*NOISE, device=device)
     recording.poses[:] = recording.poses[:1].clone()
     timing = ops.CaptureTiming.unknown(device)
     keyframes = recording.keyframes(3, (1, 2), timing.color_delay)
-    unknown = keyframes._replace(timing=ops.ColorTiming(timing.color_delay, (ops.NO_MOTION,) * 2, ops.NO_MOTION))
-    for one in (keyframes, unknown):
-        ops.measure_capture_timing_(timing, recording.records(3), recording.poses[3], CAMERA, noise, one)
-        assert not timing.state.any()
-    ops.measure_capture_timing_(timing, recording.records(3)[:0], recording.poses[3], CAMERA, noise, keyframes)
+    ops.measure_capture_timing_(timing, recording.records(3), recording.poses[3], CAMERA, noise, keyframes)
     assert not timing.state.any()
+
+
+@pytest.mark.parametrize("unknown", ["frame", "keyframes", "pixels"])
+def test_unknown_motion_and_no_pixels_tell_nothing(unknown, device):
+    recording, noise = Recording(14, 0.02, device=device), noise_model(*NOISE, device=device)
+    found = []
+    for leave_out in (False, True):
+        timing = ops.CaptureTiming.unknown(device)
+        keyframes = recording.keyframes(13, (1, 6), timing.color_delay)
+        records, known = recording.records(13), keyframes.timing
+        if leave_out and unknown == "frame":
+            known = known._replace(frame=ops.NO_MOTION)
+        elif leave_out and unknown == "keyframes":
+            known = known._replace(keyframes=(ops.NO_MOTION,) * 2)
+        elif leave_out:
+            records = records[:0]
+        keyframes = keyframes._replace(timing=known)
+        ops.measure_capture_timing_(timing, records, recording.poses[13], CAMERA, noise, keyframes)
+        found.append(bool(timing.state.any()))
+    assert found == [True, False]
 
 
 @pytest.mark.parametrize("where", ["pixels", "pose", "before"])
@@ -214,7 +230,9 @@ def test_without_a_readout_or_after_a_jump_a_frame_stays(device):
 def test_unknown_depth_stays_unknown(device):
     recording = Recording(3, readout=0.02, device=device)
     recording.images[2] = 0
-    depth, _, _ = _rectified(recording, 2, torch.tensor([0.02], device=device))
+    motion = recording.shutter(2, torch.tensor([0.02], device=device))
+    depth, intensity = torch.full_like(recording.images[2], 7), recording.grays[2].clone()
+    ops.rectify_shutter_images_(depth, intensity, recording.images[2], recording.grays[2], motion, CAMERA, unit=UNIT)
     assert not depth.int().any()
 
 

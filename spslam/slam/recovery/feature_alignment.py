@@ -62,14 +62,23 @@ class FeatureAlignment:
         camera: of all frames.
         motion: from the frame's depth to its color image; None where they are of one moment. Poses that are taken and
             returned are those of depth.
+        read: the features as they were read, where `features` are rectified.
 
     Attributes:
+        features: see the argument.
+        read: see the argument; `features` where it is not given.
         max_error_px: farther from where the frame shows them, points do not agree with a pose.
         focal_px: focal length of the intensity image.
     """
 
-    def __init__(self, features: ImageFeatures, camera: Camera, motion: ColorMotion | None = None):
-        self.features = features
+    def __init__(
+        self,
+        features: ImageFeatures,
+        camera: Camera,
+        motion: ColorMotion | None = None,
+        read: ImageFeatures | None = None,
+    ):
+        self.features, self.read = features, features if read is None else read
         self._motion = motion
         k = depth_image_intrinsics(camera)
         self._matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
@@ -142,6 +151,7 @@ class FeatureAlignment:
         agreeing = 0
         for _ in range(HELD_ITERATIONS):
             residuals, jacobians = self._reprojection(points, positions, self._color_pose(at))
+            jacobians = jacobians * (1.0 if self._motion is None else self._motion.lever(at))
             ratio = (residuals**2).sum(1) / error_px**2
             agreeing = int((ratio < 1).sum())
             if agreeing < MIN_INLIERS:
@@ -171,8 +181,7 @@ class FeatureAlignment:
         by_point[:, 1, 1], by_point[:, 1, 2] = fy / z, -fy * y / z**2
         by_world = by_point @ pose[:3, :3].T
         jacobians = np.concatenate([-by_world, by_world @ cross_matrices(arms[front])], 2)
-        lever = 1.0 if self._motion is None else 1.0 + self._motion.share
-        return projected - positions[front], lever * jacobians
+        return projected - positions[front], jacobians
 
     def _color_pose(self, pose: np.ndarray) -> np.ndarray:
         return pose if self._motion is None else self._motion.color_pose(pose)

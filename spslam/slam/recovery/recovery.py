@@ -136,10 +136,10 @@ class Recovery:
         matches += frame.matched(self._anchors(history, row))
         pose = image.held(tracked.pose, tracked.information, matches, frame.late_px)
         if pose is None:
-            return replace(tracked, features=image.features)
+            return replace(tracked, features=image.read)
         estimate = self._tracker.measure(problem, pose)
         frame = replace(frame, matches=tuple(image.counted(one, pose) for one in matches))
-        held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.features)
+        held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.read)
         held = self._judged(held)
         return held if held.weight > tracked.weight - MAX_LOSS else self._recover(problem, tracked, pixels, history)
 
@@ -180,7 +180,7 @@ class Recovery:
         if found is None or found.lost:
             found = self._relocalize(frame, candidates)
         iterations += sum(candidate.iterations for candidate in candidates)
-        return replace(found, iterations=iterations, features=frame.image.features if frame.image else None)
+        return replace(found, iterations=iterations, features=frame.image.read if frame.image else None)
 
     def _features(
         self, problem: TrackingProblem, pixels: FramePixels, history: FrameHistory
@@ -188,13 +188,13 @@ class Recovery:
         tracking = self._config.tracking
         if not (tracking.features and tracking.recovery):
             return None
-        features = extract_features(pixels, self._camera, self._config.dataset.max_depth_m)
+        features = read = extract_features(pixels, self._camera, self._config.dataset.max_depth_m)
         if problem.constraints.shutter is not None:
-            features = self._rectifier.features(features, problem.constraints.shutter)
+            features = self._rectifier.features(read, problem.constraints.shutter)
         keyframes = problem.constraints.depth_keyframes
         timing = None if keyframes is None else keyframes.timing
         motion = None if timing is None else history.color_motion(timing.frame)
-        return FeatureAlignment(features, self._camera, motion)
+        return FeatureAlignment(features, self._camera, motion, read)
 
     def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
         """Poses against the last trusted frame: by image features, by ICP from the predicted pose and from its own."""
