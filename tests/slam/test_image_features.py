@@ -1,5 +1,6 @@
 """Image features: where they are, what they match, which pose they give, and how they are kept."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -253,3 +254,16 @@ def test_features_that_may_be_late_hold_a_pose_less(dataset, features):
 
     assert moved_m(0.0) == moved_m(0.5 * image.max_error_px)
     assert moved_m(10.0) < 0.5 * moved_m(0.0)
+
+
+@pytest.mark.parametrize(("count", "contradicts"), [(60, True), (4, False)])
+def test_few_features_of_a_frame_that_is_hardly_seen_contradict_nothing(dataset, features, count, contradicts):
+    """Matches with an earlier frame that agree on another pose, beside many that agree with the right one."""
+    image, pose = FeatureAlignment(features[4], dataset.camera), pose_of(dataset, 4)
+    many = image.counted(image.matches(features[2].with_depth(), pose_of(dataset, 2)), pose)
+    other = replace(many, points=many.points[:count] + 1.0, positions=many.positions[:count], agreeing=count)
+    assert many.agreeing > 40
+    frame = DoubtfulFrame(SimpleNamespace(constraints=Constraints()), None, None, None, image, (many, other))
+    fit = frame.with_features(Fit(), pose)
+    assert (fit.feature_share < 0.2) == contradicts
+    assert fit.feature_inliers == many.agreeing

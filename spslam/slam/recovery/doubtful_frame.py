@@ -17,6 +17,9 @@ REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones fea
 # By so much the moments of a frame's depth and color may differ, or those of an image's rows: as in recordings whose
 # images are paired by time, and with a rolling shutter.
 LATE_S = 0.02
+# Of the features that agree with the earlier frame seen best: those of a frame that shares fewer contradict no pose, as
+# where the camera has turned away from it they lie at the edge of both images.
+FEW_FEATURES = 0.1
 MAX_TURN_DEG_S = 300.0  # of a camera; what moves faster in the image has jumped
 
 
@@ -68,8 +71,10 @@ class DoubtfulFrame:
         inliers = [self.image.inliers(one, pose) for one in self.matches]
         shares: list[float] = []
         if self.colors_are_registered:
-            within = [self.image.inliers(one, pose, self.late_px) for one in self.matches]
-            shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, self.matches, strict=True) if one.agreeing]
+            most = max((one.agreeing for one in self.matches), default=0)
+            telling = [one for one in self.matches if one.agreeing > FEW_FEATURES * most]
+            within = [self.image.inliers(one, pose, self.late_px) for one in telling]
+            shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, telling, strict=True)]
         return replace(fit, feature_inliers=max(inliers, default=0), feature_share=min(shares, default=math.nan))
 
     @property
