@@ -7,7 +7,8 @@
 A pose is wrong where it is more than 5 cm or 2 degrees off against the frames around it: the median over the trusted
 ones of the 21 around it of the error of the relative pose. It is confidently wrong if its error probability is below
 0.05 as well. All cases can be tracked, so every lost frame is a false loss. A loop is false if the relative pose of its
-two frames is off by more than 10 cm or 5 degrees at the end.
+two frames is off by more than 10 cm or 5 degrees at the end. With --orb-slam3 its errors on the same frames stand
+beside, with and without loop closing: over the frames that it knows, and how many it does not.
 """
 
 import argparse
@@ -17,7 +18,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -39,7 +42,7 @@ AROUND = 10  # frames before and after that a pose is compared with
 
 COLUMNS = (
     "place", "sensor", "motion", "seed", "frames", "ATE cm", "GICP cm", "drift %", "lost", "wrong", "confidently wrong",
-    "loops", "false loops", "frames/s",
+    "loops", "false loops", "frames/s", "ORB-SLAM3 cm (lost)", "without loops cm (lost)",
 )  # fmt: skip
 FALSE_LOOP_M, FALSE_LOOP_DEG = 0.1, 5.0
 
@@ -47,8 +50,9 @@ FALSE_LOOP_M, FALSE_LOOP_DEG = 0.1, 5.0
 def main() -> None:
     """Parses the arguments; runs the cases, or one of them; prints a row per case and the sums."""
     args = _parser().parse_args()
-    if args.only_gicp:
-        print(json.dumps(gicp_ate_cm(args, tuple(args.only_gicp))))
+    if args.only_baseline:
+        name, *case = args.only_baseline
+        print(json.dumps(BASELINES[name](args, tuple(case))))
         return
     cases = list(product(args.places, args.sensors, args.motions, args.seeds))
     print(f"| {' | '.join(COLUMNS)} |")
@@ -76,10 +80,11 @@ def measure(args: argparse.Namespace, case: tuple[str, str, str, int]) -> dict:
         if done.returncode:
             return {**row, "error": done.stderr.strip().splitlines()[-1:]}
         row |= judge(args, case, RunFolder(output), done.stdout + done.stderr)
-    if not args.without_gicp:
-        command = [sys.executable, "-m", "experiments.places_sweep", *sys.argv[1:], "--only-gicp", *map(str, case)]
-        done = subprocess.run(command, env=_environment(), capture_output=True, text=True)
-        row["gicp_cm"] = json.loads(done.stdout) if done.returncode == 0 else None
+    baselines = ([] if args.without_gicp else ["gicp"]) + (["orb", "orb_without_loops"] if args.orb_slam3 else [])
+    for name in baselines:
+        command = [sys.executable, "-m", "experiments.places_sweep", *sys.argv[1:], "--only-baseline", name]
+        done = subprocess.run([*command, *map(str, case)], env=_environment(), capture_output=True, text=True)
+        row |= json.loads(done.stdout) if done.returncode == 0 else {f"{name}_error": done.stderr[-300:]}
     return row
 
 
@@ -160,7 +165,7 @@ def local_errors(estimated: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, 
     return errors_cm, errors_deg
 
 
-def gicp_ate_cm(args: argparse.Namespace, case: tuple[str, ...]) -> float:
+def gicp(args: argparse.Namespace, case: tuple[str, ...]) -> dict:
     """ATE of voxelized GICP odometry over the same frames."""
     from spslam.benchmark.gicp import GicpOdometry
     from spslam.evaluation.trajectory_metrics import ate
@@ -170,7 +175,35 @@ def gicp_ate_cm(args: argparse.Namespace, case: tuple[str, ...]) -> float:
     odometry = GicpOdometry(data.camera, truth[0])
     for frame in data:
         odometry.process(frame.depth)
-    return ate(np.array(odometry.poses), truth)["ate_rmse_cm"]
+    return {"gicp_cm": ate(np.array(odometry.poses), truth)["ate_rmse_cm"]}
+
+
+def orb_slam3(args: argparse.Namespace, case: tuple[str, ...], name: str, loop_closing: bool) -> dict:
+    """ATE of ORB-SLAM3's final trajectory over the frames that have a pose in it, how many have none, frames/s."""
+    from spslam.benchmark.orb_slam3 import OrbSlam3
+
+    data = dataset_of(args, (case[0], case[1], case[2], int(case[3])))
+    truth, busy_s = data.poses(), 0.0
+    with OrbSlam3(data.camera, 1 / float(np.median(np.diff(data.timestamps()))), loop_closing) as slam:
+        for frame in data:
+            started = time.perf_counter()
+            slam.process(frame)
+            busy_s += time.perf_counter() - started
+        poses = slam.finish()
+    known = [i for i, pose in enumerate(poses) if pose is not None]
+    figures = {f"{name}_lost": len(poses) - len(known), f"{name}_fps": len(poses) / busy_s}
+    if len(known) < 3:
+        return figures
+    found = np.array([poses[i] for i in known])
+    errors = absolute_errors(found, truth[known], align(found, truth[known]))
+    return figures | {f"{name}_cm": 100 * float(np.sqrt(np.mean(errors**2)))}
+
+
+BASELINES = {
+    "gicp": gicp,
+    "orb": partial(orb_slam3, name="orb", loop_closing=True),
+    "orb_without_loops": partial(orb_slam3, name="orb_without_loops", loop_closing=False),
+}
 
 
 def dataset_of(args: argparse.Namespace, case: tuple[str, str, str, int]):
@@ -187,6 +220,10 @@ def table_row(row: dict) -> str:
     figures = [row["frames"], f"{row['ate_cm']:.2f}", "-" if gicp is None else f"{gicp:.2f}"]
     figures += [f"{row['drift_percent']:.2f}", row["lost"], row["wrong"], len(row["confidently_wrong"])]
     figures += [row["loops"], len(row["false_loops"]), f"{row['fps']:.0f}"]
+    figures += [
+        f"{row[f'{name}_cm']:.2f} ({row[f'{name}_lost']})" if f"{name}_cm" in row else "-"
+        for name in ("orb", "orb_without_loops")
+    ]
     return head + " | ".join(map(str, figures)) + " |"
 
 
@@ -205,6 +242,10 @@ def summary(rows: list[dict]) -> str:
     if done:
         drifts = [row["drift_percent"] for row in done]
         lines.append(f"drift: median {statistics.median(drifts):.2f} %, at most {max(drifts):.2f} %")
+        lines.append(f"ATE: median {statistics.median(row['ate_cm'] for row in done):.2f} cm")
+    for name, title in (("orb", "ORB-SLAM3"), ("orb_without_loops", "ORB-SLAM3 without loops")):
+        if found := [row[f"{name}_cm"] for row in done if f"{name}_cm" in row]:
+            lines.append(f"ATE of {title}: median {statistics.median(found):.2f} cm in {len(found)} cases")
     return "\n".join(lines)
 
 
@@ -224,7 +265,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--without-gicp", action="store_true", help="do not run GICP odometry")
     parser.add_argument("--measures", action="store_true", help="save each frame's measures of its fit too")
     parser.add_argument("--save", type=Path, help="file for the figures, JSON")
-    parser.add_argument("--only-gicp", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--orb-slam3", action="store_true", help="run it too; see docs/results.md for what it needs")
+    parser.add_argument("--only-baseline", nargs=5, help=argparse.SUPPRESS)
     add_options(parser)
     return parser
 

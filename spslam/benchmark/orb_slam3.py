@@ -55,6 +55,7 @@ ORBextractor.scaleFactor: {scale}
 ORBextractor.nLevels: {levels}
 ORBextractor.iniThFAST: 20
 ORBextractor.minThFAST: 7
+loopClosing: {loop_closing:d}
 Viewer.KeyFrameSize: 0.05
 Viewer.KeyFrameLineWidth: 1.0
 Viewer.GraphLineWidth: 0.9
@@ -96,6 +97,7 @@ class OrbSlam3:
     Args:
         camera: intrinsics of the images, which must have no lens distortion.
         rate_hz: of the frames; ORB-SLAM3 inserts a keyframe at least once a second.
+        loop_closing: whether it closes loops and joins maps.
 
     Attributes:
         live: float64 [4, 4] T_world_camera of each frame as it was tracked, before later keyframes and loops changed
@@ -105,10 +107,10 @@ class OrbSlam3:
         SpslamError: pyorbslam3 or the vocabulary is missing, images are too small, or ORB-SLAM3 fails.
     """
 
-    def __init__(self, camera: Camera, rate_hz: float) -> None:
+    def __init__(self, camera: Camera, rate_hz: float, loop_closing: bool = True) -> None:
         if reason := orb_slam3_off_reason():
             raise SpslamError(f"the ORB-SLAM3 baseline {reason}")
-        settings = orb_slam3_settings(camera, rate_hz)
+        settings = orb_slam3_settings(camera, rate_hz, loop_closing)
         self.live: list[np.ndarray | None] = []
         self._numbers: dict[int, int] = {}
         self._start = math.nan
@@ -215,7 +217,7 @@ def _start(folder: Path) -> tuple[Connection, subprocess.Popen]:
     return connection, process
 
 
-def orb_slam3_settings(camera: Camera, rate_hz: float) -> str:
+def orb_slam3_settings(camera: Camera, rate_hz: float, loop_closing: bool = True) -> str:
     """ORB-SLAM3's settings file for a camera without distortion and depth in meters.
 
     ORB features are extracted on 8 pyramid levels a factor of 1.2 apart, or as many as a small image has room for.
@@ -223,6 +225,7 @@ def orb_slam3_settings(camera: Camera, rate_hz: float) -> str:
     Args:
         camera: intrinsics.
         rate_hz: of the frames.
+        loop_closing: whether it closes loops and joins maps.
 
     Raises:
         SpslamError: images are too small.
@@ -244,4 +247,5 @@ def orb_slam3_settings(camera: Camera, rate_hz: float) -> str:
         rate_hz=max(round(rate_hz), 1),
         scale=_PYRAMID_SCALE,
         levels=levels,
+        loop_closing=loop_closing,
     )
