@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,7 +23,23 @@ from spslam.slam.poses import pose_tensor
 SAMPLED_SHARE = 1.5  # pixels that are drawn for each that is encoded, as not all have a normal
 SAMPLED_AHEAD = 16  # keyframes, of 300 kB of pixels each
 
-_Pixels = tuple[torch.Tensor, torch.Tensor]
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Pixels that were drawn of a keyframe, and its pose, in one buffer: an upload is one copy.
+
+    Attributes:
+        words: int32 [6 N + 7]: records, normals, pose; page-locked where they go to a GPU.
+        count: N.
+    """
+
+    words: torch.Tensor
+    count: int
+
+    def to(self, device: torch.device) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Records int32 [N, 3], normals float32 [N, 3] and the pose float32 [7] on a device; waits for nothing."""
+        records, normals, pose = self.words.to(device, non_blocking=True).split([3 * self.count, 3 * self.count, 7])
+        return records.view(-1, 3), normals.view(torch.float32).view(-1, 3), pose.view(torch.float32)
 
 
 def encode_keyframe(volume: SparseVolume, keyframe: Keyframe, pose: np.ndarray, prior: Prior, config: Config) -> None:
@@ -35,7 +52,7 @@ def encode_keyframe(volume: SparseVolume, keyframe: Keyframe, pose: np.ndarray, 
         prior: on the volume's device.
         config: of the run.
     """
-    _encode(volume, keyframe, _sampled(keyframe, config), pose, prior, config)
+    _encode(volume, keyframe, _drawn(keyframe, pose, config, volume.device), prior, config)
 
 
 def encode_keyframes(
@@ -58,33 +75,32 @@ def encode_keyframes(
         for keyframe, pose in posed:
             encode_keyframe(volume, keyframe, pose, prior, config)
         return
-    coming: deque[tuple[Keyframe, np.ndarray, Future[_Pixels]]] = deque()
+    coming: deque[tuple[Keyframe, Future[_Drawn]]] = deque()
 
     def fuse_next() -> None:
-        keyframe, pose, sampled = coming.popleft()
-        _encode(volume, keyframe, sampled.result(), pose, prior, config)
+        keyframe, drawn = coming.popleft()
+        _encode(volume, keyframe, drawn.result(), prior, config)
 
     for keyframe, pose in posed:
-        coming.append((keyframe, pose, pool.submit(_sampled, keyframe, config)))
+        coming.append((keyframe, pool.submit(_drawn, keyframe, pose, config, volume.device)))
         if len(coming) > SAMPLED_AHEAD:
             fuse_next()
     while coming:
         fuse_next()
 
 
-def _sampled(keyframe: Keyframe, config: Config) -> _Pixels:
-    """Records and normals of pixels of a keyframe."""
-    return keyframe.sample(round(SAMPLED_SHARE * config.prior.points_per_frame), config.seed)
+def _drawn(keyframe: Keyframe, pose: np.ndarray, config: Config, device: torch.device) -> _Drawn:
+    records, normals = keyframe.sample(round(SAMPLED_SHARE * config.prior.points_per_frame), config.seed)
+    words = torch.empty(6 * len(records) + 7, dtype=torch.int32, pin_memory=device.type == "cuda")
+    parts = records, normals.view(torch.int32), pose_tensor(pose, torch.device("cpu")).view(torch.int32)
+    torch.cat([part.flatten() for part in parts], out=words)
+    return _Drawn(words, len(records))
 
 
-def _encode(
-    volume: SparseVolume, keyframe: Keyframe, pixels: _Pixels, pose: np.ndarray, prior: Prior, config: Config
-) -> None:
-    if not len(pixels[0]):
+def _encode(volume: SparseVolume, keyframe: Keyframe, drawn: _Drawn, prior: Prior, config: Config) -> None:
+    if not drawn.count:
         return
-    records, normals = (tensor.contiguous().to(volume.device) for tensor in pixels)
-    at = pose_tensor(pose, volume.device)
-    points, turned = ops.unproject_pixels(records, normals, at, *keyframe.camera.intrinsics)
+    points, turned = ops.unproject_pixels(*drawn.to(volume.device), *keyframe.camera.intrinsics)
     encode_frame(volume, points, turned, prior, config.prior, config.seed, config.precision == "tf32")
 
 
