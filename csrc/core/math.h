@@ -1,4 +1,4 @@
-// Exponentials that a compiler vectorizes on the host: the C library's are one call per element.
+// Functions that a compiler vectorizes on the host: the C library's are one call per element.
 #pragma once
 
 #include <cmath>
@@ -7,6 +7,17 @@
 #include "core/macros.h"
 
 namespace spslam {
+
+// The smaller and the larger of two; `b` where one is NaN. Unlike std::fmin and std::fmax no calls, so they vectorize.
+template <class T>
+SPS_INLINE T smaller(T a, T b) {
+  return a < b ? a : b;
+}
+
+template <class T>
+SPS_INLINE T larger(T a, T b) {
+  return a > b ? a : b;
+}
 
 // e^x for float: within 2 ulp, NaN kept; saturates near 2^-126 and 2^127 where the C library underflows or overflows.
 SPS_INLINE float exponential(float x) {

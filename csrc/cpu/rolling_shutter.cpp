@@ -8,7 +8,33 @@ namespace spslam {
 namespace {
 
 constexpr std::int64_t kRowGrain = 16;
-constexpr std::int64_t kLanes = 128;  // pixels that are looked up together, in vector lanes
+constexpr std::int64_t kLanes = 128;  // pixels that are made together, in vector lanes
+
+// `count` pixels of row y from column `begin` on. By value: nothing that is written can be part of them.
+void rectify_lanes(FrameImages images, ReadoutMotion readout, ShutterCamera camera, std::int64_t y, std::int64_t begin,
+                   std::int64_t count, std::uint16_t* depth, std::uint8_t* intensity) {
+  float scale[kLanes], by_column[kLanes], by_row[kLanes], read[kLanes], corners[4][kLanes];
+  std::int32_t row[kLanes], column[kLanes], top[kLanes], left[kLanes];
+  for (std::int64_t lane = 0; lane < count; ++lane) {
+    const ReadPixel from = look_up(images, readout, camera, y, begin + lane);
+    const ReadPlace at = read_place(camera, from);
+    scale[lane] = from.scale, by_column[lane] = at.by_column, by_row[lane] = at.by_row;
+    row[lane] = at.row, column[lane] = at.column, top[lane] = at.top, left[lane] = at.left;
+  }
+  for (std::int64_t lane = 0; lane < count; ++lane) {
+    read[lane] = static_cast<float>(images.depth[row[lane] * camera.width + column[lane]]);
+    const std::uint8_t* corner = images.intensity + top[lane] * camera.width + left[lane];
+    corners[0][lane] = static_cast<float>(corner[0]), corners[1][lane] = static_cast<float>(corner[1]);
+    corners[2][lane] = static_cast<float>(corner[camera.width]);
+    corners[3][lane] = static_cast<float>(corner[camera.width + 1]);
+  }
+  SPS_SIMD
+  for (std::int64_t lane = 0; lane < count; ++lane) {
+    depth[lane] = rectified_depth(scale[lane], read[lane]);
+    intensity[lane] = rectified_intensity(corners[0][lane], corners[1][lane], corners[2][lane], corners[3][lane],
+                                          by_column[lane], by_row[lane]);
+  }
+}
 
 }  // namespace
 
@@ -32,19 +58,10 @@ void rectify_shutter_images<Cpu>(Cpu, const FrameImages& images, const ShutterMo
     return;
   }
   parallel_for(camera.height, kRowGrain, [&](std::int64_t first, std::int64_t last) {
-    float column[kLanes], row[kLanes], scale[kLanes];
     for (std::int64_t y = first; y < last; ++y) {
       for (std::int64_t begin = 0; begin < width; begin += kLanes) {
-        const std::int64_t count = width - begin < kLanes ? width - begin : kLanes;
-        SPS_SIMD
-        for (std::int64_t lane = 0; lane < count; ++lane) {
-          const ReadPixel from = look_up(images, readout, camera, y, begin + lane);
-          column[lane] = from.column, row[lane] = from.row, scale[lane] = from.scale;
-        }
-        for (std::int64_t lane = 0; lane < count; ++lane) {
-          const std::int64_t at = y * width + begin + lane;
-          rectify_pixel(images, camera, {column[lane], row[lane], scale[lane]}, depth + at, intensity + at);
-        }
+        const std::int64_t count = width - begin < kLanes ? width - begin : kLanes, at = y * width + begin;
+        rectify_lanes(images, readout, camera, y, begin, count, depth + at, intensity + at);
       }
     }
   });

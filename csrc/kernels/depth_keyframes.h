@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "core/macros.h"
+#include "core/math.h"
 #include "core/vec.h"
 #include "kernels/color_pose.h"
 #include "kernels/earlier_frame.h"
@@ -75,13 +76,13 @@ SPS_INLINE SurfaceDistance surface_distance(const DepthKeyframes& keyframes, con
   if (d00 == 0 || d01 == 0 || d10 == 0 || d11 == 0) return {};
   const float q00 = 1.0f / (keyframes.unit * d00), q01 = 1.0f / (keyframes.unit * d01);
   const float q10 = 1.0f / (keyframes.unit * d10), q11 = 1.0f / (keyframes.unit * d11);
-  const float most = std::fmax(std::fmax(q00, q01), std::fmax(q10, q11));
-  const float least = std::fmin(std::fmin(q00, q01), std::fmin(q10, q11));
+  const float most = larger(larger(q00, q01), larger(q10, q11));
+  const float least = smaller(smaller(q00, q01), smaller(q10, q11));
   if (!(most - least < kMaxInverseDepthSpread * most)) return {};
   const BilinearValue q = bilinear_value(q00, q01, q10, q11, at.a, at.b);
   const float x = q.by_u * keyframes.intrinsics.fx, y = q.by_v * keyframes.intrinsics.fy;
   const Vec3<float> gradient{x, y, q.value - (x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
-  const float inverse_slope = 1.0f / std::fmax(std::sqrt(dot(gradient, gradient)), 1e-6f);
+  const float inverse_slope = 1.0f / larger(std::sqrt(dot(gradient, gradient)), 1e-6f);
   const float excess = at.in_camera.z * q.value - 1.0f;
   return {excess * inverse_slope, inverse_slope * gradient, true, std::fabs(excess) < kMaxDepthDifference};
 }

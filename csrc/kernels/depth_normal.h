@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "core/macros.h"
+#include "core/math.h"
 #include "core/vec.h"
 #include "spslam/prior_fusion.h"
 
@@ -48,8 +49,8 @@ SPS_INLINE Vec3<float> unproject(const Intrinsics& camera, float u, float v, flo
 // the share max_jump of it, or more.
 SPS_INLINE Vec3<float> normal_of_cross(const Intrinsics& camera, float u, float v, float step_px, float max_jump,
                                        const DepthCross& z) {
-  const float horizontal_jump = std::fmax(std::fabs(z.left - z.center), std::fabs(z.right - z.center));
-  const float vertical_jump = std::fmax(std::fabs(z.up - z.center), std::fabs(z.down - z.center));
+  const float horizontal_jump = larger(std::fabs(z.left - z.center), std::fabs(z.right - z.center));
+  const float vertical_jump = larger(std::fabs(z.up - z.center), std::fabs(z.down - z.center));
   const bool smooth = (horizontal_jump < max_jump * z.center) & (vertical_jump < max_jump * z.center);
   const bool measured = (z.center > 0.0f) & (z.left > 0.0f) & (z.right > 0.0f) & (z.up > 0.0f) & (z.down > 0.0f);
   const Vec3<float> horizontal = unproject(camera, u + step_px, v, z.right) - unproject(camera, u - step_px, v, z.left);

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "core/macros.h"
+#include "core/math.h"
 #include "core/vec.h"
 #include "kernels/depth_noise.h"
 #include "spslam/gauss_newton.h"
@@ -30,7 +31,7 @@ SPS_INLINE SensorNoise load_sensor_noise(const float* numbers) {
 // Of a difference between intensities where the image has these derivatives (1/px). Never 0, whatever was measured: a
 // flat pixel would weigh infinitely.
 SPS_INLINE float intensity_deviation(const SensorNoise* noise, float by_u, float by_v) {
-  const float floor = std::fmax(noise->intensity_floor, kRoundingVariance);
+  const float floor = larger(noise->intensity_floor, kRoundingVariance);
   return std::sqrt(floor + noise->intensity_growth * (by_u * by_u + by_v * by_v));
 }
 
@@ -38,7 +39,7 @@ SPS_INLINE float intensity_deviation(const SensorNoise* noise, float by_u, float
 // not average out, so their deviation counts twice.
 SPS_INLINE float intensity_share(const SensorNoise& noise) {
   constexpr float kRegistered = kRegistrationError * kRegistrationError;
-  return kRegistered / std::fmax(noise.intensity_growth, kRegistered);
+  return kRegistered / larger(noise.intensity_growth, kRegistered);
 }
 
 // Of a pixel of one depth and intensity: inverse variances of its residuals, against the map as a share of that without
@@ -55,8 +56,8 @@ SPS_INLINE PixelNoise pixel_noise(const SensorNoise* sensor, float depth, float 
   constexpr float kMost = kSurfaceDeviation * kSurfaceDeviation,
                   kLeast = kLeastSurfaceDeviation * kLeastSurfaceDeviation;
   const float variance = depth_variance(sensor->depth, depth);
-  const float surface = std::fmin(kLeast + sensor->depth.floor, kMost);
-  return {sensor, kMost / (kMost + variance), surface / std::fmax(kLeast + variance, surface), intensity,
+  const float surface = smaller(kLeast + sensor->depth.floor, kMost);
+  return {sensor, kMost / (kMost + variance), surface / larger(kLeast + variance, surface), intensity,
           kIntensityGain * std::sqrt(surface * intensity_share(*sensor))};
 }
 

@@ -7,6 +7,7 @@
 #include <cstdint>
 
 #include "core/macros.h"
+#include "core/math.h"
 #include "core/vec.h"
 #include "kernels/color_pose.h"
 #include "kernels/earlier_frame.h"
@@ -78,27 +79,47 @@ SPS_INLINE ReadPixel look_up(const FrameImages& images, const ReadoutMotion& mot
   const Vec3<float> ray{(u - k.cx) * (1.0f / k.fx), (v - k.cy) * (1.0f / k.fy), 1.0f};
   const ReadoutMotion per_depth{motion.angular, inverse_z * motion.linear, motion.readout};
   const Vec3<float> moved = at_middle_row(per_depth, ray, v, camera.height);
-  const float by_z = 1.0f / std::fmax(moved.z, 0.5f);
+  const float by_z = 1.0f / larger(moved.z, 0.5f);
   const float column = 2.0f * u - (moved.x * by_z * k.fx + k.cx), row = 2.0f * v - (moved.y * by_z * k.fy + k.cy);
-  return {std::fmin(std::fmax(column, 0.0f), static_cast<float>(camera.width - 1)),
-          std::fmin(std::fmax(row, 0.0f), static_cast<float>(camera.height - 1)), moved.z};
+  return {smaller(larger(column, 0.0f), static_cast<float>(camera.width - 1)),
+          smaller(larger(row, 0.0f), static_cast<float>(camera.height - 1)), moved.z};
 }
 
-// What a pixel of the images shows at the middle row's moment: depth of the nearest pixel that was read, intensity
-// between four.
+// Where that is in the images: the nearest pixel, the upper left one of four, and the place between these.
+struct ReadPlace {
+  std::int32_t row, column, top, left;
+  float by_column, by_row;
+};
+
+SPS_INLINE ReadPlace read_place(const ShutterCamera& camera, ReadPixel from) {
+  const std::int32_t left = static_cast<std::int32_t>(smaller(from.column, static_cast<float>(camera.width - 2))),
+                     top = static_cast<std::int32_t>(smaller(from.row, static_cast<float>(camera.height - 2)));
+  return {static_cast<std::int32_t>(from.row + 0.5f),
+          static_cast<std::int32_t>(from.column + 0.5f),
+          top,
+          left,
+          from.column - static_cast<float>(left),
+          from.row - static_cast<float>(top)};
+}
+
+// Depth of the nearest pixel that was read.
+SPS_INLINE std::uint16_t rectified_depth(float scale, float depth) {
+  return static_cast<std::uint16_t>(smaller(scale * depth + 0.5f, 65535.0f));
+}
+
+// Intensity between four pixels that were read.
+SPS_INLINE std::uint8_t rectified_intensity(float v00, float v01, float v10, float v11, float by_column, float by_row) {
+  return static_cast<std::uint8_t>(bilinear_value(v00, v01, v10, v11, by_column, by_row).value + 0.5f);
+}
+
+// What a pixel of the images shows at the middle row's moment.
 SPS_INLINE void rectify_pixel(const FrameImages& images, const ShutterCamera& camera, const ReadPixel& from,
                               std::uint16_t* depth, std::uint8_t* intensity) {
-  const std::int64_t nearest =
-      static_cast<std::int64_t>(from.row + 0.5f) * camera.width + static_cast<std::int64_t>(from.column + 0.5f);
-  *depth =
-      static_cast<std::uint16_t>(std::fmin(from.scale * static_cast<float>(images.depth[nearest]) + 0.5f, 65535.0f));
-  const std::int64_t left = static_cast<std::int64_t>(std::fmin(from.column, static_cast<float>(camera.width - 2)));
-  const std::int64_t top = static_cast<std::int64_t>(std::fmin(from.row, static_cast<float>(camera.height - 2)));
-  const std::uint8_t* corner = images.intensity + top * camera.width + left;
-  const float a = from.column - static_cast<float>(left), b = from.row - static_cast<float>(top);
-  const BilinearValue value =
-      bilinear_value(corner[0], corner[1], corner[camera.width], corner[camera.width + 1], a, b);
-  *intensity = static_cast<std::uint8_t>(value.value + 0.5f);
+  const ReadPlace at = read_place(camera, from);
+  *depth = rectified_depth(from.scale, images.depth[at.row * camera.width + at.column]);
+  const std::uint8_t* corner = images.intensity + at.top * camera.width + at.left;
+  *intensity = rectified_intensity(corner[0], corner[1], corner[camera.width], corner[camera.width + 1], at.by_column,
+                                   at.by_row);
 }
 
 }  // namespace spslam
