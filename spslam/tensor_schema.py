@@ -251,6 +251,8 @@ CHECKPOINT = TensorSchema(
         **_map_rules("scene."),
         "frames.poses": TensorRule(torch.float32, ("frames", 7)),
         "frames.timestamps": TensorRule(torch.float64, ("frames",)),
+        "frames.depth_times": TensorRule(torch.float64, ("frames",)),
+        "frames.color_offsets": TensorRule(torch.float64, ("frames",)),
         "frames.indices": TensorRule(torch.int64, ("frames",), low=0),
         "frames.lost": TensorRule(torch.bool, ("frames",)),
         "frames.consistent_frames": TensorRule(torch.int64, ("frames",), low=0),

@@ -12,16 +12,16 @@ namespace spslam::bindings {
 // Places in the lists of numbers; spslam/ops/earlier_frames.py fills them.
 enum class KeyframeScalar { kFx, kFy, kCx, kCy, kUnit, kKernelEnd, kCount };
 // Before the places of each depth keyframe. Times are in ns; a motion's row is negative where it is unknown.
-enum class KeyframeInteger { kFirstIteration, kMotionRow, kMotionNs, kCount };
-enum class KeyframePlace { kImage, kPose, kMotionRow, kMotionNs, kCount };
+enum class KeyframeInteger { kFirstIteration, kMotionRow, kMotionNs, kColorNs, kCount };
+enum class KeyframePlace { kImage, kPose, kMotionRow, kMotionNs, kColorNs, kCount };
 
-// A motion's row and time.
+// A motion's row and times.
 inline FrameMotion load_motion(const char* name, const std::int64_t* integers, std::int64_t poses) {
-  if (integers[0] < 0) return {-1, 1.0f};
+  if (integers[0] < 0) return {-1, 1.0f, 0.0f};
   SPS_CHECK(integers[0] < poses && integers[1] > 0, name,
             ": timing must name poses that are there and positive times, got ", integers[0], " and ", integers[1],
             " ns");
-  return {integers[0], 1e-9f * static_cast<float>(integers[1])};
+  return {integers[0], 1e-9f * static_cast<float>(integers[1]), 1e-9f * static_cast<float>(integers[2])};
 }
 
 inline std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {

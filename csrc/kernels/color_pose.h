@@ -42,17 +42,20 @@ struct ColorPose {
   float lever;  // by how much more than the depth image's pose it moves with a step of that; 0: it is the same pose
 };
 
-// Of a frame at a pose [7], `delay` (s; may be null) after its depth image, moving on as it came.
+// Of a frame at a pose [7], moving on as it came: later than its depth image by what the stamps say and `delay` (s; may
+// be null: they are of one moment).
 SPS_INLINE ColorPose color_pose(const float* poses, const FrameMotion& motion, const float* delay, const float* pose) {
   const ColorPose still{load_pose(pose), 0.0f};
-  if (!delay || *delay == 0.0f || !(std::fabs(*delay) < kMaxColorDelay)) return still;
+  if (!delay) return still;
+  const float late = *delay + motion.color_offset;
+  if (late == 0.0f || !(std::fabs(late) < kMaxColorDelay)) return still;
   const CameraVelocity velocity = camera_velocity(poses, motion, pose);
-  const Vec3<float> turn = *delay * velocity.angular, way = *delay * velocity.linear;
+  const Vec3<float> turn = late * velocity.angular, way = late * velocity.linear;
   const bool moved_on =
       dot(turn, turn) < kMaxColorTurn * kMaxColorTurn && dot(way, way) < kMaxColorTranslation * kMaxColorTranslation;
   if (!velocity.known || !moved_on) return still;
   const Quaternion<float> q = normalized(Quaternion<float>{pose[0], pose[1], pose[2], pose[3]});
-  return {{rotation(quaternion_exp(turn) * q), still.pose.translation + way}, *delay / motion.seconds};
+  return {{rotation(quaternion_exp(turn) * q), still.pose.translation + way}, late / motion.seconds};
 }
 
 // A pixel's surface point as the depth image has it, and where the color image sees that pixel: elsewhere if it is of

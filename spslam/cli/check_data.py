@@ -48,6 +48,9 @@ def _rows(found: Inspection) -> list[tuple[str, str]]:
     if found.focal_error is not None:
         off, sigma = (100 * value for value in found.focal_error)
         rows.append(("focal length", f"{off:+.1f} % +- {sigma:.1f} % off, by how color moves against depth"))
+    if found.color_offset is not None:
+        mean, spread = (1000 * value for value in found.color_offset)
+        rows.append(("color", f"{mean:+.1f} ms +- {spread:.1f} ms after depth, by time stamps"))
     return [*rows, *_pose_rows(found)]
 
 

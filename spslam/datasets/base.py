@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.frame_arrays import UNNUMBERED, checked_arrays
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
+from spslam.datasets.frame_arrays import UNNUMBERED, checked_arrays, checked_offset
 from spslam.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class RgbdFrame:
         depth: float32 [H, W], m along the optical axis; 0 where nothing was measured.
         pose: float64 [4, 4] T_world_camera in OpenCV axes (x right, y down, z forward), or None where unknown. It is
             the ground truth to evaluate against; the system uses no more than the first.
+        offsets: when the two images were taken, where that is known better than by the time stamp.
     """
 
     index: int
@@ -43,17 +45,22 @@ class RgbdFrame:
     color: np.ndarray
     depth: np.ndarray
     pose: np.ndarray | None = None
+    offsets: CaptureOffsets = AT_ONCE
 
     @classmethod
-    def from_arrays(cls, color: Any, depth: Any, timestamp: float, *, depth_scale: float | None = None) -> RgbdFrame:
+    def from_arrays(
+        cls, color: Any, depth: Any, timestamp: float, *, depth_scale: float | None = None, color_offset: float = 0.0
+    ) -> RgbdFrame:
         """A frame of arrays from any camera or program, converted and checked.
 
         Args:
             color: uint8 [H, W, 3], RGB. OpenCV's images are BGR: `color[..., ::-1]`, or `cv2.cvtColor`.
             depth: [H, W] along the optical axis, of the same view as `color`: floating-point meters, or whole numbers
                 with `depth_scale`. 0, negative numbers, NaN and infinity stand for "not measured".
-            timestamp: s; of one clock for all frames.
+            timestamp: s, when the depth image was taken; of one clock for all frames.
             depth_scale: units of `depth` per meter, 1000 for millimeters. Required for whole numbers.
+            color_offset: how much later the color image was taken, s, if both have stamps of their own that tell; what
+                is the same for all frames is measured (`tracking.capture_timing`).
 
         Returns:
             The frame, which the system numbers when it comes; depth is a copy, color is not.
@@ -70,7 +77,8 @@ class RgbdFrame:
             RgbdFrame(640x480, t=0.000 s, depth in 100 % of the pixels, median 1.50 m)
         """
         color, depth, timestamp = checked_arrays(color, depth, timestamp, depth_scale)
-        return cls(UNNUMBERED, timestamp, color, depth)
+        offsets = CaptureOffsets(color=checked_offset(color_offset)) if color_offset else AT_ONCE
+        return cls(UNNUMBERED, timestamp, color, depth, offsets=offsets)
 
     def __repr__(self) -> str:
         known = self.depth[::8, ::8] > 0 if self.depth.ndim == 2 else np.zeros(1, dtype=bool)

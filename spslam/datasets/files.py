@@ -11,6 +11,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.images import read_color, read_depth, resized_color
 from spslam.datasets.lens import Rectification
 from spslam.datasets.text import read_pose, read_pose_table
@@ -28,12 +29,14 @@ class FramePaths:
         depth: image file.
         timestamp: s.
         fault: why the frame can't be used, if that is known beforehand.
+        offsets: when the images were taken; see `RgbdFrame`.
     """
 
     color: Path
     depth: Path
     timestamp: float
     fault: str | None = None
+    offsets: CaptureOffsets = AT_ONCE
 
 
 @dataclass
@@ -86,7 +89,7 @@ class FileDataset(RgbdDataset):
             color = self.undistortion.color(color)
         if self.resize_color:
             color = resized_color(color, depth.shape[1], depth.shape[0])
-        return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index))
+        return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index), paths.offsets)
 
     def describe(self, index: int) -> str:
         return f"{self.frames[index].depth} (color: {self.frames[index].color.name})"

@@ -82,13 +82,17 @@ def file_recording(
     min_confidence: int,
     view: View,
 ) -> Recording:
-    """A recording whose images are files, paired already; see `Recording` and `DepthFiles`."""
+    """A recording whose images are files, paired already; see `Recording` and `DepthFiles`.
+
+    Frames have their depth images' time stamps; `FramePaths.offsets` say how much later the color images' are.
+    """
     seconds = np.array([frame.timestamp for frame in frames])
+    color_seconds = seconds + np.array([frame.offsets.color for frame in frames])
     color, depth = calibration.color.camera, calibration.depth.camera
     pairs = np.repeat(np.arange(len(frames))[:, None], 2, axis=1)
     return Recording(
         name,
-        ColorFiles([frame.color for frame in frames], seconds, (color.width, color.height)),
+        ColorFiles([frame.color for frame in frames], color_seconds, (color.width, color.height)),
         DepthFiles(
             [frame.depth for frame in frames],
             seconds,

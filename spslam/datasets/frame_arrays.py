@@ -17,6 +17,7 @@ UNNUMBERED = -1
 MEDIAN_RANGE_M = (0.01, 100.0)
 # Unix time in seconds passes this in the year 5138; in milliseconds it did so in 1973.
 MAX_TIMESTAMP_S = 1e11
+MAX_COLOR_OFFSET_S = 1.0  # farther apart, images are of two frames; or milliseconds were meant
 # Every n-th row and column decides about units.
 _STEP_PX = 8
 _COMMON_SCALES = (1000.0, 5000.0, 10000.0)
@@ -33,6 +34,16 @@ def checked_arrays(
     depth_m = _in_meters(stored, depth_scale)
     _check_unit(depth_m, stored.dtype, depth_scale)
     return np.ascontiguousarray(color_image), depth_m, _checked_time(timestamp)
+
+
+def checked_offset(color_offset: float) -> float:
+    """`color_offset` of `RgbdFrame.from_arrays` (s), checked; TypeError or ValueError where it is none."""
+    name = "RgbdFrame.from_arrays: color_offset"
+    if not isinstance(color_offset, Real) or isinstance(color_offset, bool):
+        raise TypeError(f"{name} must be a number of seconds, got {type(color_offset).__name__}")
+    if not abs(float(color_offset)) <= MAX_COLOR_OFFSET_S:
+        raise ValueError(f"{name} must be within {MAX_COLOR_OFFSET_S:g} s of the depth image, got {color_offset}")
+    return float(color_offset)
 
 
 def check_frame(function: str, color: np.ndarray, depth: np.ndarray, camera: Camera) -> None:

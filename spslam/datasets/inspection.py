@@ -91,6 +91,8 @@ class Inspection:
         findings: what a look at a few stretches says of intrinsics, scale, pairing and order.
         focal_error: share by which the focal length looks too large by how color moves against depth, and its standard
             deviation; None where that can't be told.
+        color_offset: from depth images to their color images, as stamps say: mean and standard deviation, s; None where
+            all are of one moment, or nothing is known.
         problems: all that looks wrong, in words.
     """
 
@@ -104,6 +106,7 @@ class Inspection:
     poses: PoseStatistics | None
     findings: list[Finding] = field(default_factory=list)
     focal_error: tuple[float, float] | None = None
+    color_offset: tuple[float, float] | None = None
     problems: list[str] = field(default_factory=list)
 
 
@@ -119,7 +122,7 @@ def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> 
         pairs: most pairs of frames that check the poses.
     """
     indices = np.unique(np.linspace(0, len(dataset) - 1, frames).astype(int))
-    depths, unreadable = _read_depths(dataset, indices)
+    depths, offsets, unreadable = _read_depths(dataset, indices)
     poses, problem = _inspect_poses(dataset, pairs)
     found = Inspection(
         dataset.name,
@@ -134,6 +137,8 @@ def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> 
     judgments = _judge_stretches(dataset, frames)
     found.findings = folded(finding for judgment in judgments for finding in judgment.findings)
     found.focal_error = _focal_error(judgments)
+    if any(offsets):
+        found.color_offset = float(np.mean(offsets)), float(np.std(offsets))
     frozen = frozen_frames(dataset, indices[:: max(1, len(indices) // pairs)])
     found.problems = [
         *_depth_problems(found),
@@ -164,14 +169,18 @@ def _focal_error(judgments: list[Judgment]) -> tuple[float, float] | None:
     return float(np.expm1(-focal)), float(1 / np.sqrt(weights.sum()))
 
 
-def _read_depths(dataset: RgbdDataset, indices: np.ndarray) -> tuple[list[np.ndarray], list[str]]:
-    depths, unreadable = [], []
+def _read_depths(dataset: RgbdDataset, indices: np.ndarray) -> tuple[list[np.ndarray], list[float], list[str]]:
+    """Thinned depth images, the offsets of their colors (s), and what can't be read."""
+    depths, offsets, unreadable = [], [], []
     for index in indices:
         try:
-            depths.append(thinned(dataset[int(index)].depth))
+            frame = dataset[int(index)]
         except DatasetError as error:
             unreadable.append(str(error))
-    return depths, unreadable
+            continue
+        depths.append(thinned(frame.depth))
+        offsets.append(frame.offsets.color)
+    return depths, offsets, unreadable
 
 
 def _frozen_problems(frozen: list[int], findings: list[Finding]) -> list[str]:

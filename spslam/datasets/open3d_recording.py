@@ -17,6 +17,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.calibration_files import INTRINSICS_FILES, read_calibration
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.files import FramePaths, paired, require_folder
 from spslam.datasets.folder import check_scale, file_recording
 from spslam.datasets.image_files import first_depth_size
@@ -85,9 +86,15 @@ def _frames(folder: Path) -> dict[int, FramePaths]:
         path, microseconds = depth or color or (folder, None)
         seconds = number / _FRAMES_PER_SECOND if microseconds is None else microseconds * 1e-6
         frames[number] = paired(color and color[0], depth and depth[0], seconds)
+        stamps = [image[1] for image in (color, depth) if image is not None and image[1] is not None]
+        if len(stamps) == 2:
+            frames[number] = replace(frames[number], offsets=CaptureOffsets(color=(stamps[0] - stamps[1]) * 1e-6))
     times = np.array([frame.timestamp for frame in frames.values()])
     if (np.diff(times) <= 0).any():  # Redwood's clock starts anew in some recordings
-        return {number: replace(frame, timestamp=number / _FRAMES_PER_SECOND) for number, frame in frames.items()}
+        return {
+            number: replace(frame, timestamp=number / _FRAMES_PER_SECOND, offsets=AT_ONCE)
+            for number, frame in frames.items()
+        }
     return frames
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.clock import capture_offsets, capture_times
 from spslam.datasets.images import resized_color
 from spslam.datasets.lens import Lens, Rectification
 from spslam.datasets.registration import ColorToDepth, DepthToColor, is_same_view
@@ -161,7 +162,8 @@ def _rectification(lens: Lens, kind: str) -> Rectification | None:
 class Recording(RgbdDataset):
     """Frames of two image streams, registered to each other.
 
-    A frame has the time of its depth image, by which the camera is tracked.
+    A frame has the time stamp of its depth image, by which the camera is tracked; when its images were taken is read
+    from all stamps of each stream (`spslam.datasets.clock`).
 
     Args:
         name: of the sequence.
@@ -196,7 +198,10 @@ class Recording(RgbdDataset):
         except DatasetError as error:
             raise DatasetError(f"{name}: {error}") from None
         self.camera = self._geometry.camera
-        self._times = depth.times()[pairs[:, 1]]
+        color_times, depth_times = color.times(), depth.times()
+        self._times = depth_times[pairs[:, 1]]
+        taken = (capture_times(times)[pairs[:, i]] for i, times in enumerate((color_times, depth_times)))
+        self._offsets = capture_offsets(self._times, *taken)
         has_poses = poses is not None and np.isfinite(poses).any()
         self._poses = poses @ self._geometry.color_from_camera if has_poses else None  # type: ignore[operator]
         self._faults = dict(faults or {})
@@ -218,7 +223,7 @@ class Recording(RgbdDataset):
         pose = None
         if self._poses is not None and np.isfinite(self._poses[index]).all():
             pose = self._poses[index].copy()
-        return RgbdFrame(index, float(self._times[index]), *images, pose)
+        return RgbdFrame(index, float(self._times[index]), *images, pose, self._offsets[index])
 
     def describe(self, index: int) -> str:
         color, depth = (int(number) for number in self._pairs[index])

@@ -3,12 +3,13 @@
 `rgb.txt` and `depth.txt` list `timestamp file`, `groundtruth.txt` lists `timestamp tx ty tz qx qy qz qw`
 (camera to world, OpenCV axes). Depth is 16-bit with 5000 units per meter, registered to the color camera.
 
-Color and depth are taken at different moments, so each color image is paired with the depth image nearest in time,
-and the ground truth is interpolated at the color image's time. freiburg1's and freiburg2's color images are distorted,
-freiburg3's are not; the intrinsics are those the authors calibrated for each. Color is undistorted; depth is left as
-it is, because it comes from another lens: carried from view to view with the ground-truth poses, the depth images of
-freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15 frames) than undistorted with the color
-camera's coefficients (3.0, 5.3, 5.3 cm).
+Color and depth are taken at different moments, so each color image is paired with the depth image nearest in time. A
+frame has the color image's stamp, and the ground truth is interpolated at that time; when the two images were taken is
+read from all stamps (`spslam.datasets.clock`), and the tracked pose is that of the depth image. freiburg1's and
+freiburg2's color images are distorted, freiburg3's are not; the intrinsics are those the authors calibrated for each.
+Color is undistorted; depth is left as it is, because it comes from another lens: carried from view to view with the
+ground-truth poses, the depth images of freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15
+frames) than undistorted with the color camera's coefficients (3.0, 5.3, 5.3 cm).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import MAX_FRAMES
+from spslam.datasets.clock import capture_offsets, capture_times
 from spslam.datasets.files import FileDataset, FramePaths, require_folder
 from spslam.datasets.images import first_size
 from spslam.datasets.lens import Lens, Rectification
@@ -120,7 +122,12 @@ def open_tum(folder: Path, calibration: str | None = None) -> FileDataset:
             f"{folder}: must have color and depth images within {MAX_PAIR_DIFFERENCE_S} s of each other, got none "
             f"({len(colors)} in rgb.txt, {len(depths)} in depth.txt)"
         )
-    frames = [FramePaths(folder / colors[c][1], folder / depths[d][1], colors[c][0]) for c, d in pairs]
+    taken = (capture_times(_times(stream))[pairs[:, i]] for i, stream in enumerate((colors, depths)))
+    offsets = capture_offsets(_times(colors)[pairs[:, 0]], *taken)
+    frames = [
+        FramePaths(folder / colors[c][1], folder / depths[d][1], colors[c][0], offsets=own)
+        for (c, d), own in zip(pairs, offsets, strict=True)
+    ]
     camera, distortion = _find_calibration(folder, calibration, *first_size(frame.color for frame in frames))
     return FileDataset(
         f"tum/{folder.name}",

@@ -14,6 +14,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.frame_arrays import UNNUMBERED
 from spslam.errors import SourceError
 from spslam.live.source import LiveFrame, LiveSource
@@ -173,7 +174,18 @@ class RealSenseSource(LiveSource, AbstractContextManager):
             color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             # Depth between a near and a far pixel would be of neither.
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return RgbdFrame(UNNUMBERED, frameset.get_timestamp() / 1e3, color, depth.astype(np.float32, copy=False))
+        offsets = self._offsets(frameset)
+        time_s = frameset.get_timestamp() / 1e3
+        return RgbdFrame(UNNUMBERED, time_s, color, depth.astype(np.float32, copy=False), offsets=offsets)
+
+    @staticmethod
+    def _offsets(frameset: Any) -> CaptureOffsets:
+        """By the stamps of the two images, which the camera gives them itself."""
+        color, depth = frameset.get_color_frame(), frameset.get_depth_frame()
+        if color.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain():
+            return AT_ONCE  # of two clocks
+        frame_ms, color_ms, depth_ms = frameset.get_timestamp(), color.get_timestamp(), depth.get_timestamp()
+        return CaptureOffsets((depth_ms - frame_ms) / 1e3, (color_ms - depth_ms) / 1e3)
 
 
 def _import_sdk() -> Any:

@@ -51,10 +51,12 @@ class FrameMotion(NamedTuple):
     Attributes:
         row: of the pose before, in `DepthKeyframes.poses`; negative where it is unknown.
         seconds: since that pose, s.
+        color_offset: from the frame's depth image to its color image, s, as their stamps say.
     """
 
     row: int
     seconds: float
+    color_offset: float = 0.0
 
 
 NO_MOTION = FrameMotion(-1, 1.0)
@@ -64,8 +66,8 @@ class ColorTiming(NamedTuple):
     """When color images are taken; the camera is taken to move on as it came from the frame before.
 
     Attributes:
-        delay: float32 [1] from a frame's depth image to its color image, s, negative where color comes first (see
-            `measure_capture_timing_`).
+        delay: float32 [1] from a frame's depth image to its color image beside its motion's `color_offset`, s, negative
+            where color comes first (see `measure_capture_timing_`).
         keyframes: the motion of each keyframe.
         frame: that of the frame which is compared with them.
     """
@@ -82,6 +84,7 @@ class ColorTiming(NamedTuple):
         for motion in (self.frame, *self.keyframes):
             fits = motion.row < 0 or (motion.row < poses and 1e-9 <= motion.seconds < 1e9)
             check(fits, function, name, "name poses that are there and positive times", motion)
+            check(abs(motion.color_offset) < 1e9, function, name, "have finite color offsets", motion)
 
 
 class DepthKeyframes(NamedTuple):
@@ -136,7 +139,7 @@ class DepthKeyframes(NamedTuple):
         """What schemas take: the enums KeyframeScalar and KeyframeInteger in csrc/bindings/depth_keyframes.h."""
         timing, count = self.timing, len(self.rows)
         motions = [NO_MOTION] * (1 + count) if timing is None else [timing.frame, *timing.keyframes]
-        frame, *others = ((motion.row, round(1e9 * motion.seconds)) for motion in motions)
+        frame, *others = ((each.row, round(1e9 * each.seconds), round(1e9 * each.color_offset)) for each in motions)
         places = [place for row, motion in zip(self.rows, others, strict=True) for place in (*row, *motion)]
         tensors = [self.images, self.poses, self.intensities, None if timing is None else timing.delay]
         scalars = [*self.intrinsics, self.unit, self.kernel_end]

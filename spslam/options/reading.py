@@ -151,6 +151,16 @@ class DatasetOptions(Section):
     color_delay_ms: float = option(
         "time from a frame's depth image to its color image", "ms", needs=(_PLACES,), ge=-1000, le=1000
     )
+    color_rate_hz: float | None = option(
+        "rate of a color camera that runs on its own; null takes a color image with each depth image",
+        "Hz",
+        needs=(_PLACES,),
+        ge=1,
+        le=120,
+    )
+    stamp_jitter_ms: float = option(
+        "by up to how much each image's time stamp is late", "ms", needs=(_PLACES,), ge=0, le=1000
+    )
 
     def check(self) -> None:
         if self.max_depth_m <= self.min_depth_m:

@@ -166,7 +166,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             raise StopIteration
         pixels = self._take(message.slot, message.valid_depth_share)
         prepared = PreparedFrame(message.index, message.timestamp, pixels, message.decode_ms)
-        prepared.signature, prepared.features = message.signature, message.features
+        prepared.signature, prepared.features, prepared.offsets = message.signature, message.features, message.offsets
         return prepared
 
     def _take(self, slot: int, valid_depth_share: float) -> FramePixels | Upload:

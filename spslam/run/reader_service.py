@@ -16,6 +16,7 @@ import torch
 from spslam import ops
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
@@ -57,7 +58,7 @@ class Message:
     Attributes:
         read_ms: time that a reading thread spent on the frame.
         slot: slot that holds the frame's pixels; None where there is no frame.
-        index, timestamp, decode_ms, signature, features: as in `PreparedFrame`.
+        index, timestamp, decode_ms, signature, features, offsets: as in `PreparedFrame`.
         valid_depth_share: as in `FramePixels`.
         error: of a frame that can't be read.
         failure: traceback of an exception that is not the data's fault; the process then ends.
@@ -71,6 +72,7 @@ class Message:
     valid_depth_share: float = 0.0
     signature: FrameSignature | None = None
     features: ImageFeatures | None = None
+    offsets: CaptureOffsets = AT_ONCE
     error: DatasetError | None = None
     failure: str | None = None
 
@@ -128,7 +130,7 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
             described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
-            connection.send(Message(read_ms, slot, *described, frame.signature, frame.features))
+            connection.send(Message(read_ms, slot, *described, frame.signature, frame.features, frame.offsets))
     connection.send(Message())
     # Stay until the loop closes the connection: it still returns slots.
     with contextlib.suppress(*DISCONNECTED):

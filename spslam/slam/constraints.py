@@ -55,10 +55,19 @@ class ConstraintSource:
         self._references = ReferenceCache(camera, weight_m, kernel) if weight_m > 0 else None
         self._mapping_every = config.mapping.every
 
-    def gather(self, history: FrameHistory, pixels: FramePixels, timestamp: float | None = None) -> Constraints:
-        """The constraints of the next frame, of the given pixels and, where it is known, time stamp (s)."""
+    def gather(
+        self, history: FrameHistory, pixels: FramePixels, depth_time: float | None = None, color_offset: float = 0.0
+    ) -> Constraints:
+        """The constraints of the next frame.
+
+        Args:
+            history: of the frames before.
+            pixels: of the frame.
+            depth_time: when its depth image was taken, s; None where that is not known.
+            color_offset: from there to its color image, s, as stamps say.
+        """
         from_start = pixels.valid_depth_share < LITTLE_DEPTH_SHARE
-        keyframes = history.depth_keyframes(timestamp)
+        keyframes = history.depth_keyframes(depth_time, color_offset)
         if keyframes is not None and not self._timing:
             keyframes = keyframes._replace(timing=None)
         if keyframes is not None and not self._color:

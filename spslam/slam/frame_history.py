@@ -111,30 +111,42 @@ class FrameHistory:
         """float32 [4] what was measured of the sensor's noise, on the device; see `ops.SensorNoise`."""
         return self._state.noise.model
 
-    def depth_keyframes(self, timestamp: float | None = None) -> ops.DepthKeyframes | None:
-        """Earlier images to align the next frame with, of a time stamp if known; None if none has a trusted pose."""
+    def depth_keyframes(self, depth_time: float | None = None, color_offset: float = 0.0) -> ops.DepthKeyframes | None:
+        """Earlier images to align the next frame with, its times as of `motion`; None if none has a trusted pose."""
         state = self._state
         if state.depth_keyframes is None:
             return None
         selected = state.depth_keyframes.select(len(state.frames), state.frames.lost, state.frames.poses)
         if selected is None:
             return None
-        motions = tuple(self.motion(row, float(state.frames.timestamps[row])) for _, row in selected.rows)
-        timing = ops.ColorTiming(state.noise.color_delay, motions, self.motion(len(state.frames), timestamp))
+        motions = tuple(self.own_motion(row) for _, row in selected.rows)
+        motion = self.motion(len(state.frames), depth_time, color_offset)
+        timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
         return selected._replace(timing=timing)
 
-    def motion(self, row: int, timestamp: float | None) -> ops.FrameMotion:
-        """How the camera came to the frame of a row, or to the next one, from the frame before."""
+    def own_motion(self, row: int) -> ops.FrameMotion:
+        """How the camera came to the frame of a row."""
         frames = self._state.frames
-        if timestamp is None or row <= frames.opened or bool(frames.lost[row - 1]):
+        return self.motion(row, float(frames.depth_times[row]), float(frames.color_offsets[row]))
+
+    def motion(self, row: int, depth_time: float | None, color_offset: float = 0.0) -> ops.FrameMotion:
+        """How the camera came to the frame of a row, or to the next one, from the frame before.
+
+        Args:
+            row: of the frame.
+            depth_time: when its depth image was taken, s; None where that is not known.
+            color_offset: from there to its color image, s, as stamps say.
+        """
+        frames = self._state.frames
+        if depth_time is None or row <= frames.opened or bool(frames.lost[row - 1]):
             return ops.NO_MOTION
-        seconds = timestamp - float(frames.timestamps[row - 1])
-        return ops.FrameMotion(row - 1, seconds) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
+        seconds = depth_time - float(frames.depth_times[row - 1])
+        return ops.FrameMotion(row - 1, seconds, color_offset) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
 
     def color_motion(self, motion: ops.FrameMotion) -> ColorMotion | None:
         """How a frame's color image moved on from its depth image; None where the two are of one moment, or nothing
         is known of the motion. Waits for the device."""
-        delay = float(self._state.noise.color_delay)
+        delay = float(self._state.noise.color_delay) + motion.color_offset
         share = delay / motion.seconds
         if motion.row < 0 or delay == 0 or abs(delay) > MAX_COLOR_DELAY_S or abs(share) > MAX_SHARE:
             return None
@@ -142,7 +154,7 @@ class FrameHistory:
 
     def color_pose(self, row: int) -> torch.Tensor:
         """float32 [7] where the camera took the color image of the frame in a row, on the device."""
-        motion = self.color_motion(self.motion(row, float(self._state.frames.timestamps[row])))
+        motion = self.color_motion(self.own_motion(row))
         pose = self.poses[row]
         return pose if motion is None else pose_tensor(motion.color_pose(pose_matrix(pose)), pose.device)
 

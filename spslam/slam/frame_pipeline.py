@@ -147,12 +147,13 @@ class FramePipeline:
             self.global_mapping.before_tracking()
         shutter = None
         if self._measures_timing:
-            shutter = self._rectifier.motion(self.state, self.history, frame.timestamp, self.tracker.predict)
+            shutter = self._rectifier.motion(self.state, self.history, frame.depth_time, self.tracker.predict)
         pixels, constraints = read, Constraints()
         if shutter is not None and self.state.frames.knows_speed:
             pixels = self._rectifier.records(read, shutter)
         if not begins_map:
-            constraints = replace(self.constraints.gather(self.history, pixels, frame.timestamp), shutter=shutter)
+            gathered = self.constraints.gather(self.history, pixels, frame.depth_time, frame.offsets.color)
+            constraints = replace(gathered, shutter=shutter)
         tracked = self._track(pixels, constraints, number, events)
         shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
         pixels = read if shutter is None else self._rectifier.frame(read, shutter)
@@ -298,6 +299,7 @@ class FramePipeline:
             tracked.lost,
             pixels.depth_thumbnail,
             tracked.consistent_frames,
+            frame.offsets,
         )
         state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records)
         if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:

@@ -7,6 +7,7 @@ from typing import cast
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.slam.device_events import DeviceEvent
 from spslam.slam.feature_store import keeps_features
@@ -29,6 +30,7 @@ class PreparedFrame:
         signature: what tells frozen depth; None where nobody asks.
         features: of its image, where they are kept in any case and were extracted ahead; else this is done once the
             pose is known.
+        offsets: as of `RgbdFrame`.
     """
 
     index: int
@@ -39,13 +41,20 @@ class PreparedFrame:
     requested: DeviceEvent | None = None
     signature: FrameSignature | None = None
     features: ImageFeatures | None = None
+    offsets: CaptureOffsets = AT_ONCE
+
+    @property
+    def depth_time(self) -> float:
+        """When the depth image was taken, s."""
+        return self.timestamp + self.offsets.depth
 
     @classmethod
     def of(cls, frame: RgbdFrame, camera: Camera, config: Config) -> "PreparedFrame":
         """Samples a frame of color, depth and time stamp, of pinhole intrinsics, for a run of a configuration."""
         began = time.perf_counter()
         pixels = sample_frame(frame, camera, config)
-        return cls(frame.index, frame.timestamp, pixels, 1e3 * (time.perf_counter() - began))
+        decode_ms = 1e3 * (time.perf_counter() - began)
+        return cls(frame.index, frame.timestamp, pixels, decode_ms, offsets=frame.offsets)
 
 
 class FramePreparation:

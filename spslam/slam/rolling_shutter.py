@@ -37,7 +37,7 @@ class ShutterRectifier:
     def motion(
         state: SlamState,
         history: FrameHistory,
-        timestamp: float,
+        depth_time: float,
         predict: Callable[[FrameTable], torch.Tensor],
     ) -> ops.ShutterMotion | None:
         """How the camera is predicted to move while the next frame is read; None where that does not matter.
@@ -45,11 +45,11 @@ class ShutterRectifier:
         Args:
             state: before that frame.
             history: of the state.
-            timestamp: of the frame, s.
+            depth_time: when the frame's depth image was taken, s.
             predict: the next pose after those of a table.
         """
         frames, readout = state.frames, state.noise.readout
-        motion = history.motion(len(frames), timestamp)
+        motion = history.motion(len(frames), depth_time)
         if motion.row < 0 or (readout.device.type == "cpu" and float(readout) == 0):
             return None
         # A copy: the frame itself changes the estimate before its features are kept.

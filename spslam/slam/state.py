@@ -11,6 +11,7 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.geometry import pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import SparseVolume, resize_rows
@@ -47,6 +48,8 @@ class FrameTable:
         self._columns = {
             "poses": torch.zeros(0, 7, device=device),
             "timestamps": torch.zeros(0, dtype=torch.float64),
+            "depth_times": torch.zeros(0, dtype=torch.float64),
+            "color_offsets": torch.zeros(0, dtype=torch.float64),
             "indices": torch.zeros(0, dtype=torch.int64),
             "lost": torch.zeros(0, dtype=torch.bool),
             "consistent_frames": torch.zeros(0, dtype=torch.int64),
@@ -62,6 +65,16 @@ class FrameTable:
     def timestamps(self) -> torch.Tensor:
         """float64 [F], s."""
         return self._columns["timestamps"][: self._count]
+
+    @property
+    def depth_times(self) -> torch.Tensor:
+        """float64 [F] when the depth images were taken, s, as far as stamps tell."""
+        return self._columns["depth_times"][: self._count]
+
+    @property
+    def color_offsets(self) -> torch.Tensor:
+        """float64 [F] from the depth images to the color images, s, as far as stamps tell."""
+        return self._columns["color_offsets"][: self._count]
 
     @property
     def indices(self) -> torch.Tensor:
@@ -112,6 +125,7 @@ class FrameTable:
         lost: bool,
         depth_thumbnail: torch.Tensor,
         consistent_frames: int = 0,
+        offsets: CaptureOffsets = AT_ONCE,
     ) -> None:
         """Adds a row."""
         if self._count == len(self._columns["poses"]):
@@ -120,6 +134,8 @@ class FrameTable:
         values: dict[str, Any] = {
             "poses": pose,
             "timestamps": timestamp,
+            "depth_times": timestamp + offsets.depth,
+            "color_offsets": offsets.color,
             "indices": index,
             "lost": lost,
             "consistent_frames": consistent_frames,

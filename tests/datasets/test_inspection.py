@@ -1,13 +1,16 @@
 """The look through a dataset: an analytic room whose data is then corrupted in the ways that occur."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from spslam.camera import Camera
+from spslam.cli.check_data import _rows
 from spslam.datasets import thinning
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
+from spslam.datasets.clock import CaptureOffsets
 from spslam.datasets.inspection import inspect_dataset
 from spslam.datasets.replica import open_replica
 from spslam.datasets.seven_scenes import open_seven_scenes
@@ -81,6 +84,17 @@ def test_frozen_depth_is_reported():
 
     room.read = frozen
     assert any(problem.startswith("depth is frozen: ") for problem in inspect_dataset(room).problems)
+
+
+def test_when_colors_were_taken():
+    class Late(BoxRoom):
+        def read(self, index):
+            return replace(super().read(index), offsets=CaptureOffsets(color=0.005 + 0.002 * (-1) ** index))
+
+    assert inspect_dataset(BoxRoom()).color_offset is None
+    found = inspect_dataset(Late())
+    assert found.color_offset == pytest.approx((0.005, 0.002))
+    assert ("color", "+5.0 ms +- 2.0 ms after depth, by time stamps") in _rows(found)
 
 
 def test_large_images_are_thinned_without_another_finding(monkeypatch):

@@ -127,6 +127,7 @@ def test_redwoods_names_and_its_camera(tmp_path):
     dataset = open_path(recording, "dataset.depth_scale=5000")
     assert dataset.camera.fx == 525 / 20
     assert dataset.timestamps()[1] == pytest.approx(0.033869)
+    assert dataset[1].offsets.color == pytest.approx(-0.0005)
     np.testing.assert_allclose(dataset.poses(), poses(COUNT), atol=1e-8)
     np.testing.assert_allclose(dataset[2].depth, depth_meters(2), atol=2e-4)
 

@@ -35,6 +35,14 @@ def test_a_sequence(tmp_path):
     np.testing.assert_array_equal(dataset.poses()[1], frame.pose)
 
 
+def test_when_images_were_taken(tmp_path):
+    dataset = open_tum(write_tum(tmp_path, count=12, depth_delay=0.006))
+    for i in (0, 5, 11):
+        offsets = dataset[i].offsets
+        assert offsets.depth == pytest.approx(0.006, abs=1e-5)
+        assert offsets.color == pytest.approx(-0.006, abs=1e-5)
+
+
 def test_cameras_by_folder_name(tmp_path):
     for name, focal in (
         ("rgbd_dataset_freiburg1_desk", 517.3),

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.errors import SourceError
 from spslam.live import realsense
 from spslam.live.realsense import RealSenseSource, _explained
@@ -70,6 +71,22 @@ class Image:
 
     def __init__(self, milliseconds, domain="clock"):
         self.get_timestamp, self.get_frame_timestamp_domain = lambda: milliseconds, lambda: domain
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "offsets"),
+    [
+        (Image(104.0), Image(101.0), CaptureOffsets(0.001, 0.003)),
+        (Image(104.0), Image(9e9, "another"), AT_ONCE),
+    ],
+)
+def test_when_the_two_images_were_taken(color, depth, offsets):
+    class Images:
+        get_color_frame, get_depth_frame = lambda self: color, lambda self: depth
+        get_timestamp = lambda self: 100.0  # noqa: E731
+
+    found = RealSenseSource._offsets(Images())
+    assert (found.depth, found.color) == pytest.approx((offsets.depth, offsets.color), abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -51,11 +51,13 @@ def _pose7(matrix):
 class Recording:
     """Frames of a camera with late colors and a rolling shutter, and their true poses."""
 
-    def __init__(self, frames, delay=0.0, readout=0.0, device="cpu"):
+    def __init__(self, frames, delay=0.0, readout=0.0, device="cpu", offsets=()):
+        """Colors are late by `delay` and, of the first frames, by their own `offsets`, as these frames' stamps say."""
         self.device, depths, intensities = device, [], []
-        for i in range(frames):
+        self.offsets = [*offsets, *[0.0] * (frames - len(offsets))]
+        for i, offset in enumerate(self.offsets):
             depths.append(_view(i * INTERVAL, readout)[0])
-            intensities.append(_view(i * INTERVAL + delay, readout)[1])
+            intensities.append(_view(i * INTERVAL + delay + offset, readout)[1])
         self.depth, self.intensity = torch.stack(depths), torch.stack(intensities)
         self.images = (self.depth / UNIT).round().to(torch.int32).to(torch.uint16).to(device)
         self.grays = (255 * self.intensity).round().to(torch.uint8).to(device)
@@ -70,7 +72,7 @@ class Recording:
         return torch.stack(words, 1).to(self.device)
 
     def motion(self, frame):
-        return ops.FrameMotion(frame - 1, INTERVAL) if frame else ops.NO_MOTION
+        return ops.FrameMotion(frame - 1, INTERVAL, self.offsets[frame]) if frame else ops.NO_MOTION
 
     def keyframes(self, frame, others, delay):
         motions = tuple(self.motion(other) for other in others)
@@ -120,6 +122,15 @@ def test_times_are_found(delay, readout, device):
     assert timing.seconds.cpu().tolist() == [
         float(one.float()) if abs(one) >= least else 0.0 for one, least in zip(found, (0.0015, 0.003), strict=True)
     ]
+
+
+def test_the_delay_beyond_what_stamps_say_is_found(device):
+    offsets = [0.01 * (i % 3 - 1) for i in range(30)]
+    noise = noise_model(*NOISE, device=device)
+    stamped = _measured(Recording(30, 0.008, device=device, offsets=offsets), noise)
+    even = _measured(Recording(30, 0.008, device=device), noise)
+    torch.testing.assert_close(stamped.state[0, 0].cpu(), torch.tensor(0.008).double(), rtol=0.15, atol=0.001)
+    assert abs(float(stamped.state[0, 0] - even.state[0, 0])) < 0.001
 
 
 def test_a_camera_that_stands_still_tells_nothing(device):
@@ -259,6 +270,26 @@ def test_late_colors_bend_a_pose_unless_their_delay_is_known(device):
     assert errors[0.0] > 0.003
 
 
+def test_an_offset_of_all_stamps_is_a_delay(device):
+    noise, poses = noise_model(*NOISE, device=device), []
+    options = ops.GaussNewtonOptions(
+        num_pixels=512, iterations=4, truncation=0.08, kernel_start=0.5, kernel_end=0.5, damping=1e-6, seed=0,
+        stream=ops.RandomStream.TRACKING_PIXELS, frame=0,
+    )  # fmt: skip
+    for delay, offset in ((0.0125, 0.0), (0.0, 0.0125), (0.0, 0.0), (0.0125, -0.0125)):
+        recording = Recording(15, delay + offset, device=device)
+        recording.offsets = [offset] * 15
+        keyframes = recording.keyframes(14, (8, 2), torch.tensor([delay], device=device))
+        tracked = ops.track_gauss_newton(
+            ops.SceneView.empty(device=device), recording.records(14), recording.poses[14], CAMERA, options,
+            noise=noise, depth_keyframes=keyframes,
+        )  # fmt: skip
+        poses.append(tracked[0])
+    torch.testing.assert_close(poses[0], poses[1], rtol=0, atol=1e-6)
+    torch.testing.assert_close(poses[2], poses[3], rtol=0, atol=1e-6)
+    assert (poses[0] - poses[2]).abs().max() > 1e-5
+
+
 def test_opcheck(device):
     recording, noise = Recording(4, 0.01), noise_model(*NOISE)
     timing = ops.CaptureTiming.unknown()
@@ -298,6 +329,7 @@ def test_opcheck(device):
         (dict(motions=1), "have 2 motions"),
         (dict(row=99), "name poses that are there and positive times"),
         (dict(seconds=0.0), "name poses that are there and positive times"),
+        (dict(offset=float("nan")), "have finite color offsets"),
         (dict(delay=torch.zeros(2)), "depth_keyframes.timing.delay"),
         (dict(intensities=None), "come with intensities"),
         (dict(timing=None), "have a timing"),
@@ -305,7 +337,7 @@ def test_opcheck(device):
 )
 def test_errors(change, message):
     recording, timing = Recording(4), ops.CaptureTiming.unknown()
-    motion = ops.FrameMotion(change.get("row", 1), change.get("seconds", INTERVAL))
+    motion = ops.FrameMotion(change.get("row", 1), change.get("seconds", INTERVAL), change.get("offset", 0.0))
     own = ops.ColorTiming(change.get("delay", timing.color_delay), (motion,) * change.get("motions", 2), motion)
     keyframes = recording.keyframes(3, (1, 2), timing.color_delay)._replace(timing=change.get("timing", own))
     keyframes = keyframes._replace(intensities=change.get("intensities", recording.grays))

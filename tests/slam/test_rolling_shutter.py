@@ -1,5 +1,6 @@
 """Late colors and rolling shutters through the whole system: their times are found, and poses are those of depth."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from spslam import ops
 from spslam.config import load_config
+from spslam.datasets.clock import CaptureOffsets
 from spslam.datasets.registry import open_sequence
 from spslam.evaluation.trajectory_metrics import ate
 from spslam.geometry import inverse
@@ -101,6 +103,31 @@ def test_unknown_motion_is_not_made_up():
     assert history.motion(4, float(frames.timestamps[3]) + 1.0) == ops.NO_MOTION
     frames.lost[-1] = True
     assert history.motion(4, 4 * INTERVAL) == ops.NO_MOTION
+
+
+def test_times_of_images_come_from_their_offsets(tmp_path):
+    """Not from the frames' time stamps: these may be of neither image."""
+    dataset, system = Recorded(6), SlamSystem(settings("device=cpu", preset="fast"), Recorded(6).camera)
+    offsets = [CaptureOffsets(0.002 * (i % 2), -0.003 * i) for i in range(6)]
+    for i in range(5):
+        system.process(replace(dataset[i], offsets=offsets[i]))
+    history, times = system.history, dataset.timestamps()
+    motion = history.own_motion(3)
+    assert motion.seconds == pytest.approx(times[3] - times[2] + 0.002)
+    assert motion.color_offset == pytest.approx(-0.009)
+    keyframes = history.depth_keyframes(times[5], -0.02)
+    assert keyframes.timing.keyframes[0] == history.own_motion(4)
+    assert keyframes.timing.frame.color_offset == -0.02
+    # What is measured comes on top.
+    system.state.noise.color_delay[0] = 0.0
+    assert history.color_motion(motion).share == pytest.approx(-0.009 / motion.seconds)
+    system.state.noise.color_delay[0] = 0.009 + 1e-3
+    assert history.color_motion(motion).share == pytest.approx(1e-3 / motion.seconds, rel=1e-3)
+    system.save(tmp_path / "saved")
+    frames = SlamSystem.load(tmp_path / "saved").state.frames
+    np.testing.assert_allclose(frames.color_offsets, [each.color for each in offsets[:5]])
+    np.testing.assert_array_equal(frames.depth_times, system.state.frames.depth_times)
+    np.testing.assert_allclose(system.trajectory().timestamps, times[:5])
 
 
 def test_a_known_readout_is_compensated_for_and_a_resumed_system_goes_on_alike(tmp_path):

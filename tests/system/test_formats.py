@@ -59,7 +59,8 @@ def frames_to_record(known_poses):
     frames, lens = rounded_frames(), Lens(CAMERA)
     poses = np.array([frame.pose for frame in frames]) if known_poses else None
     images = [frame.color for frame in frames], [frame.depth for frame in frames]
-    return ros_bags.Frames(*images, lens, lens, poses=poses)
+    # Stamped alike, as the images are of one moment: stamps that are apart would be heeded.
+    return ros_bags.Frames(*images, lens, lens, poses=poses, depth_delay_s=0.0)
 
 
 WRITERS = {

@@ -31,10 +31,11 @@ struct SensorNoise {
 };
 constexpr int kSensorNoiseSize = 4;
 
-// How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown.
+// How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown. And by
+// how much later the frame's color was taken than its depth, s, as the stamps of the two say.
 struct FrameMotion {
   std::int64_t row;
-  float seconds;
+  float seconds, color_offset;
 };
 
 constexpr int kMaxDepthKeyframes = 8;
@@ -51,7 +52,7 @@ struct DepthKeyframes {
   std::int64_t first_iteration;  // from which on they take part
   int count;
   std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each keyframe
-  // s, from a frame's depth image to its color image; null: they are of one moment.
+  // s, from a frame's depth image to its color image, beside what stamps say; null: they are of one moment.
   const float* color_delay;
   FrameMotion motions[kMaxDepthKeyframes], frame_motion;  // of each keyframe, and of the frame that is aligned
 };

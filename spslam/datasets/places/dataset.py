@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spslam.datasets.base import MAX_FRAMES, RgbdDataset, RgbdFrame
+from spslam.datasets.clock import AT_ONCE, CaptureOffsets, capture_offsets, capture_times
 from spslam.datasets.images import check_image_size
 from spslam.datasets.places.color_image import ColorImage, ExposureMeter
 from spslam.datasets.places.motion import MOTIONS, Motion
@@ -33,6 +34,9 @@ class Capture:
         auto_exposure: whether brightness follows the scene's, and dark and bright parts are clipped.
         rolling_shutter_ms: read-out time from the first row to the last, of color and depth.
         color_delay_ms: from depth to color of the same frame; negative where color comes first.
+        color_rate_hz: of a color camera that runs on its own, whose image nearest in time a frame has; None takes one
+            with each depth image.
+        stamp_jitter_ms: each image's stamp is late by up to so much, as if given on arrival.
     """
 
     width: int | None = None
@@ -44,13 +48,16 @@ class Capture:
     auto_exposure: bool = False
     rolling_shutter_ms: float = 0.0
     color_delay_ms: float = 0.0
+    color_rate_hz: float | None = None
+    stamp_jitter_ms: float = 0.0
 
     def check(self) -> None:
         """Raises DatasetError for a number out of range."""
         sizes = [("width", _SMALLEST_IMAGE, MAX_FRAMES), ("height", _SMALLEST_IMAGE, MAX_FRAMES)]
         ranges = [("sensor_noise", 0, 100), ("color_noise", 0, 255), ("exposure_ms", 0, 1000)]
         ranges += [("rolling_shutter_ms", 0, 1000), ("color_delay_ms", -1000, 1000)]
-        for name, low, high in [*sizes, ("rate_hz", *RATES_HZ), *ranges]:
+        ranges += [("stamp_jitter_ms", 0, 1000)]
+        for name, low, high in [*sizes, ("rate_hz", *RATES_HZ), ("color_rate_hz", *RATES_HZ), *ranges]:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise DatasetError(f"dataset.{name} must be from {low:g} to {high:g}, got {value}")
@@ -104,6 +111,12 @@ class PlacesDataset(RgbdDataset):
         self.motion = Motion(self.place.route, motion, seed, self.place.pace)
         self._rate_hz = self._sensor.rate_hz if self._capture.rate_hz is None else self._capture.rate_hz
         self._frames, self._seed = int(frames), int(seed)
+        self._times = np.arange(self._frames) / self._rate_hz
+        # The color images that its camera takes, and which of them each frame has.
+        color_rate_hz = self._capture.color_rate_hz or self._rate_hz
+        self._colors = np.round(self._times * color_rate_hz).astype(np.int64)
+        self._color_times = np.arange(self._colors[-1] + 1) / color_rate_hz
+        self._stamps, self._offsets = self._stamped()
         meter = ExposureMeter(self.place, self.motion, self.camera) if self._capture.auto_exposure else None
         self._color = ColorImage(self.camera, self._capture.color_noise, self._capture.exposure_ms / 1000, meter)
 
@@ -115,27 +128,38 @@ class PlacesDataset(RgbdDataset):
         return self._frames
 
     def timestamps(self) -> np.ndarray:
-        return np.arange(self._frames) / self._rate_hz
+        return self._stamps.copy()
 
     def poses(self) -> np.ndarray:
-        """Poses at the times of depth images; with a rolling shutter, of their middle row."""
-        return self.motion.poses(self.timestamps())
+        """Poses at the times of depth images, not of their stamps; with a rolling shutter, of their middle row."""
+        return self.motion.poses(self._times)
 
     @property
     def surface(self) -> SolidScene:
         return self.place
 
     def read(self, index: int) -> RgbdFrame:
-        time = index / self._rate_hz
+        time = float(self._times[index])
+        color_time = float(self._color_times[self._colors[index]]) + self._capture.color_delay_ms / 1000
         generator = np.random.default_rng([self._seed, 41, index])
-        color_time = time + self._capture.color_delay_ms / 1000
         color, exact = self.place.render(self.camera, self._row_poses(color_time))
         seen = color
         color = self._color.take(color, exact, (self.motion, color_time), generator)
         if color_time != time:
             seen, exact = self.place.render(self.camera, self._row_poses(time))
         depth = self._sensor.read(exact, seen, self.camera, self._capture.sensor_noise, generator)
-        return RgbdFrame(index, time, color, depth, self.motion.pose(time))
+        return RgbdFrame(index, float(self._stamps[index]), color, depth, self.motion.pose(time), self._offsets[index])
+
+    def _stamped(self) -> tuple[np.ndarray, list[CaptureOffsets]]:
+        """The stamps of the depth images, [F], and what both images' stamps say of when they were taken."""
+        capture = self._capture
+        if capture.color_rate_hz is None and capture.stamp_jitter_ms == 0:
+            return self._times, [AT_ONCE] * self._frames
+        generator, most_s = np.random.default_rng([self._seed, 43]), capture.stamp_jitter_ms / 1000
+        # Stamps do not know of a constant delay.
+        color = np.maximum.accumulate(self._color_times + generator.uniform(0, most_s, len(self._color_times)))
+        stamps = np.maximum.accumulate(self._times + generator.uniform(0, most_s, self._frames))
+        return stamps, capture_offsets(stamps, capture_times(color)[self._colors], capture_times(stamps))
 
     def _row_poses(self, time: float) -> np.ndarray:
         """The pose at a time, or of each row [H, 4, 4] around it."""

@@ -95,6 +95,34 @@ def test_color_comes_later_than_depth_by_the_delay(delay_ms):
     np.testing.assert_array_equal(frame.depth, depth)
 
 
+def test_a_color_camera_that_runs_on_its_own():
+    capture = Capture(**SIZE, color_rate_hz=28, color_delay_ms=10)
+    dataset = PlacesDataset("room", "fast_turns", "exact", 60, capture=capture)
+    for index in (0, 7, 31):
+        frame = dataset[index]
+        color_time = np.round(frame.timestamp * 28) / 28
+        assert frame.offsets.depth == pytest.approx(0, abs=1e-9)
+        assert frame.offsets.color == pytest.approx(color_time - frame.timestamp, abs=1e-9)  # not the delay
+        color, _ = dataset.place.render(dataset.camera, dataset.motion.pose(color_time + 0.01))
+        np.testing.assert_array_equal(frame.color, color)
+
+
+def test_stamps_that_are_late_change_no_image():
+    plain = PlacesDataset("room", "fast_turns", "exact", 60, capture=Capture(**SIZE))
+    late = PlacesDataset("room", "fast_turns", "exact", 60, capture=Capture(**SIZE, stamp_jitter_ms=8))
+    np.testing.assert_array_equal(late.poses(), plain.poses())
+    off = late.timestamps() - plain.timestamps()
+    assert off.min() >= 0 and 0.005 < off.max() <= 0.008
+    for index in (3, 40):
+        np.testing.assert_array_equal(late[index].color, plain[index].color)
+        assert late[index].timestamp == late.timestamps()[index]
+        # The frames' clock is found again, but for what is late on average.
+        depth_time = late[index].timestamp + late[index].offsets.depth
+        assert abs(depth_time - plain[index].timestamp - 0.004) < 0.002
+        assert abs(late[index].offsets.color) < 0.002
+        assert plain[index].offsets.color == plain[index].offsets.depth == 0
+
+
 def test_exposure_blurs_as_the_mean_of_sharp_images_does():
     options = ("room", "fast_turns", "exact", 100)
     size = {"width": 160, "height": 120}
