@@ -32,7 +32,7 @@ SPS_INLINE Vec3<float> to_camera(const Mat3<float>& rotation, const Vec3<float>&
 }
 
 SPS_INLINE ReadoutMotion readout_motion(const ShutterMotion& motion) {
-  const CameraVelocity world = camera_velocity(motion.before, {0, motion.seconds}, motion.pose);
+  const CameraVelocity world = camera_velocity(motion.before, {0, motion.seconds, 0.0f}, motion.pose);
   const Mat3<float> rotation = load_pose(motion.pose).rotation;
   const float readout = *motion.readout, turn = readout * std::sqrt(dot(world.angular, world.angular)),
               way = readout * std::sqrt(dot(world.linear, world.linear));

@@ -48,7 +48,7 @@ class FileDataset(RgbdDataset):
         gt_poses: float64 [F, 4, 4], NaN where unknown, or None.
         units_per_meter: see `spslam.datasets.images.read_depth`.
         invalid_depth: see `spslam.datasets.images.read_depth`.
-        undistortion: applied to each color image.
+        undistortion: of the color lens, applied to both images: depth that is registered to color lies in its pixels.
         resize_color: bring each color image, of whatever size, to its depth image's size.
         is_registered: see `RgbdDataset`.
     """
@@ -86,7 +86,7 @@ class FileDataset(RgbdDataset):
         color = read_color(paths.color, None if self.resize_color else size)
         depth = read_depth(paths.depth, self.units_per_meter, self.invalid_depth, size)
         if self.undistortion is not None:
-            color = self.undistortion.color(color)
+            color, depth = self.undistortion.color(color), self.undistortion.depth(depth)
         if self.resize_color:
             color = resized_color(color, depth.shape[1], depth.shape[0])
         return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index), paths.offsets)

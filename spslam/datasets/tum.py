@@ -7,9 +7,10 @@ Color and depth are taken at different moments, so each color image is paired wi
 frame has the color image's stamp, and the ground truth is interpolated at that time; when the two images were taken is
 read from all stamps (`spslam.datasets.clock`), and the tracked pose is that of the depth image. freiburg1's and
 freiburg2's color images are distorted, freiburg3's are not; the intrinsics are those the authors calibrated for each.
-Color is undistorted; depth is left as it is, because it comes from another lens: carried from view to view with the
-ground-truth poses, the depth images of freiburg1_rpy agree better as they are (median 2.8, 4.9, 5.1 cm over 5, 10, 15
-frames) than undistorted with the color camera's coefficients (3.0, 5.3, 5.3 cm).
+Both images are undistorted: depth is registered to the color image as it was taken. Of freiburg1_rpy's frames 46 to 49,
+in which the camera stands still, edges of undistorted color lie 3 px off those of depth as it is, above in the lower half
+and below in the upper one; edges of color as it was taken lie beside those of depth alike in all parts
+(docs/experiments/2026-11-color-stamps.md).
 """
 
 from __future__ import annotations

@@ -55,10 +55,11 @@ def test_cameras_by_folder_name(tmp_path):
         assert (dataset.undistortion is None) == (focal in (535.4, 525.0))
 
 
-def test_color_is_undistorted_and_depth_is_not(tmp_path):
+def test_both_images_are_undistorted(tmp_path):
     folder = write_tum(tmp_path / "freiburg1_x", count=1)
     color = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8), (0, 0), 2)
-    depth = np.random.default_rng(1).uniform(1, 3, (120, 160))
+    rows, columns = np.mgrid[:120, :160]
+    depth = 2 + np.sin(rows / 30) * np.cos(columns / 35) / 4
     write_color(next((folder / "rgb").iterdir()), color)
     write_depth(next((folder / "depth").iterdir()), depth, 5000.0)
     dataset = open_tum(folder)
@@ -67,7 +68,9 @@ def test_color_is_undistorted_and_depth_is_not(tmp_path):
     inside = np.s_[10:-10, 10:-10]
     assert np.abs(dataset[0].color.astype(int) - expected)[inside].max() <= 2  # fixed-point weights
     assert np.abs(dataset[0].color.astype(int) - color)[inside].max() > 20
-    np.testing.assert_allclose(dataset[0].depth, depth, atol=1.1e-4)
+    expected = cv2.undistort(depth, dataset.camera.matrix(), distortion)
+    np.testing.assert_allclose(dataset[0].depth[inside], expected[inside], atol=2e-3)
+    assert np.abs(dataset[0].depth - depth)[inside].max() > 0.01
 
 
 def test_a_calibration_file_comes_first(tmp_path):
