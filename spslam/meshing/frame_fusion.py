@@ -17,6 +17,7 @@ from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.sdf_sampling import near_surface
+from spslam.ops.depth_planes import SURFACE_VARIANCE_M2
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
 
@@ -187,10 +188,19 @@ def _planes_and_ramps(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Planes float32 [H, W, 5] of the pixels away from edges, and of those on ramps with little weight; else 0."""
     kept = _on(without_blurred_edges(depth, noise), device)
-    ramps = ops.measure_planes(_on(depth, device), intrinsics, noise)
+    ramps = _smoothed_planes(_on(depth, device), intrinsics, noise)
     ramps[kept > 0] = 0
     ramps[..., 4] *= RAMP_WEIGHT
-    return ops.measure_planes(kept, intrinsics, noise), ramps
+    return _smoothed_planes(kept, intrinsics, noise), ramps
+
+
+def _smoothed_planes(depth: torch.Tensor, intrinsics: ops.Intrinsics, noise: tuple[float, float]) -> torch.Tensor:
+    """Planes of depth that a sensor smoothed: neighbors have the same noise, of which a mean over them would take
+    nothing but would blur once more. So they are measured as if there were none; weights count it."""
+    planes = ops.measure_planes(depth, intrinsics, (0.0, 0.0))
+    weighted = SURFACE_VARIANCE_M2 / (SURFACE_VARIANCE_M2 + noise[0] + noise[1] * depth**4) * planes[..., 4]
+    planes[..., 4] = torch.where(planes[..., 4] > 0, weighted, 0.0)  # depth may be NaN
+    return planes
 
 
 def _on(image: np.ndarray, device: torch.device) -> torch.Tensor:

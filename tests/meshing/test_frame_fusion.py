@@ -121,6 +121,17 @@ def test_a_ramp_stays_where_nothing_else_was_seen():
     assert between[0] > 100 and between[1] == 0
 
 
+def test_smoothed_depth_is_not_smoothed_once_more():
+    """A wave that smoothing leaves; as its curvature is within the noise, a mean over a window would lower it."""
+    steps = np.where(np.arange(128) // 24 % 2, np.float32(1.0), np.float32(1.6))
+    wave = np.float32(0.006) * np.sin(np.arange(96, dtype=np.float32) * np.float32(2 * np.pi / 8))[:, None]
+    depth = cv2.GaussianBlur(np.tile(steps, (96, 1)), (0, 0), 1.2) + wave
+    volume = fuse_frames(_Views(*[depth] * 3), FusionOptions(0.01, 500, (4e-5, 0.0)))
+    z = extract_fused_mesh(volume, min_part_m2=0).vertices[:, 2]
+    near = np.abs(z[np.abs(z - 1) < 0.02] - 1)
+    assert np.sqrt(2 * np.mean(near**2)) > 0.8 * 0.006
+
+
 def test_the_map_fills_what_no_frame_measured(device):
     """A slab's map of 1 x 1 m; a frame has measured the left half of its upper side, 4 mm above the map's."""
     scene = _scene(_slab, (0.5, 0.5, 0.03), device)
