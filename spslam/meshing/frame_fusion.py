@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.sdf_sampling import near_surface
+from spslam.ops.depth_planes import SURFACE_VARIANCE_M2
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
 
@@ -25,6 +26,10 @@ COARSENING = 1.5
 _MOST_ATTEMPTS = 12
 # Truncation in deviations of the noise of near depth, and at most; a phone's LiDAR, smoothed at edges, needs so many.
 NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
+# Weight of a pixel on a ramp between two surfaces, where depth was smoothed over edges: what else was seen there counts
+# for more, and as `extract_fused_mesh` asks for as large a share of the weight nearby, little of a ramp stays beside
+# surface. What lies between may be the floor of a landing, of which a camera sees but its edge.
+RAMP_WEIGHT = 0.01
 _WORKERS, _AHEAD = 2, 4
 
 
@@ -96,7 +101,10 @@ def fuse_frames(
     scene: Scene | None = None,
     device: torch.device | str = "cpu",
 ) -> ops.TsdfVolume:
-    """Fuses all frames into a new volume. Where a sensor smooths depth over edges, pixels there are left out.
+    """Fuses all frames into a new volume.
+
+    Where a sensor smooths depth over edges, the pixels between two surfaces have little weight. Such frames are read
+    twice: what frames saw before may be free of what a later one takes for surface there.
 
     Args:
         frames: to be fused, in order; of one dataset or of several in one world.
@@ -122,10 +130,7 @@ def fuse_frames(
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
             for part, smooth in zip(parts, blurred, strict=True):
-                noise = part.noise or options.noise
-                for frame, pose in part.read():
-                    depth = without_blurred_edges(frame.depth, noise) if smooth else frame.depth
-                    _integrate(volume, replace(frame, depth=depth), pose, part.dataset, noise)
+                _fuse_part(volume, part, part.noise or options.noise, smooth)
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -162,12 +167,45 @@ def surface_cells(scene: Scene) -> torch.Tensor:
     return near_surface(cells, volume.voxel_size_m, sdf, MAX_SLOPE, CHUNK_POINTS)
 
 
-def _integrate(
-    volume: ops.TsdfVolume, frame: RgbdFrame, pose: np.ndarray, dataset: RgbdDataset, noise: tuple[float, float]
-) -> None:
-    camera, device = dataset.camera, volume.sdf.device
+def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, float], smooth: bool) -> None:
+    """Fuses the frames of one dataset, whose depth is smoothed over edges or not."""
+    camera, device = part.dataset.camera, volume.sdf.device
     intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
-    depth = torch.from_numpy(np.ascontiguousarray(frame.depth)).to(device)
-    color = torch.from_numpy(np.ascontiguousarray(frame.color)).to(device)
-    pose7 = torch.from_numpy(matrix_to_pose7(pose)).to(device, torch.float32)
-    volume.integrate(depth, pose7, intrinsics, color, noise)
+    if smooth:
+        for frame, pose in part.read():
+            _, ramps = _planes_and_ramps(frame.depth, intrinsics, noise, device)
+            volume.make_room(ramps, _pose7(pose, device), intrinsics, noise)
+    for frame, pose in part.read():
+        if smooth:
+            planes = torch.add(*_planes_and_ramps(frame.depth, intrinsics, noise, device))
+        else:
+            planes = ops.measure_planes(_on(frame.depth, device), intrinsics, noise)
+        volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
+
+
+def _planes_and_ramps(
+    depth: np.ndarray, intrinsics: ops.Intrinsics, noise: tuple[float, float], device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Planes float32 [H, W, 5] of the pixels away from edges, and of those on ramps with little weight; else 0."""
+    kept = _on(without_blurred_edges(depth, noise), device)
+    ramps = _smoothed_planes(_on(depth, device), intrinsics, noise)
+    ramps[kept > 0] = 0
+    ramps[..., 4] *= RAMP_WEIGHT
+    return _smoothed_planes(kept, intrinsics, noise), ramps
+
+
+def _smoothed_planes(depth: torch.Tensor, intrinsics: ops.Intrinsics, noise: tuple[float, float]) -> torch.Tensor:
+    """Planes of depth that a sensor smoothed: neighbors have the same noise, of which a mean over them would take
+    nothing but would blur once more. So they are measured as if there were none; weights count it."""
+    planes = ops.measure_planes(depth, intrinsics, (0.0, 0.0))
+    weighted = SURFACE_VARIANCE_M2 / (SURFACE_VARIANCE_M2 + noise[0] + noise[1] * depth**4) * planes[..., 4]
+    planes[..., 4] = torch.where(planes[..., 4] > 0, weighted, 0.0)  # depth may be NaN
+    return planes
+
+
+def _on(image: np.ndarray, device: torch.device) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image)).to(device)
+
+
+def _pose7(pose: np.ndarray, device: torch.device) -> torch.Tensor:
+    return torch.from_numpy(matrix_to_pose7(pose)).to(device, torch.float32)

@@ -10,6 +10,7 @@ from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 PLANE_SIZE = 5  # kPlaneSize of csrc/include/spslam/tsdf.h
+SURFACE_VARIANCE_M2 = 0.003**2  # kPoseVariance of csrc/kernels/depth_planes.h: of poses and surface, added to the noise
 # The unknown sensor's of `SensorNoise.unknown`: 3 mm, and 1.3 mm at 1 m that grow with the square of depth.
 DEFAULT_NOISE = (9e-6, 1.69e-6)
 

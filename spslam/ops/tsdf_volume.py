@@ -148,27 +148,65 @@ class TsdfVolume:
             VoxelLimitError: more than `max_blocks`. The volume is then as before.
         """
         planes = measure_planes(depth, intrinsics, noise)
+        self.integrate_planes(planes, pose, intrinsics, color, noise)
+
+    def integrate_planes(
+        self,
+        planes: torch.Tensor,
+        pose: torch.Tensor,
+        intrinsics: Intrinsics,
+        color: torch.Tensor | None = None,
+        noise: tuple[float, float] = DEFAULT_NOISE,
+    ) -> None:
+        """Adds a frame whose planes were measured, and perhaps weighted anew.
+
+        Args:
+            planes: float32 [H, W, 5], see `measure_planes`.
+            pose, intrinsics, color, noise: as of `integrate`.
+
+        Raises:
+            TypeError, ValueError, VoxelLimitError: as `integrate`.
+        """
         if color is not None:  # before blocks are added
-            check_tensor("TsdfVolume.integrate", "color", color, (*depth.shape, 3), torch.uint8, like=depth)
-        size, truncation = self.voxel_size, self.truncation
-        reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
-        step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
-        touched = tsdf_touched_blocks(
-            planes, pose, intrinsics, voxel_size=size, truncation=truncation, noise=noise, step=step
-        )
-        self.add_blocks(touched)
+            check_tensor("TsdfVolume.integrate", "color", color, (*planes.shape[:2], 3), torch.uint8, like=planes)
+        self.make_room(planes, pose, intrinsics, noise)
         arrays = self.block_coords, self._sdf, self._weights, self._colors
         tsdf_integrate_(
             *arrays,
             planes,
             pose,
             intrinsics,
-            voxel_size=size,
-            truncation=truncation,
+            voxel_size=self.voxel_size,
+            truncation=self.truncation,
             near_truncation=self.near_truncation,
             noise=noise,
             color=color,
         )
+
+    def make_room(
+        self,
+        planes: torch.Tensor,
+        pose: torch.Tensor,
+        intrinsics: Intrinsics,
+        noise: tuple[float, float] = DEFAULT_NOISE,
+    ) -> None:
+        """Adds the blocks that a frame's planes touch, of which nothing is known yet. Arguments as `integrate_planes`.
+
+        Raises:
+            TypeError, ValueError, VoxelLimitError: as `integrate`.
+        """
+        reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
+        step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
+        touched = tsdf_touched_blocks(
+            planes,
+            pose,
+            intrinsics,
+            voxel_size=self.voxel_size,
+            truncation=self.truncation,
+            noise=noise,
+            step=step,
+        )
+        self.add_blocks(touched)
 
     def query(self, points: torch.Tensor, min_weight: float = 1e-3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Distance (m), color and whether both are known, at points float32 [N, 3]; see `tsdf_query`."""

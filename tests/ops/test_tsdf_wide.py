@@ -118,3 +118,16 @@ def test_a_wrong_color_changes_nothing(color, error, message):
     with pytest.raises(error, match=f"TsdfVolume.integrate: {message}"):
         volume.integrate(torch.from_numpy(two_walls()), POSE, CAMERA, color)
     assert len(volume) == 0 and volume.nbytes == ops.TsdfVolume(VOXEL).nbytes
+
+
+def test_planes_are_integrated_with_the_weights_they_are_given(device):
+    depth, pose = torch.from_numpy(two_walls()).to(device), POSE.to(device)
+    whole, half, room = (ops.TsdfVolume(VOXEL, device=device) for _ in range(3))
+    whole.integrate(depth, pose, CAMERA, noise=NOISE)
+    planes = ops.measure_planes(depth, CAMERA, NOISE)
+    room.make_room(planes, pose, CAMERA, NOISE)
+    planes[..., 4] *= 0.5
+    half.integrate_planes(planes, pose, CAMERA, noise=NOISE)
+    assert torch.equal(room.block_coords, whole.block_coords) and not room.weights.any()
+    assert torch.equal(half.block_coords, whole.block_coords) and torch.equal(half.weights, 0.5 * whole.weights)
+    assert torch.allclose(half.sdf, whole.sdf)
