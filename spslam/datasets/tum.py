@@ -7,9 +7,9 @@ Color and depth are taken at different moments, so each color image is paired wi
 frame has the color image's stamp, and the ground truth is interpolated at that time; when the two images were taken is
 read from all stamps (`spslam.datasets.clock`), and the tracked pose is that of the depth image. freiburg1's and
 freiburg2's color images are distorted, freiburg3's are not; the intrinsics are those the authors calibrated for each.
-Both images are undistorted: depth is registered to the color image as it was taken. Of freiburg1_rpy's frames 46 to 49,
-in which the camera stands still, edges of undistorted color lie 3 px off those of depth as it is, above in the lower half
-and below in the upper one; edges of color as it was taken lie beside those of depth alike in all parts
+Both images are undistorted: depth is registered to the color image as it was taken. In freiburg1_rpy's frames 46 to
+49, where the camera stands still, edges of undistorted color lie 3 px off those of depth as it is, above in the lower
+half and below in the upper one; edges of color as it was taken lie beside those of depth alike in all parts
 (docs/experiments/2026-11-color-stamps.md).
 """
 
