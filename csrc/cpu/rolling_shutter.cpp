@@ -15,6 +15,7 @@ void rectify_lanes(FrameImages images, ReadoutMotion readout, ShutterCamera came
                    std::int64_t count, std::uint16_t* depth, std::uint8_t* intensity) {
   float scale[kLanes], by_column[kLanes], by_row[kLanes], read[kLanes], corners[4][kLanes];
   std::int32_t row[kLanes], column[kLanes], top[kLanes], left[kLanes];
+  // Not SPS_SIMD: GCC would keep the structs of each lane in memory and vectorize nothing; so it does by itself.
   for (std::int64_t lane = 0; lane < count; ++lane) {
     const ReadPixel from = look_up(images, readout, camera, y, begin + lane);
     const ReadPlace at = read_place(camera, from);
