@@ -173,25 +173,26 @@ def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, fl
     intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
     if smooth:
         for frame, pose in part.read():
-            _, ramps = _planes_and_ramps(frame.depth, intrinsics, noise, device)
-            volume.make_room(ramps, _pose7(pose, device), intrinsics, noise)
+            depth, kept = (_on(image, device) for image in (frame.depth, without_blurred_edges(frame.depth, noise)))
+            volume.make_room(_ramps(depth, kept, intrinsics, noise), _pose7(pose, device), intrinsics, noise)
     for frame, pose in part.read():
+        depth = _on(frame.depth, device)
         if smooth:
-            planes = torch.add(*_planes_and_ramps(frame.depth, intrinsics, noise, device))
+            kept = _on(without_blurred_edges(frame.depth, noise), device)
+            planes = _smoothed_planes(kept, intrinsics, noise) + _ramps(depth, kept, intrinsics, noise)
         else:
-            planes = ops.measure_planes(_on(frame.depth, device), intrinsics, noise)
+            planes = ops.measure_planes(depth, intrinsics, noise)
         volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
 
 
-def _planes_and_ramps(
-    depth: np.ndarray, intrinsics: ops.Intrinsics, noise: tuple[float, float], device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Planes float32 [H, W, 5] of the pixels away from edges, and of those on ramps with little weight; else 0."""
-    kept = _on(without_blurred_edges(depth, noise), device)
-    ramps = _smoothed_planes(_on(depth, device), intrinsics, noise)
+def _ramps(
+    depth: torch.Tensor, kept: torch.Tensor, intrinsics: ops.Intrinsics, noise: tuple[float, float]
+) -> torch.Tensor:
+    """Planes float32 [H, W, 5] of the pixels of a depth image [H, W] (m) that are not `kept`, with little weight."""
+    ramps = _smoothed_planes(depth, intrinsics, noise)
     ramps[kept > 0] = 0
     ramps[..., 4] *= RAMP_WEIGHT
-    return _smoothed_planes(kept, intrinsics, noise), ramps
+    return ramps
 
 
 def _smoothed_planes(depth: torch.Tensor, intrinsics: ops.Intrinsics, noise: tuple[float, float]) -> torch.Tensor:

@@ -6,7 +6,7 @@ import torch
 
 from spslam.ops._checks import check, check_tensor
 from spslam.ops._public import public_op
-from spslam.ops.depth_planes import DEFAULT_NOISE, measure_planes
+from spslam.ops.depth_planes import DEFAULT_NOISE, PLANE_SIZE, measure_planes
 from spslam.ops.hash_table import VoxelHash
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.scene_view import Intrinsics
@@ -167,6 +167,7 @@ class TsdfVolume:
         Raises:
             TypeError, ValueError, VoxelLimitError: as `integrate`.
         """
+        check_tensor("TsdfVolume.integrate_planes", "planes", planes, ("H", "W", PLANE_SIZE), torch.float32)
         if color is not None:  # before blocks are added
             check_tensor("TsdfVolume.integrate", "color", color, (*planes.shape[:2], 3), torch.uint8, like=planes)
         self.make_room(planes, pose, intrinsics, noise)
