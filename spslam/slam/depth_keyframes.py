@@ -1,5 +1,6 @@
 """Depth and intensity images of earlier frames, with which tracking aligns a frame beside the map."""
 
+import numpy as np
 import torch
 
 from spslam import ops
@@ -49,12 +50,12 @@ class DepthKeyframeStore:
             self.intensities[slot].copy_(intensity)
             self.frames[slot] = frame
 
-    def select(self, frame: int, lost: torch.Tensor, poses: torch.Tensor) -> ops.DepthKeyframes | None:
+    def select(self, frame: int, lost: np.ndarray, poses: torch.Tensor) -> ops.DepthKeyframes | None:
         """Images to align frame number `frame` with: the last frame, one 10 to 19 back and one 40 to 49 back.
 
         Args:
             frame: its number.
-            lost: bool [F] on the CPU, whether a frame's pose is not trusted.
+            lost: bool [F], whether a frame's pose is not trusted.
             poses: float32 [F, 7] of the frames before.
 
         Returns:

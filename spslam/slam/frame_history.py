@@ -42,7 +42,7 @@ class FrameHistory:
     @property
     def is_lost(self) -> bool:
         """Whether the last frame is lost."""
-        return bool(self._state.frames.lost[-1])
+        return self._state.frames.is_lost(-1)
 
     @property
     def knows_speed(self) -> bool:
@@ -116,7 +116,7 @@ class FrameHistory:
         state = self._state
         if state.depth_keyframes is None:
             return None
-        selected = state.depth_keyframes.select(len(state.frames), state.frames.lost, state.frames.poses)
+        selected = state.depth_keyframes.select(len(state.frames), state.frames.lost.numpy(), state.frames.poses)
         if selected is None:
             return None
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
@@ -127,7 +127,7 @@ class FrameHistory:
     def own_motion(self, row: int) -> ops.FrameMotion:
         """How the camera came to the frame of a row."""
         frames = self._state.frames
-        return self.motion(row, float(frames.depth_times[row]), float(frames.color_offsets[row]))
+        return self.motion(row, frames.depth_time(row), frames.color_offset(row))
 
     def motion(self, row: int, depth_time: float | None, color_offset: float = 0.0) -> ops.FrameMotion:
         """How the camera came to the frame of a row, or to the next one, from the frame before.
@@ -138,9 +138,9 @@ class FrameHistory:
             color_offset: from there to its color image, s, as stamps say.
         """
         frames = self._state.frames
-        if depth_time is None or row <= frames.opened or bool(frames.lost[row - 1]):
+        if depth_time is None or row <= frames.opened or frames.is_lost(row - 1):
             return ops.NO_MOTION
-        seconds = depth_time - float(frames.depth_times[row - 1])
+        seconds = depth_time - frames.depth_time(row - 1)
         return ops.FrameMotion(row - 1, seconds, color_offset) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
 
     def color_motion(self, motion: ops.FrameMotion) -> ColorMotion | None:

@@ -165,7 +165,7 @@ class FramePipeline:
             self._tell(on_pose)
         self._keep_features(frame, read, tracked, number, shutter)
         self._follow_other_maps(frame, read)
-        is_keyframe = not tracked.occluded and not self.state.frames.lost[-1] and self.state.segment is None
+        is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
             self.global_mapping.after_frame(number, pixels, tracked.matrix())
         pose = self._last_pose()
@@ -319,7 +319,7 @@ class FramePipeline:
 
         Those that are due and were not extracted ahead are extracted now.
         """
-        if tracked.occluded or self.state.frames.lost[-1]:
+        if tracked.occluded or self.state.frames.is_lost(-1):
             return
         features, processed = tracked.features, self.state.frames.processed - 1
         if features is None and (frame.features is not None or keeps_features(self.config, processed)):
@@ -362,7 +362,7 @@ class FramePipeline:
 
     def _last_pose(self) -> torch.Tensor | None:
         """The newest frame's pose float32 [7], on its way to the CPU; None where it is lost."""
-        return None if self.state.frames.lost[-1] else fetch(self.state.frames.poses[-1])
+        return None if self.state.frames.is_lost(-1) else fetch(self.state.frames.poses[-1])
 
     def _tell(self, on_pose: PoseCallback | None) -> None:
         if on_pose is not None:
@@ -380,9 +380,9 @@ class FramePipeline:
     def _is_mapping_frame(self, number: int, tracked: TrackedFrame) -> bool:
         """Whether the newest frame is to be mapped: a lost one never, one soon after a lost one not yet."""
         if not self._has_map:
-            return not bool(self.state.frames.lost[-1])
+            return not self.state.frames.is_lost(-1)
         is_wanted = self._is_mapping_turn(number) or tracked.fit.inlier_share < MIN_MAPPED_SHARE
-        return is_wanted and not bool(self.state.frames.lost[-SETTLED_FRAMES:].any())
+        return is_wanted and not self.state.frames.any_lost(SETTLED_FRAMES)
 
 
 def _check_first_pose(pose: np.ndarray) -> None:

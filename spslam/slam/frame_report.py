@@ -191,7 +191,7 @@ def frame_report(
         frame=state.frames.processed - 1,
         index=frame.index,
         timestamp=frame.timestamp,
-        lost=bool(state.frames.lost[-1]),
+        lost=state.frames.is_lost(-1),
         valid_depth_share=pixels.valid_depth_share,
         tracking_iterations=tracked.iterations,
         fit=tracked.fit,

@@ -2,6 +2,7 @@
 
 import mmap
 
+import numpy as np
 import torch
 
 from spslam.errors import SpslamError
@@ -58,7 +59,7 @@ class PixelDatabase:
             )
         self._memory: mmap.mmap | None = None  # that the words are in, where addresses for all of them are reserved
         self._words = torch.zeros(0, dtype=torch.int32, device=device)
-        self._has_pixels = torch.zeros(0, dtype=torch.bool)
+        self._has_pixels = np.zeros(0, bool)  # each frame writes to it, which an array of NumPy's does at once
 
     @property
     def records(self) -> torch.Tensor:
@@ -68,7 +69,7 @@ class PixelDatabase:
     @property
     def has_pixels(self) -> torch.Tensor:
         """bool [F] on the CPU: whether the frame had valid depth, and is still kept."""
-        return self._has_pixels[: self.num_frames]
+        return torch.from_numpy(self._has_pixels)[: self.num_frames]
 
     @property
     def nbytes(self) -> int:
@@ -112,13 +113,13 @@ class PixelDatabase:
         records = state["records"]
         self.num_frames, self.pixels_per_frame = records.shape[0], records.shape[1]
         self._words, self._memory = records.to(self._words.device, copy=True).view(-1), None
-        self._has_pixels = state["has_pixels"].clone()
+        self._has_pixels = state["has_pixels"].numpy().copy()
 
     def _reserve(self, frames: int) -> None:
         """Makes room for so many frames, thinning all of them if the budget requires it."""
         if frames > len(self._has_pixels):
-            flags = torch.zeros(max(frames, _FIRST_CAPACITY, 2 * len(self._has_pixels)), dtype=torch.bool)
-            flags[: self.num_frames] = self.has_pixels
+            flags = np.zeros(max(frames, _FIRST_CAPACITY, 2 * len(self._has_pixels)), bool)
+            flags[: self.num_frames] = self._has_pixels[: self.num_frames]
             self._has_pixels = flags
         pixels = self._affordable_pixels(frames)
         if pixels == self.pixels_per_frame and frames * self._words_per_frame <= len(self._words):

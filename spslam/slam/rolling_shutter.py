@@ -11,10 +11,11 @@ from spslam.camera import Camera
 from spslam.pose_graph import rotation_vectors
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.frame_history import FrameHistory
+from spslam.slam.frame_table import FrameTable
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import pose_matrix
-from spslam.slam.state import FrameTable, SlamState
+from spslam.slam.state import SlamState
 
 # rad, m, during the readout, as in csrc/kernels/rolling_shutter.h: what moves by more has jumped.
 MAX_READOUT_MOTION = 0.15

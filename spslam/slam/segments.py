@@ -95,7 +95,7 @@ class Segments:
             self.end()
             segment = None
         if segment is None:
-            if not has_depth or not frames.lost[number] or _lost_s(self._state) < self._after_s:
+            if not has_depth or not frames.is_lost(number) or _lost_s(self._state) < self._after_s:
                 return None
             self._system = self._make(None)
             segment = self._state.segment = Segment(number, self._system.state)
@@ -165,12 +165,12 @@ class Segments:
         """Whether the segment itself is lost for as long as makes another begin, or does not fit to the map."""
         inner = segment.state.frames
         tries = int((~self._state.frames.lost[segment.first :]).sum())
-        return bool(len(inner) and inner.lost[-1] and _lost_s(segment.state) >= self._after_s) or tries > MAX_TRIES
+        return bool(len(inner) and inner.is_lost(-1) and _lost_s(segment.state) >= self._after_s) or tries > MAX_TRIES
 
     def _place(self, segment: Segment) -> np.ndarray | None:
         """T_world_segment float64 [4, 4], if the last frames agree on it."""
         inner, outer, count = segment.state.frames, self._state.frames, SETTLED_FRAMES
-        if len(inner) < count or bool(inner.lost[-count:].any()) or bool(outer.lost[-count:].any()):
+        if len(inner) < count or inner.any_lost(count) or outer.any_lost(count):
             return None
         ones, others = outer.matrices(-count), inner.matrices(-count)
         places = compose(ones, inverse(others))

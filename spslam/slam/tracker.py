@@ -12,8 +12,8 @@ from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.constraints import Constraints
 from spslam.slam.fit import Fit, min_eigenvalue, prediction_error
+from spslam.slam.frame_table import FrameTable
 from spslam.slam.render_options import render_options
-from spslam.slam.state import FrameTable
 
 INDEPENDENT_PIXELS = 300  # as many a frame's pixels are worth: the map's errors are alike for neighbors
 LEAST_DEVIATION_M = 0.003  # of a pixel

@@ -4,7 +4,7 @@ import torch
 
 from spslam.camera import Camera
 from spslam.slam.covisibility import select_frames
-from spslam.slam.state import FrameTable
+from spslam.slam.frame_table import FrameTable
 from tests.system.sequences import settings
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)

@@ -28,7 +28,7 @@ def filled(frames, skipped=()):
 
 def used(store, frame, lost=()):
     """Numbers of the frames whose images are used for a frame, by what the images hold."""
-    is_lost = torch.zeros(frame, dtype=torch.bool)
+    is_lost = np.zeros(frame, bool)
     is_lost[list(lost)] = True
     views = store.select(frame, is_lost, torch.zeros(frame, 7))
     if views is None:

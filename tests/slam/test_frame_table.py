@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from spslam.camera import Camera
-from spslam.slam.state import FrameTable
+from spslam.slam.frame_table import FrameTable
 
 
 def add(table, number, thumbnail=None):
@@ -25,6 +25,11 @@ def test_rows_stay_as_the_table_grows(device):
     assert table.poses[:, 4].tolist() == list(range(300))
     assert table.indices.tolist() == list(range(0, 600, 2))
     assert table.lost.tolist() == [number % 3 == 0 for number in range(300)]
+    assert [table.is_lost(row) for row in (0, 1, -1, -3)] == [True, False, False, True]
+    assert [table.any_lost(count) for count in (1, 2, 3, 1000)] == [False, False, True, True]
+    assert table.depth_time(7) == table.timestamps[7] and table.color_offset(7) == 0
+    table.lost[-1] = True  # a column is the table itself
+    assert table.is_lost(299) and not table.knows_speed
     assert torch.equal(table.depth_thumbnails[:, 0, 0].float().cpu(), torch.arange(300.0))
 
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from spslam import ops
+from spslam.slam.frame_table import FrameTable
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame, unpack_points
 from spslam.slam.poses import pose_tensor
-from spslam.slam.state import FrameTable
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from spslam.prior import load_prior
+from spslam.slam.frame_table import FrameTable
 from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_tensor
-from spslam.slam.state import FrameTable, Moments, SlamState
+from spslam.slam.state import Moments, SlamState
 from spslam.slam.system import SlamSystem
 from spslam.slam.tracker import Tracker, TrackingProblem
 from tests.system.sequences import Recorded, settings
