@@ -7,6 +7,8 @@ shape.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 
@@ -99,7 +101,26 @@ def pose_from(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 def pose7_to_matrix(pose7: np.ndarray) -> np.ndarray:
     """Poses [..., 4, 4] of rows [..., 7]: quaternion (w, x, y, z), then translation."""
     pose7 = _as_floats("pose7_to_matrix", "pose7", pose7, (7,))
+    if pose7.ndim == 1:
+        return _matrix_of(*pose7.tolist())
     return pose_from(quaternion_to_matrix(pose7[..., :4]), pose7[..., 4:])
+
+
+def _matrix_of(w: float, x: float, y: float, z: float, *translation: float) -> np.ndarray:
+    """`pose7_to_matrix` of one row, the same bits: a frame asks several times, and arrays of one number take longer."""
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if norm == 0:
+        raise ValueError("quaternion_to_matrix: quaternion must have a length above 0, got 0")
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    tx, ty, tz = translation
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), tx),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), ty),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), tz),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+    )
 
 
 def matrix_to_pose7(pose: np.ndarray) -> np.ndarray:

@@ -14,7 +14,10 @@ struct RaySamples {
 
   RaySamples(const char* function, const Tensor& opacities_, const std::optional<Tensor>& lengths_,
              const Tensor& values_, const Tensor& t_, const std::optional<Tensor>& packed_info_)
-      : opacities(contiguous(opacities_)), values(contiguous(values_)), t(contiguous(t_)), packed(packed_info_) {
+      : opacities(as_contiguous(opacities_)),
+        values(as_contiguous(values_)),
+        t(as_contiguous(t_)),
+        packed(packed_info_) {
     const std::int64_t axes = packed ? 1 : 2;
     SPS_CHECK(opacities.dim() == axes && values.dim() == axes + 1 && same_shape(t, opacities), function,
               ": shapes must be [R, S], [R, S, C], [R, S], or with packed_info [N], [N, C], [N]");
@@ -23,11 +26,11 @@ struct RaySamples {
     }
     if (lengths_) {
       SPS_CHECK(same_shape(*lengths_, opacities), function, ": lengths must have the shape of opacities");
-      lengths = contiguous(*lengths_);
+      lengths = as_contiguous(*lengths_);
     }
     if (packed) {
       SPS_CHECK(has_shape(*packed_info_, {-1, 2}), function, ": packed_info must have shape [R, 2]");
-      packed_info = contiguous(*packed_info_);
+      packed_info = as_contiguous(*packed_info_);
     }
     rays = packed ? packed_info->size(0) : opacities.size(0);
     samples = opacities.numel();
@@ -82,11 +85,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> alpha_composite_backward(
                 (!grad_weights || same_shape(*grad_weights, opacities)),
             name, ": gradients must fit the outputs");
   DeviceScope scope(opacities);
-  grad_values = contiguous(grad_values);
-  grad_depth = contiguous(grad_depth);
-  grad_opacity = contiguous(grad_opacity);
-  if (grad_weights) grad_weights = contiguous(*grad_weights);
-  weights = contiguous(weights);
+  grad_values = as_contiguous(grad_values);
+  grad_depth = as_contiguous(grad_depth);
+  grad_opacity = as_contiguous(grad_opacity);
+  if (grad_weights) grad_weights = as_contiguous(*grad_weights);
+  weights = as_contiguous(weights);
   std::vector<std::int64_t> shape = samples.shape();
   Tensor to_opacities = samples.per_sample(shape), to_t = samples.per_sample(shape);
   Tensor to_lengths = samples.per_sample(lengths ? shape : std::vector<std::int64_t>{0});

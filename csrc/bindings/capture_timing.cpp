@@ -17,9 +17,9 @@ void measure_capture_timing(Tensor state, Tensor timing, Tensor pixels, Tensor p
   SPS_CHECK(pose.numel() == kPoseSize && noise.numel() == kSensorNoiseSize, kName, ": pose must have ", kPoseSize,
             " elements, noise ", kSensorNoiseSize);
   DeviceScope scope(pixels);
-  pixels = contiguous(pixels);
-  pose = contiguous(pose);
-  noise = contiguous(noise);
+  pixels = as_contiguous(pixels);
+  pose = as_contiguous(pose);
+  noise = as_contiguous(noise);
   depth_keyframes = all_contiguous(depth_keyframes);
   const DepthKeyframes keyframes =
       load_depth_keyframes(kName, depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);

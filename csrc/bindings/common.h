@@ -15,6 +15,7 @@
 #include <torch/headeronly/util/Exception.h>
 
 #include <cstdint>
+#include <cstring>
 #include <exception>
 #include <initializer_list>
 #include <optional>
@@ -30,7 +31,6 @@
 namespace spslam::bindings {
 
 using torch::headeronly::ScalarType;
-using torch::stable::contiguous;
 using torch::stable::Tensor;
 
 template <class... Words>
@@ -70,6 +70,12 @@ inline bool same_shape(const Tensor& tensor, const Tensor& other) {
   return true;
 }
 
+// The tensor, or a contiguous copy of it. Nearly all are contiguous, which is known at once; torch's own function looks
+// itself up by its name in each call.
+inline Tensor as_contiguous(const Tensor& tensor) {
+  return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
+}
+
 // A number that kernels hold in 32 bits.
 inline std::int32_t to_int32(const char* function, const char* argument, std::int64_t value) {
   SPS_CHECK(value >= INT32_MIN && value <= INT32_MAX, function, ": ", argument, " must fit 32 bits, got ", value);
@@ -100,9 +106,19 @@ class DeviceScope {
  private:
   torch::stable::accelerator::DeviceGuard guard_;
 };
+
+// Copies memory of the device to other memory of it, in the order of its stream.
+inline void copy_bytes(const Context& context, void* to, const void* from, std::size_t bytes) {
+  if (bytes == 0) return;
+  STD_CUDA_CHECK(cudaMemcpyAsync(to, from, bytes, cudaMemcpyDeviceToDevice, static_cast<cudaStream_t>(context.stream)));
+}
 #else
 #define SPS_DISPATCH_KEY CPU
 using Context = Cpu;
+
+inline void copy_bytes(const Context&, void* to, const void* from, std::size_t bytes) {
+  if (bytes != 0) std::memcpy(to, from, bytes);
+}
 
 class DeviceScope {
  public:
@@ -142,7 +158,7 @@ struct ScalarTypeOf<std::uint16_t> {
   static constexpr ScalarType value = ScalarType::UInt16;
 };
 
-// Read access. The tensor must be contiguous: take it through contiguous() first.
+// Read access. The tensor must be contiguous: take it through as_contiguous() first.
 template <class T>
 const T* data(const Tensor& tensor) {
   SPS_CHECK(tensor.scalar_type() == ScalarTypeOf<T>::value, "spslam: tensor of another dtype than the kernel reads");

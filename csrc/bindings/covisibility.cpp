@@ -10,7 +10,7 @@ class FramesArgument {
  public:
   FramesArgument(const char* function, const Tensor& poses, const Tensor& depth_thumbnails,
                  const std::vector<double>& intrinsics, std::int64_t step)
-      : poses_(contiguous(poses)), thumbnails_(contiguous(depth_thumbnails)) {
+      : poses_(as_contiguous(poses)), thumbnails_(as_contiguous(depth_thumbnails)) {
     SPS_CHECK(poses.dim() == 2 && poses.size(1) == kPoseSize, function, ": poses must have shape [F, 7]");
     SPS_CHECK(depth_thumbnails.dim() == 3 && depth_thumbnails.size(0) == poses.size(0) &&
                   depth_thumbnails.scalar_type() == ScalarType::Half,
@@ -36,7 +36,7 @@ Tensor frame_overlap(Tensor points, Tensor poses, Tensor depth_thumbnails, std::
   SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "frame_overlap: points must have shape [N, 3]");
   DeviceScope scope(points);
   const FramesArgument argument("frame_overlap", poses, depth_thumbnails, intrinsics, thumbnail_step);
-  points = contiguous(points);
+  points = as_contiguous(points);
   Tensor share = empty(points, {argument.frames.num_frames}, ScalarType::Float);
   spslam::frame_overlap(scope.context, data<float>(points), points.size(0), argument.frames,
                         mutable_data<float>(share));
@@ -61,8 +61,8 @@ Tensor select_covisible_frames(Tensor records, Tensor poses, Tensor depth_thumbn
   SPS_CHECK(candidates.dim() == 1, kName, ": candidates must have shape [M]");
   DeviceScope scope(poses);
   const FramesArgument argument(kName, poses, depth_thumbnails, intrinsics, integers[Integer::kThumbnailStep]);
-  records = contiguous(records);
-  candidates = contiguous(candidates);
+  records = as_contiguous(records);
+  candidates = as_contiguous(candidates);
   const std::int64_t num_candidates = candidates.numel();
   const CovisibleSelection selection{current,
                                      integers[Integer::kNumPoints],

@@ -20,8 +20,8 @@ MlpShape mlp_shape(const char* function, const Tensor& input, const Tensor& para
 
 Tensor mlp(Tensor input, Tensor params, std::int64_t hidden, std::int64_t output, std::int64_t activation) {
   const MlpShape shape = mlp_shape("mlp", input, params, hidden, output, activation);
-  input = torch::stable::contiguous(input);
-  params = torch::stable::contiguous(params);
+  input = as_contiguous(input);
+  params = as_contiguous(params);
   DeviceScope scope(input);
   const std::int64_t n = input.size(0);
   Tensor out = empty(input, {n, output}, input.scalar_type());
@@ -40,9 +40,9 @@ std::tuple<Tensor, Tensor> mlp_backward(Tensor grad, Tensor input, Tensor params
   const MlpShape shape = mlp_shape("mlp_backward", input, params, hidden, output, activation);
   const std::int64_t n = input.size(0);
   SPS_CHECK(has_shape(grad, {n, output}), "mlp_backward: grad must have shape [N, output]");
-  grad = torch::stable::contiguous(grad);
-  input = torch::stable::contiguous(input);
-  params = torch::stable::contiguous(params);
+  grad = as_contiguous(grad);
+  input = as_contiguous(input);
+  params = as_contiguous(params);
   DeviceScope scope(input);
   Tensor grad_input = empty(input, {need_grad_input ? n : 0, shape.input}, input.scalar_type());
   Tensor grad_params = empty(input, {need_grad_params ? shape.num_params() : 0}, input.scalar_type());

@@ -26,7 +26,7 @@ inline FrameMotion load_motion(const char* name, const std::int64_t* integers, s
 
 inline std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
   std::vector<Tensor> result;
-  for (const Tensor& tensor : tensors) result.push_back(contiguous(tensor));
+  for (const Tensor& tensor : tensors) result.push_back(as_contiguous(tensor));
   return result;
 }
 

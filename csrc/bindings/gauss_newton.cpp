@@ -10,8 +10,8 @@ Tensor predict_pose(Tensor before, Tensor last) {
   SPS_CHECK(before.numel() == kPoseSize && last.numel() == kPoseSize,
             "predict_pose: before and last must have 7 elements");
   DeviceScope scope(last);
-  before = torch::stable::contiguous(before);
-  last = torch::stable::contiguous(last);
+  before = as_contiguous(before);
+  last = as_contiguous(last);
   Tensor next = empty(last, {kPoseSize}, ScalarType::Float);
   spslam::predict_pose(scope.context, data<float>(before), data<float>(last), mutable_data<float>(next));
   return next;
@@ -56,11 +56,14 @@ GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<I
   return options;
 }
 
-std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
-    std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars, std::vector<std::int64_t> plane_layout,
-    std::vector<Tensor> frame, std::vector<double> scalars, std::vector<std::int64_t> integers,
-    std::vector<Tensor> reference, std::vector<double> reference_scalars, std::vector<Tensor> depth_keyframes,
-    std::vector<double> depth_keyframe_scalars, std::vector<std::int64_t> depth_keyframe_integers) {
+// All that tracking finds, in one tensor, which is read at once: the pose that it started from and the one it found, H
+// and the statistics of every iteration.
+Tensor track_gauss_newton(std::vector<Tensor> scene_tensors, std::vector<double> scene_scalars,
+                          std::vector<std::int64_t> plane_layout, std::vector<Tensor> frame,
+                          std::vector<double> scalars, std::vector<std::int64_t> integers,
+                          std::vector<Tensor> reference, std::vector<double> reference_scalars,
+                          std::vector<Tensor> depth_keyframes, std::vector<double> depth_keyframe_scalars,
+                          std::vector<std::int64_t> depth_keyframe_integers) {
   SPS_CHECK(frame.size() == 2 || frame.size() == 3, kName, ": frame must be pixels, a pose and, if known, noise");
   frame = all_contiguous(frame);
   const Tensor &pixels = frame[0], &pose = frame[1];
@@ -78,15 +81,19 @@ std::tuple<Tensor, Tensor, Tensor> track_gauss_newton(
   options.reference = load_reference(reference, reference_scalars);
   options.depth_keyframes =
       load_depth_keyframes(kName, depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);
-  Tensor result = torch::stable::clone(pose);
-  Tensor stats = empty(pose, {options.iterations, kTrackingStatSize}, ScalarType::Float);
-  Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
+  Tensor found = empty(pose, {2 * kPoseSize + 36 + options.iterations * kTrackingStatSize}, ScalarType::Float);
+  float* const start = mutable_data<float>(found);
+  float* const result = start + kPoseSize;
+  float* const hessian = result + kPoseSize;
+  float* const stats = hessian + 36;
+  for (float* place : {start, result}) {
+    copy_bytes(scope.context, place, data<float>(pose), kPoseSize * sizeof(float));
+  }
   Tensor workspace =
       empty(pixels, {gauss_newton_workspace_size(scope.context, 1, options.num_pixels)}, ScalarType::Byte);
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,
-                             workspace.mutable_data_ptr(), mutable_data<float>(result), mutable_data<float>(stats),
-                             mutable_data<float>(hessian));
-  return {result, stats, hessian};
+                             workspace.mutable_data_ptr(), result, stats, hessian);
+  return found;
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor> tensors, std::vector<double> scalars,
@@ -98,8 +105,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
             "gauss_newton_poses: poses must have shape [F, 7]");
   DeviceScope scope(pixels);
   const SceneArgument scene(tensors, scalars, layout);
-  pixels = torch::stable::contiguous(pixels);
-  poses = torch::stable::contiguous(poses);
+  pixels = as_contiguous(pixels);
+  poses = as_contiguous(poses);
   const std::int64_t frames = pixels.size(0), count = pixels.size(1);
   check_count("gauss_newton_poses", "pixels of a frame", count, 0);
   Tensor hessian = empty(poses, {frames, 6, 6}, ScalarType::Float);
@@ -122,7 +129,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
   m.def("track_gauss_newton(" SPS_SCENE_SCHEMA
         ", Tensor[] frame, float[] scalars, int[] integers, Tensor[] reference, "
-        "float[] reference_scalars, " SPS_DEPTH_KEYFRAMES_SCHEMA ") -> (Tensor, Tensor, Tensor)");
+        "float[] reference_scalars, " SPS_DEPTH_KEYFRAMES_SCHEMA ") -> Tensor");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "
         "-> (Tensor, Tensor, Tensor, Tensor)");

@@ -65,7 +65,7 @@ struct Arguments {
 
   Arguments(const char* function, const Tensor& table_, const Tensor& points_, const Integers& integers,
             bool concatenated)
-      : table(contiguous(table_)), points(contiguous(points_)) {
+      : table(as_contiguous(table_)), points(as_contiguous(points_)) {
     SPS_CHECK(table.dim() == 2 && has_shape(points, {-1, 3}), function, ": shapes must be [P, C], [N, 3]");
     channels = table.size(1);
     num_points = points.size(0);
@@ -100,7 +100,7 @@ std::tuple<Tensor, Tensor> grid_interpolate_backward(Tensor grad, Tensor table, 
   const Arguments in(name, table, points, levels, concatenated);
   SPS_CHECK(has_shape(grad, {in.num_points, in.width}), name, ": grad must fit the output");
   DeviceScope scope(table);
-  grad = contiguous(grad);
+  grad = as_contiguous(grad);
   const ScalarType dtype = table.scalar_type();
   const Integers none{0};
   Tensor to_table = empty(table, need_table ? Integers{in.table.size(0), in.channels} : none, dtype);
@@ -125,9 +125,9 @@ RowLists row_lists(const Tensor& rows, std::int64_t num_rows, std::int64_t chann
 Tensor row_gather(Tensor table, Tensor rows, Tensor weights) {
   SPS_CHECK(table.dim() == 2 && same_shape(rows, weights), "row_gather: shapes must be [P, C], [N, K], [N, K]");
   DeviceScope scope(table);
-  table = contiguous(table);
-  rows = contiguous(rows);
-  weights = contiguous(weights);
+  table = as_contiguous(table);
+  rows = as_contiguous(rows);
+  weights = as_contiguous(weights);
   const RowLists lists = row_lists(rows, table.size(0), table.size(1));
   Tensor out = empty(table, {lists.num_lists, lists.channels}, table.scalar_type());
   dispatch_floating("row_gather", table, [&](auto zero) {
@@ -142,9 +142,9 @@ Tensor row_scatter(Tensor grad, Tensor rows, Tensor weights, std::int64_t num_ro
   SPS_CHECK(grad.dim() == 2 && same_shape(rows, weights) && rows.dim() == 2 && grad.size(0) == rows.size(0),
             "row_scatter: shapes must be [N, C], [N, K], [N, K]");
   DeviceScope scope(grad);
-  grad = contiguous(grad);
-  rows = contiguous(rows);
-  weights = contiguous(weights);
+  grad = as_contiguous(grad);
+  rows = as_contiguous(rows);
+  weights = as_contiguous(weights);
   const RowLists lists = row_lists(rows, num_rows, grad.size(1));
   Tensor out = empty(grad, {num_rows, lists.channels}, grad.scalar_type());
   const std::int64_t words = grid_workspace_words<Context>(num_rows * lists.channels);
@@ -162,9 +162,9 @@ Tensor row_dot(Tensor grad, Tensor table, Tensor rows) {
                 grad.size(1) == table.size(1),
             "row_dot: shapes must be [N, C], [P, C], [N, K]");
   DeviceScope scope(grad);
-  grad = contiguous(grad);
-  table = contiguous(table);
-  rows = contiguous(rows);
+  grad = as_contiguous(grad);
+  table = as_contiguous(table);
+  rows = as_contiguous(rows);
   const RowLists lists = row_lists(rows, table.size(0), table.size(1));
   Tensor out = empty(grad, {lists.num_lists, lists.length}, grad.scalar_type());
   dispatch_floating("row_dot", grad, [&](auto zero) {

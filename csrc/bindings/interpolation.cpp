@@ -34,9 +34,9 @@ void check_trilinear(const Tensor& embeddings, const Tensor& corner_ids, const T
 Tensor trilinear_interpolate(Tensor embeddings, Tensor corner_ids, Tensor local_coords) {
   check_trilinear(embeddings, corner_ids, local_coords);
   DeviceScope scope(embeddings);
-  embeddings = contiguous(embeddings);
-  corner_ids = contiguous(corner_ids);
-  local_coords = contiguous(local_coords);
+  embeddings = as_contiguous(embeddings);
+  corner_ids = as_contiguous(corner_ids);
+  local_coords = as_contiguous(local_coords);
   const std::int64_t points = corner_ids.size(0), channels = embeddings.size(1);
   Tensor out = empty(embeddings, {points, channels}, embeddings.scalar_type());
   dispatch_floating("trilinear_interpolate", embeddings, [&](auto zero) {
@@ -52,10 +52,10 @@ std::tuple<Tensor, Tensor> trilinear_interpolate_backward(Tensor grad, Tensor em
                                                           bool need_local_coords) {
   check_trilinear(embeddings, corner_ids, local_coords);
   DeviceScope scope(embeddings);
-  grad = contiguous(grad);
-  embeddings = contiguous(embeddings);
-  corner_ids = contiguous(corner_ids);
-  local_coords = contiguous(local_coords);
+  grad = as_contiguous(grad);
+  embeddings = as_contiguous(embeddings);
+  corner_ids = as_contiguous(corner_ids);
+  local_coords = as_contiguous(local_coords);
   const std::int64_t points = corner_ids.size(0), channels = embeddings.size(1);
   SPS_CHECK(has_shape(grad, {points, channels}), "trilinear_interpolate_backward: grad must have shape [N, C]");
   Gradients out(embeddings, local_coords, need_embeddings, need_local_coords);
@@ -79,8 +79,8 @@ void check_bilinear(const Tensor& texels, const Tensor& uv) {
 Tensor bilinear_interpolate(Tensor texels, Tensor uv) {
   check_bilinear(texels, uv);
   DeviceScope scope(texels);
-  texels = contiguous(texels);
-  uv = contiguous(uv);
+  texels = as_contiguous(texels);
+  uv = as_contiguous(uv);
   const std::int64_t points = uv.size(0), channels = texels.size(2);
   Tensor out = empty(texels, {points, channels}, texels.scalar_type());
   dispatch_floating("bilinear_interpolate", texels, [&](auto zero) {
@@ -95,9 +95,9 @@ std::tuple<Tensor, Tensor> bilinear_interpolate_backward(Tensor grad, Tensor tex
                                                          bool need_uv) {
   check_bilinear(texels, uv);
   DeviceScope scope(texels);
-  grad = contiguous(grad);
-  texels = contiguous(texels);
-  uv = contiguous(uv);
+  grad = as_contiguous(grad);
+  texels = as_contiguous(texels);
+  uv = as_contiguous(uv);
   const std::int64_t points = uv.size(0), channels = texels.size(2);
   SPS_CHECK(has_shape(grad, {points, channels}), "bilinear_interpolate_backward: grad must have shape [N, C]");
   Gradients out(texels, uv, need_texels, need_uv);
@@ -120,8 +120,8 @@ TriPlaneLayout checked_layout(const Tensor& texels, const Tensor& points, const 
 Tensor tri_plane_interpolate(Tensor texels, Tensor points, double cell_size, Sizes layout) {
   const TriPlaneLayout planes = checked_layout(texels, points, layout);
   DeviceScope scope(texels);
-  texels = contiguous(texels);
-  points = contiguous(points);
+  texels = as_contiguous(texels);
+  points = as_contiguous(points);
   Tensor out = empty(texels, {points.size(0), texels.size(1)}, texels.scalar_type());
   dispatch_floating("tri_plane_interpolate", texels, [&](auto zero) {
     using T = decltype(zero);
@@ -135,9 +135,9 @@ std::tuple<Tensor, Tensor> tri_plane_interpolate_backward(Tensor grad, Tensor te
                                                           Sizes layout, bool need_texels, bool need_points) {
   const TriPlaneLayout planes = checked_layout(texels, points, layout);
   DeviceScope scope(texels);
-  grad = contiguous(grad);
-  texels = contiguous(texels);
-  points = contiguous(points);
+  grad = as_contiguous(grad);
+  texels = as_contiguous(texels);
+  points = as_contiguous(points);
   SPS_CHECK(has_shape(grad, {points.size(0), texels.size(1)}),
             "tri_plane_interpolate_backward: grad must have shape [N, C]");
   Gradients out(texels, points, need_texels, need_points);

@@ -14,8 +14,8 @@ std::tuple<Tensor, Tensor, std::int64_t> marching_cubes(Tensor cell_coords, Tens
   SPS_CHECK(values.size(1) >= 2 && values.size(1) <= kMaxSamples, "marching_cubes: values must have 2 to ", kMaxSamples,
             " samples per axis, got ", values.size(1));
   DeviceScope scope(values);
-  cell_coords = contiguous(cell_coords);
-  values = contiguous(values);
+  cell_coords = as_contiguous(cell_coords);
+  values = as_contiguous(values);
   const MarchingCubesCells cells{data<std::int32_t>(cell_coords), data<float>(values), values.size(0),
                                  static_cast<int>(values.size(1) - 1), static_cast<float>(level)};
   Tensor workspace =

@@ -64,7 +64,7 @@ class Moments {
 
 // The frames on the kernel's device. The driver stages so small a copy at once: nothing waits.
 Tensor frames_on_device(const Tensor& frames, const Tensor& like, std::int64_t rows, const Context& context) {
-  Tensor list = contiguous(frames);
+  Tensor list = as_contiguous(frames);
 #ifdef SPS_CUDA
   if (list.is_cuda()) return list;
 #endif
@@ -105,7 +105,7 @@ void optimize_map_(std::vector<Tensor> scene_tensors, std::vector<double> scene_
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   const RenderArgument render(kName, render_scalars, render_integers);
   const std::int64_t num_texels = scene_tensors[5].numel() / kPlaneChannels;
-  records = contiguous(records);
+  records = as_contiguous(records);
   frames = frames_on_device(frames, poses, poses.size(0), scope.context);
   MapOptimization call{};
   call.scene = scene.view;

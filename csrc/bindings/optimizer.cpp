@@ -14,7 +14,7 @@ void sparse_adam_(Tensor param, Tensor grad, Tensor exp_avg, Tensor exp_avg_sq, 
   SPS_CHECK(step >= 1, "sparse_adam_: step must be at least 1, got ", step);
   if (count == 0) return;
   std::optional<Tensor> flat_stamps;
-  if (stamps.has_value()) flat_stamps = contiguous(*stamps);
+  if (stamps.has_value()) flat_stamps = as_contiguous(*stamps);
   const std::int64_t rows = stamps.has_value() ? stamps->numel() : 1;
   SPS_CHECK(rows >= 1 && count % rows == 0, "sparse_adam_: stamps must have one entry per row of param");
   dispatch_floating("sparse_adam_", param, [&](auto zero) {
@@ -34,9 +34,9 @@ std::tuple<Tensor, Tensor, Tensor> normal_equations(Tensor residuals, Tensor jac
             "normal_equations: jacobians and weights must fit residuals");
   check_count("normal_equations", "frames", frames, 0);
   check_count("normal_equations", "residuals of a frame", count, 0);
-  residuals = contiguous(residuals);
-  jacobians = contiguous(jacobians);
-  weights = contiguous(weights);
+  residuals = as_contiguous(residuals);
+  jacobians = as_contiguous(jacobians);
+  weights = as_contiguous(weights);
   Tensor partials = empty(residuals, {normal_equations_partials(frames, count)}, ScalarType::Double);
   Tensor hessian = empty(residuals, {frames, 6, 6}, residuals.scalar_type());
   Tensor gradient = empty(residuals, {frames, 6}, residuals.scalar_type());
@@ -54,8 +54,8 @@ Tensor solve_normal_equations(Tensor hessian, Tensor gradient, double damping, d
   DeviceScope scope(hessian);
   SPS_CHECK(has_shape(gradient, {-1, 6}) && has_shape(hessian, {gradient.size(0), 6, 6}),
             "solve_normal_equations: hessian and gradient must have shapes [F, 6, 6] and [F, 6]");
-  hessian = contiguous(hessian);
-  gradient = contiguous(gradient);
+  hessian = as_contiguous(hessian);
+  gradient = as_contiguous(gradient);
   Tensor delta = empty(gradient, {gradient.size(0), 6}, gradient.scalar_type());
   dispatch_floating("solve_normal_equations", hessian, [&](auto zero) {
     using T = decltype(zero);

@@ -13,9 +13,9 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
                                             double cx, double cy) {
   SPS_CHECK(has_shape(records, {-1, 3}) && same_shape(normals, records) && has_shape(pose, {7}),
             "unproject_pixels: records, normals and pose must have shapes [P, 3], [P, 3] and [7]");
-  records = contiguous(records);
-  normals = contiguous(normals);
-  pose = contiguous(pose);
+  records = as_contiguous(records);
+  normals = as_contiguous(normals);
+  pose = as_contiguous(pose);
   DeviceScope scope(records);
   const Tensor points = rows_of_three(records), world_normals = rows_of_three(records);
   spslam::unproject_pixels(
@@ -66,8 +66,8 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
   SPS_CHECK(depth.dim() == 2 && depth.size(0) <= 65535 && depth.size(1) <= 65535 &&
                 depth.numel() < (std::int64_t{1} << 31) && has_shape(color, {depth.size(0), depth.size(1), 3}),
             "sample_frame_pixels: depth and color must have shapes [H, W] and [H, W, 3], H and W below 2^16");
-  depth = contiguous(depth);
-  color = contiguous(color);
+  depth = as_contiguous(depth);
+  color = as_contiguous(color);
   const std::int32_t height = static_cast<std::int32_t>(depth.size(0)),
                      width = static_cast<std::int32_t>(depth.size(1));
   const RgbdImage image{

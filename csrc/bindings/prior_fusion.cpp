@@ -9,9 +9,9 @@ namespace {
 
 void fuse_prior_(Tensor embeddings, Tensor weights, Tensor voxel_ids, Tensor features, Tensor feature_weights,
                  double max_weight) {
-  voxel_ids = contiguous(voxel_ids);
-  features = contiguous(features);
-  feature_weights = contiguous(feature_weights);
+  voxel_ids = as_contiguous(voxel_ids);
+  features = as_contiguous(features);
+  feature_weights = as_contiguous(feature_weights);
   const std::int64_t count = voxel_ids.numel();
   SPS_CHECK(has_shape(voxel_ids, {count}) && has_shape(features, {count, kPriorFeatures}) &&
                 has_shape(feature_weights, {count}) && has_shape(embeddings, {-1, kPriorFeatures}) &&
@@ -32,8 +32,8 @@ Tensor depth_normals(Tensor depth, Tensor pixels, double fx, double fy, double c
   check_count("depth_normals", "width", depth.size(1), 0);
   SPS_CHECK(step_px >= 1 && step_px <= kMaxStep, "depth_normals: step_px must be in [1, ", kMaxStep, "], got ",
             step_px);
-  depth = contiguous(depth);
-  pixels = contiguous(pixels);
+  depth = as_contiguous(depth);
+  pixels = as_contiguous(pixels);
   DeviceScope scope(depth);
   const DepthImage image{
       data<float>(depth),
@@ -66,9 +66,9 @@ std::tuple<Tensor, Tensor, Tensor> encode_points(Tensor points, Tensor normals, 
   const EncoderSettings settings =
       checked_settings("encode_points", encoder_params, voxel_size, neighborhood, min_pair_weight, tf32);
   check_points("encode_points", points, normals);
-  points = contiguous(points);
-  normals = contiguous(normals);
-  encoder_params = contiguous(encoder_params);
+  points = as_contiguous(points);
+  normals = as_contiguous(normals);
+  encoder_params = as_contiguous(encoder_params);
   DeviceScope scope(points);
   Scratch scratch(points);
   Tensor voxel_coords, features, weights;
@@ -136,9 +136,9 @@ std::int64_t encode_frame_(std::vector<Tensor> volume, Tensor points, Tensor nor
   const FeatureVolume into = checked_volume(volume, integers[Integer::kNumVoxels], integers[Integer::kMaxVoxels]);
   SPS_CHECK(bounds.numel() == 6, "encode_frame_: bounds must have 6 numbers, got ", bounds.numel());
   check_points("encode_frame_", points, normals);
-  points = contiguous(points);
-  normals = contiguous(normals);
-  encoder_params = contiguous(encoder_params);
+  points = as_contiguous(points);
+  normals = as_contiguous(normals);
+  encoder_params = as_contiguous(encoder_params);
   DeviceScope scope(points);
   Scratch scratch(points);
   const EncodedFrame frame = encode_frame(scope.context, into, data<float>(points), data<float>(normals),
@@ -153,7 +153,7 @@ std::int64_t encode_frame_(std::vector<Tensor> volume, Tensor points, Tensor nor
 
 Tensor random_embeddings(Tensor voxel_coords, std::int64_t seed, double scale) {
   SPS_CHECK(has_shape(voxel_coords, {-1, 3}), "random_embeddings: voxel_coords must have shape [M, 3]");
-  voxel_coords = contiguous(voxel_coords);
+  voxel_coords = as_contiguous(voxel_coords);
   DeviceScope scope(voxel_coords);
   const Tensor embeddings = empty(voxel_coords, {voxel_coords.size(0), kPriorFeatures}, ScalarType::Float);
   spslam::random_embeddings(scope.context, data<std::int32_t>(voxel_coords), voxel_coords.size(0), seed,

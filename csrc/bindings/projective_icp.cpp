@@ -15,10 +15,10 @@ std::tuple<Tensor, Tensor, Tensor> projective_icp(Tensor points, Tensor vertices
   SPS_CHECK(pose.numel() == kPoseSize, "projective_icp: pose must have 7 elements");
   check_count("projective_icp", "iterations", iterations);
   DeviceScope scope(points);
-  points = torch::stable::contiguous(points);
-  vertices = torch::stable::contiguous(vertices);
-  normals = torch::stable::contiguous(normals);
-  Tensor result = torch::stable::clone(torch::stable::contiguous(pose));
+  points = as_contiguous(points);
+  vertices = as_contiguous(vertices);
+  normals = as_contiguous(normals);
+  Tensor result = torch::stable::clone(as_contiguous(pose));
   Tensor stats = empty(pose, {iterations, kTrackingStatSize}, ScalarType::Float);
   Tensor hessian = empty(pose, {6, 6}, ScalarType::Float);
   const std::int64_t count = points.size(0);

@@ -30,7 +30,7 @@ Tensor sample_along_rays(Tensor depth, std::int64_t num_uniform, std::int64_t nu
   SPS_CHECK(depth.numel() == 0 || num_uniform + num_surface <= (std::int64_t{1} << 32) / depth.numel(),
             "sample_along_rays: rays times samples must be at most 2^32");
   DeviceScope scope(depth);
-  depth = contiguous(depth);
+  depth = as_contiguous(depth);
   Tensor out = empty(depth, {depth.numel(), num_uniform + num_surface}, depth.scalar_type());
   dispatch_floating("sample_along_rays", depth, [&](auto zero) {
     using T = decltype(zero);

@@ -36,7 +36,7 @@ void render_step(std::vector<Tensor> scene_tensors, std::vector<double> scene_sc
                  std::vector<std::int64_t> render_integers, std::int64_t stamp, Tensor losses,
                  std::optional<Tensor> grad_poses, std::vector<Tensor> geometry, std::vector<Tensor> color) {
   SPS_CHECK(rays.size() == 3, kName, ": rays must be pixels, ray_frames and poses");
-  const Tensor pixels = contiguous(rays[0]), ray_frames = contiguous(rays[1]), poses = contiguous(rays[2]);
+  const Tensor pixels = as_contiguous(rays[0]), ray_frames = as_contiguous(rays[1]), poses = as_contiguous(rays[2]);
   const std::int64_t num_rays = ray_frames.numel();
   SPS_CHECK(has_shape(ray_frames, {num_rays}) && has_shape(pixels, {num_rays, 3}), kName,
             ": ray_frames and pixels must have shapes [R] and [R, 3]");

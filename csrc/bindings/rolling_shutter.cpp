@@ -26,8 +26,8 @@ void rectify_shutter_records(Tensor out, Tensor records, Tensor before, Tensor p
             ": records must have shape [P, 3], and out too, contiguous");
   SPS_CHECK(height > 1 && width > 1, kName, ": height and width must be above 1");
   DeviceScope scope(records);
-  records = contiguous(records);
-  before = contiguous(before), pose = contiguous(pose), readout = contiguous(readout);
+  records = as_contiguous(records);
+  before = as_contiguous(before), pose = as_contiguous(pose), readout = as_contiguous(readout);
   const ShutterMotion motion = load_shutter_motion(kName, before, pose, readout, scalars[RecordScalar::kSeconds]);
   spslam::rectify_shutter_records(scope.context, data<std::int32_t>(records), records.size(0), motion,
                                   {load_intrinsics(scalars), height, width}, mutable_data<std::int32_t>(out));
@@ -44,8 +44,8 @@ void rectify_shutter_images(Tensor out_depth, Tensor out_intensity, Tensor depth
             kName, ": all images must have one shape, and results be contiguous");
   SPS_CHECK(scalars[ImageScalar::kUnit] > 0.0, kName, ": unit must be positive");
   DeviceScope scope(depth);
-  depth = contiguous(depth), intensity = contiguous(intensity);
-  before = contiguous(before), pose = contiguous(pose), readout = contiguous(readout);
+  depth = as_contiguous(depth), intensity = as_contiguous(intensity);
+  before = as_contiguous(before), pose = as_contiguous(pose), readout = as_contiguous(readout);
   const ShutterMotion motion = load_shutter_motion(kName, before, pose, readout, scalars[ImageScalar::kSeconds]);
   spslam::rectify_shutter_images(
       scope.context, {data<std::uint16_t>(depth), data<std::uint8_t>(intensity), scalars.as<float>(ImageScalar::kUnit)},

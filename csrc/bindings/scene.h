@@ -16,7 +16,7 @@ class SceneArgument {
   SceneArgument(const std::vector<Tensor>& tensors, const std::vector<double>& scalars,
                 const std::vector<std::int64_t>& layout) {
     SPS_CHECK(tensors.size() == 7 && scalars.size() == 6, "spslam: a scene must be 7 tensors and 6 scalars");
-    for (const Tensor& tensor : tensors) tensors_.push_back(torch::stable::contiguous(tensor));
+    for (const Tensor& tensor : tensors) tensors_.push_back(as_contiguous(tensor));
     const Tensor &keys = tensors_[0], &values = tensors_[1], &corners = tensors_[2], &embeddings = tensors_[3],
                  &geometry = tensors_[4], &texels = tensors_[5], &color = tensors_[6];
     const std::int64_t capacity = keys.numel();

@@ -10,7 +10,7 @@ std::tuple<Tensor, Tensor, Tensor> query_sdf(std::vector<Tensor> tensors, std::v
   SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "query_sdf: points must have shape [N, 3]");
   DeviceScope scope(points);
   const SceneArgument scene(tensors, scalars, layout);
-  points = torch::stable::contiguous(points);
+  points = as_contiguous(points);
   const std::int64_t n = points.size(0);
   Tensor sdf = empty(points, {n}, ScalarType::Float);
   Tensor valid = empty(points, {n}, ScalarType::Bool);
@@ -25,7 +25,7 @@ Tensor query_color(std::vector<Tensor> tensors, std::vector<double> scalars, std
   SPS_CHECK(points.dim() == 2 && points.size(1) == 3, "query_color: points must have shape [N, 3]");
   DeviceScope scope(points);
   const SceneArgument scene(tensors, scalars, layout);
-  points = torch::stable::contiguous(points);
+  points = as_contiguous(points);
   Tensor color = empty(points, {points.size(0), 3}, ScalarType::Float);
   spslam::query_color(scope.context, scene.view, data<float>(points), points.size(0), mutable_data<float>(color));
   return color;

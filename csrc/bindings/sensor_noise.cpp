@@ -15,8 +15,8 @@ void measure_noise(Tensor counts, Tensor noise, Tensor pixels, Tensor pose, std:
   SPS_CHECK(pixels.dim() == 2 && pixels.size(1) == 3, kName, ": pixels must have shape [P, 3]");
   SPS_CHECK(pose.numel() == kPoseSize, kName, ": pose must have 7 elements");
   DeviceScope scope(pixels);
-  pixels = contiguous(pixels);
-  pose = contiguous(pose);
+  pixels = as_contiguous(pixels);
+  pose = as_contiguous(pose);
   depth_keyframes = all_contiguous(depth_keyframes);
   const DepthKeyframes keyframes =
       load_depth_keyframes(kName, depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);

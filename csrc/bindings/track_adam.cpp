@@ -27,8 +27,8 @@ std::tuple<Tensor, Tensor> track_adam(std::vector<Tensor> scene_tensors, std::ve
   DeviceScope scope(pose);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   const RenderArgument render(kName, render_scalars, render_integers);
-  records = contiguous(records);
-  pose = contiguous(pose);
+  records = as_contiguous(records);
+  pose = as_contiguous(pose);
   PoseTracking call{};
   call.scene = scene.view;
   call.rays.records = data<std::int32_t>(records);

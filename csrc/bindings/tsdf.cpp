@@ -14,7 +14,7 @@ Tensor measure_planes(Tensor depth, std::vector<double> intrinsics, double noise
   constexpr char kName[] = "measure_planes";
   SPS_CHECK(depth.dim() == 2, kName, ": depth must have shape [H, W]");
   DeviceScope scope(depth);
-  depth = contiguous(depth);
+  depth = as_contiguous(depth);
   const DepthImage image{data<float>(depth), image_side(kName, depth.size(1)), image_side(kName, depth.size(0)),
                          load_intrinsics(kName, intrinsics)};
   const Tensor planes = empty(depth, {depth.size(0), depth.size(1), kPlaneSize}, ScalarType::Float);
@@ -48,8 +48,8 @@ Tensor tsdf_touched_blocks(Tensor planes, Tensor pose, std::vector<double> intri
   const TouchOptions options{static_cast<float>(voxel_size), static_cast<float>(truncation), load_noise(kName, noise),
                              static_cast<std::int32_t>(step)};
   DeviceScope scope(planes);
-  planes = contiguous(planes);
-  pose = contiguous(pose);
+  planes = as_contiguous(planes);
+  pose = as_contiguous(pose);
   const PlaneFrame frame = load_frame(kName, planes, pose, intrinsics);
   Tensor coords = empty(planes, {touched_rows(frame, options.step), 3}, ScalarType::Int);
   const std::int64_t written =
@@ -74,15 +74,15 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
   SPS_CHECK(voxel_size > 0.0 && truncations[0] > 0.0 && truncations[1] > 0.0 && max_weight > 0.0, kName,
             ": voxel_size, truncations and max_weight must be positive");
   DeviceScope scope(sdf);
-  block_coords = contiguous(block_coords);
-  planes = contiguous(planes);
-  pose = contiguous(pose);
+  block_coords = as_contiguous(block_coords);
+  planes = as_contiguous(planes);
+  pose = as_contiguous(pose);
   PlaneFrame frame = load_frame(kName, planes, pose, intrinsics);
   Tensor color;
   if (!image.empty()) {
     SPS_CHECK(image.size() == 1 && has_shape(image[0], {planes.size(0), planes.size(1), 3}), kName,
               ": color must have shape [H, W, 3]");
-    color = contiguous(image[0]);
+    color = as_contiguous(image[0]);
     frame.colors = data<std::uint8_t>(color);
   }
   const TsdfBlocks blocks{
@@ -98,11 +98,11 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
 struct ReadField {
   ReadField(const char* name, const Tensor& hash_keys, const Tensor& hash_values, const Tensor& sdf_rows,
             const Tensor& weight_rows, const Tensor& color_rows)
-      : keys(contiguous(hash_keys)),
-        values(contiguous(hash_values)),
-        sdf(contiguous(sdf_rows)),
-        weights(contiguous(weight_rows)),
-        colors(contiguous(color_rows)) {
+      : keys(as_contiguous(hash_keys)),
+        values(as_contiguous(hash_values)),
+        sdf(as_contiguous(sdf_rows)),
+        weights(as_contiguous(weight_rows)),
+        colors(as_contiguous(color_rows)) {
     check_blocks(name, sdf, weights, colors);
     const std::int64_t capacity = keys.numel();
     SPS_CHECK(capacity >= 2 && (capacity & (capacity - 1)) == 0 && values.numel() == capacity, name,
@@ -128,7 +128,7 @@ std::tuple<Tensor, Tensor, Tensor> tsdf_query(Tensor hash_keys, Tensor hash_valu
   SPS_CHECK(voxel_size > 0.0, kName, ": voxel_size must be positive");
   DeviceScope scope(points);
   const ReadField field(kName, hash_keys, hash_values, sdf, weights, colors);
-  points = contiguous(points);
+  points = as_contiguous(points);
   const std::int64_t n = points.size(0);
   const Tensor distance = empty(points, {n}, ScalarType::Float), color = empty(points, {n, 3}, ScalarType::Float);
   const Tensor known = empty(points, {n}, ScalarType::Bool);
@@ -147,7 +147,7 @@ std::tuple<Tensor, Tensor, Tensor> tsdf_ray_cast(Tensor hash_keys, Tensor hash_v
   SPS_CHECK(voxel_size > 0.0, kName, ": voxel_size must be positive");
   DeviceScope scope(sdf);
   const ReadField field(kName, hash_keys, hash_values, sdf, weights, colors);
-  pose = contiguous(pose);
+  pose = as_contiguous(pose);
   const std::int32_t width = image_side(kName, size[0]), height = image_side(kName, size[1]);
   const RayCastCamera camera{
       data<float>(pose),           width, height, load_intrinsics(kName, intrinsics), static_cast<float>(range[0]),

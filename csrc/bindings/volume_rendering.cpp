@@ -10,7 +10,7 @@ struct Samples {
   Tensor sdf, t, valid;
 
   Samples(const char* function, const Tensor& sdf_, const Tensor& t_, const Tensor& valid_)
-      : sdf(contiguous(sdf_)), t(contiguous(t_)), valid(contiguous(valid_)) {
+      : sdf(as_contiguous(sdf_)), t(as_contiguous(t_)), valid(as_contiguous(valid_)) {
     SPS_CHECK(sdf.dim() == 2 && t.dim() == 2 && valid.dim() == 2 && t.size(0) == sdf.size(0) &&
                   t.size(1) == sdf.size(1) && valid.size(0) == sdf.size(0) && valid.size(1) == sdf.size(1),
               function, ": sdf, t and valid must have shape [R, S]");
@@ -41,7 +41,7 @@ std::tuple<Tensor, Tensor, Tensor> volume_render(Tensor sdf, Tensor color, Tenso
   const Samples samples("volume_render", sdf, t, valid);
   const std::int64_t channels = color_channels("volume_render", samples, color);
   DeviceScope scope(sdf);
-  color = contiguous(color);
+  color = as_contiguous(color);
   const ScalarType dtype = sdf.scalar_type();
   Tensor out_color = empty(sdf, {samples.rays(), channels}, dtype), out_depth = empty(sdf, {samples.rays()}, dtype);
   Tensor weights = empty(sdf, {samples.rays(), samples.count()}, dtype);
@@ -65,11 +65,11 @@ std::tuple<Tensor, Tensor, Tensor> volume_render_backward(Tensor grad_color, Ten
   check_shape(name, "grad_depth", grad_depth, {samples.rays()});
   if (grad_weights) check_shape(name, "grad_weights", *grad_weights, {samples.rays(), samples.count()});
   DeviceScope scope(sdf);
-  color = contiguous(color);
-  weights = contiguous(weights);
-  grad_color = contiguous(grad_color);
-  grad_depth = contiguous(grad_depth);
-  if (grad_weights) grad_weights = contiguous(*grad_weights);
+  color = as_contiguous(color);
+  weights = as_contiguous(weights);
+  grad_color = as_contiguous(grad_color);
+  grad_depth = as_contiguous(grad_depth);
+  if (grad_weights) grad_weights = as_contiguous(*grad_weights);
   const ScalarType dtype = sdf.scalar_type();
   const std::int64_t rays = samples.rays(), count = samples.count();
   Tensor sdf_out = empty(sdf, {rays, count}, dtype), color_out = empty(sdf, {rays, count, channels}, dtype);
@@ -98,7 +98,7 @@ struct Targets {
     check_shape(function, "target_depth", target_depth, {rays});
     check_shape(function, "cosine", cosine, {rays});
     for (Tensor* tensor : {&color, &depth, &rendered, &target_color, &target_depth, &cosine}) {
-      *tensor = contiguous(*tensor);
+      *tensor = as_contiguous(*tensor);
     }
   }
 
@@ -137,7 +137,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> rendering_losses_backward(Tensor grad
   DeviceScope scope(sdf);
   Targets targets{color, depth, rendered, target_color, target_depth, cosine, truncation, cosine_targets};
   targets.make_contiguous(name, samples.rays());
-  grad = contiguous(grad);
+  grad = as_contiguous(grad);
   const ScalarType dtype = sdf.scalar_type();
   const std::int64_t rays = samples.rays(), count = samples.count();
   Tensor color_out = empty(sdf, {rays, 3}, dtype), depth_out = empty(sdf, {rays}, dtype);

@@ -56,10 +56,10 @@ struct Absent {
 Tensor voxel_hash_absent(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords, std::string function) {
   checked_capacity(function.c_str(), hash_keys, hash_values);
   check_coords(function.c_str(), voxel_coords);
-  hash_keys = contiguous(hash_keys);
-  hash_values = contiguous(hash_values);
+  hash_keys = as_contiguous(hash_keys);
+  hash_values = as_contiguous(hash_values);
   DeviceScope scope(hash_keys);
-  const Absent absent(scope.context, hash_keys, hash_values, contiguous(voxel_coords));
+  const Absent absent(scope.context, hash_keys, hash_values, as_contiguous(voxel_coords));
   absent.check_range(function.c_str());
   return absent.coords(scope.context);
 }
@@ -72,7 +72,7 @@ Tensor voxel_hash_insert(Tensor hash_keys, Tensor hash_values, Tensor voxel_coor
   std::int64_t* const keys = mutable_data<std::int64_t>(hash_keys);  // before they are read as contiguous
   std::int32_t* const values = mutable_data<std::int32_t>(hash_values);
   DeviceScope scope(hash_keys);
-  const Absent absent(scope.context, hash_keys, hash_values, contiguous(voxel_coords));
+  const Absent absent(scope.context, hash_keys, hash_values, as_contiguous(voxel_coords));
   const AbsentVoxels& found = absent.found;
   absent.check_range(name);
   check_room(name, capacity, first_id);
@@ -88,7 +88,7 @@ void voxel_hash_build(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords)
   const char* name = "voxel_hash_build_";
   const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
   check_coords(name, voxel_coords);
-  voxel_coords = contiguous(voxel_coords);
+  voxel_coords = as_contiguous(voxel_coords);
   const std::int64_t n = voxel_coords.size(0);
   check_room(name, capacity, n);
   std::int64_t* const keys = mutable_data<std::int64_t>(hash_keys);
@@ -103,9 +103,9 @@ void voxel_hash_build(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords)
 Tensor voxel_hash_find(Tensor hash_keys, Tensor hash_values, Tensor voxel_coords) {
   const std::int64_t capacity = checked_capacity("voxel_hash_find", hash_keys, hash_values);
   check_coords("voxel_hash_find", voxel_coords);
-  hash_keys = contiguous(hash_keys);
-  hash_values = contiguous(hash_values);
-  voxel_coords = contiguous(voxel_coords);
+  hash_keys = as_contiguous(hash_keys);
+  hash_values = as_contiguous(hash_values);
+  voxel_coords = as_contiguous(voxel_coords);
   DeviceScope scope(hash_keys);
   const Tensor voxel_ids = empty(hash_keys, {voxel_coords.size(0)}, ScalarType::Int);
   spslam::voxel_hash_find(scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values), capacity,
@@ -118,9 +118,9 @@ void voxel_hash_update_corner_ids(Tensor hash_keys, Tensor hash_values, Tensor v
   const char* name = "voxel_hash_update_corner_ids";
   const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
   check_coords(name, voxel_coords);
-  hash_keys = contiguous(hash_keys);
-  hash_values = contiguous(hash_values);
-  voxel_coords = contiguous(voxel_coords);
+  hash_keys = as_contiguous(hash_keys);
+  hash_values = as_contiguous(hash_values);
+  voxel_coords = as_contiguous(voxel_coords);
   const std::int64_t voxels = voxel_coords.size(0);
   SPS_CHECK(has_shape(corner_ids, {voxels, 8}), name, ": corner_ids must have shape [", voxels, ", 8]");
   SPS_CHECK(first_new >= 0 && first_new <= voxels, name, ": first_new must be in [0, ", voxels, "], got ", first_new);
@@ -136,10 +136,10 @@ std::tuple<Tensor, Tensor> voxel_hash_lookup(Tensor hash_keys, Tensor hash_value
   const std::int64_t capacity = checked_capacity(name, hash_keys, hash_values);
   SPS_CHECK(has_shape(corner_ids, {-1, 8}) && has_shape(points, {-1, 3}), name,
             ": corner_ids and points must have shapes [V, 8] and [N, 3]");
-  hash_keys = contiguous(hash_keys);
-  hash_values = contiguous(hash_values);
-  corner_ids = contiguous(corner_ids);
-  points = contiguous(points);
+  hash_keys = as_contiguous(hash_keys);
+  hash_values = as_contiguous(hash_values);
+  corner_ids = as_contiguous(corner_ids);
+  points = as_contiguous(points);
   const std::int64_t n = points.size(0);
   DeviceScope scope(hash_keys);
   const Tensor rows = empty(hash_keys, {n, 8}, ScalarType::Int);

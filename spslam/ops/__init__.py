@@ -1,8 +1,10 @@
 """Public op library for sparse neural reconstruction, with CPU and CUDA kernels; independent of the rest of spslam."""
 
+from spslam.ops import trusted
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.alpha_composite import Composite, alpha_composite, neus_alpha, pack_rays, volsdf_density
 from spslam.ops.capture_timing import CaptureTiming, measure_capture_timing_
+from spslam.ops.copy_rows import copy_rows_
 from spslam.ops.covisibility import frame_overlap, select_covisible_frames
 from spslam.ops.decoders import Activation, mlp, mlp_num_params
 from spslam.ops.depth_image_alignment import (
@@ -102,6 +104,7 @@ __all__ = [
     "alpha_composite",
     "bilinear_interpolate",
     "compare_depth_images",
+    "copy_rows_",
     "depth_normals",
     "encode_frame_",
     "encode_points",
@@ -149,6 +152,7 @@ __all__ = [
     "tri_plane_interpolate",
     "tri_planes_from_chw",
     "trilinear_interpolate",
+    "trusted",
     "tsdf_integrate_",
     "tsdf_query",
     "tsdf_ray_cast",

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import torch
 
-from spslam.ops import _library  # noqa: F401
+from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.earlier_frames import DepthKeyframes
@@ -96,9 +96,7 @@ def measure_capture_timing_(
     check_tensor(name, "noise", noise, (4,), torch.float32, like=timing.seconds)
     depth_keyframes.check(name, like=timing.seconds)
     check(depth_keyframes.timing is not None, name, "depth_keyframes", "have a timing", None)
-    torch.ops.spslam.measure_capture_timing_(
-        timing.state, timing.seconds, pixels, pose, noise, list(intrinsics), *depth_keyframes.arguments()
-    )
+    trusted.measure_capture_timing_(timing, pixels, pose, intrinsics, noise, depth_keyframes)
 
 
 @torch.library.register_fake("spslam::measure_capture_timing_")

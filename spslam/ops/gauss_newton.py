@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 
-from spslam.ops import _library  # noqa: F401
+from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.earlier_frames import DepthKeyframes, ReferenceImage
@@ -57,7 +57,7 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     """
     check_tensor("predict_pose", "last", last, (7,), torch.float32)
     check_tensor("predict_pose", "before", before, (7,), torch.float32, like=last)
-    return torch.ops.spslam.predict_pose(before, last)
+    return trusted.predict_pose(before, last)
 
 
 def _scalar(default: Any = dataclasses.MISSING, **bound: float) -> Any:
@@ -188,13 +188,8 @@ def track_gauss_newton(
         reference.check(name, like=scene.embeddings)
     if depth_keyframes is not None:
         depth_keyframes.check(name, like=scene.embeddings)
-    return torch.ops.spslam.track_gauss_newton(
-        *scene.arguments(),
-        [pixels, pose] if noise is None else [pixels, pose, noise],
-        *options.arguments(intrinsics),
-        *(([], []) if reference is None else reference.arguments()),
-        *(([], [], []) if depth_keyframes is None else depth_keyframes.arguments()),
-    )
+    found = trusted.track_gauss_newton(scene, pixels, pose, intrinsics, options, noise, reference, depth_keyframes)
+    return found[7:14], found[50:].view(-1, 5), found[14:50].view(6, 6)
 
 
 @public_op()
@@ -249,8 +244,7 @@ def _(before, last):
 
 @torch.library.register_fake("spslam::track_gauss_newton")
 def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *_):
-    pose = frame[1]
-    return pose.new_empty(7), pose.new_empty((integers[_ITERATIONS], 5)), pose.new_empty((6, 6))
+    return frame[1].new_empty(50 + 5 * integers[_ITERATIONS])
 
 
 @torch.library.register_fake("spslam::gauss_newton_poses")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from spslam.ops import _library  # noqa: F401
+from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.launch_graph import LaunchGraph
@@ -203,28 +203,8 @@ def optimize_map_(
     check_count(name, "first_step", first_step)
     last_stamp = first_stamp + iterations - 1
     check(first_stamp >= -(2**31) and last_stamp < 2**31, name, "first_stamp", "fit 32 bits", first_stamp)
-    losses = poses.new_empty(iterations, 5)
-    with torch.no_grad():
-        torch.ops.spslam.optimize_map_(
-            *scene.arguments(),
-            records,
-            poses,
-            frames,
-            *options.arguments(intrinsics),
-            *moments.arguments(),
-            # The enum Integer in csrc/bindings/optimize_map.cpp.
-            [
-                int(pixel_stream),
-                num_pixels,
-                iterations,
-                fixed_frame,
-                first_step,
-                first_stamp,
-                0 if graph is None else graph.number(poses.device),
-            ],
-            losses,
-        )
-    return losses
+    integers = [int(pixel_stream), num_pixels, iterations, fixed_frame, first_step, first_stamp]
+    return trusted.optimize_map_(scene, records, poses, frames, intrinsics, options, moments, integers, graph)
 
 
 def _gradient_dtype(device: torch.device) -> torch.dtype:

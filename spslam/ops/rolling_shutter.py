@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import torch
 
-from spslam.ops import _library  # noqa: F401
+from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
@@ -75,9 +75,7 @@ def rectify_shutter_records_(
     check_intrinsics(name, intrinsics)
     check(height > 1, name, "height", "be above 1", height)
     check(width > 1, name, "width", "be above 1", width)
-    torch.ops.spslam.rectify_shutter_records_(
-        out, records, motion.before, motion.pose, motion.readout, [*intrinsics, motion.seconds], height, width
-    )
+    trusted.rectify_shutter_records_(out, records, motion, intrinsics, height, width)
 
 
 @public_op()
@@ -126,10 +124,7 @@ def rectify_shutter_images_(
     motion.check(name, like=depth)
     check_intrinsics(name, intrinsics)
     check(unit > 0, name, "unit", "be positive", unit)
-    torch.ops.spslam.rectify_shutter_images_(
-        out_depth, out_intensity, depth, intensity, motion.before, motion.pose, motion.readout,
-        [*intrinsics, motion.seconds, unit],
-    )  # fmt: skip
+    trusted.rectify_shutter_images_(out_depth, out_intensity, depth, intensity, motion, intrinsics, unit)
 
 
 @torch.library.register_fake("spslam::rectify_shutter_records_")

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import torch
 
-from spslam.ops import _library  # noqa: F401
+from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.earlier_frames import DepthKeyframes
@@ -82,9 +82,7 @@ def measure_noise_(
     check_tensor(name, "pose", pose, (7,), torch.float32, like=noise.model)
     check_intrinsics(name, intrinsics)
     depth_keyframes.check(name, like=noise.model)
-    torch.ops.spslam.measure_noise_(
-        noise.counts, noise.model, pixels, pose, list(intrinsics), *depth_keyframes.arguments()
-    )
+    trusted.measure_noise_(noise, pixels, pose, intrinsics, depth_keyframes)
 
 
 @torch.library.register_fake("spslam::measure_noise_")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from spslam import ops
@@ -81,11 +82,13 @@ class TriPlanes:
         Raises:
             SpslamError: more than `max_texels` texels are needed. The planes are not changed then.
         """
-        points = points[points.isfinite().all(1)]
-        if len(points) == 0:
+        known = points.cpu().numpy()
+        known = known[np.isfinite(known).all(1)]
+        if len(known) == 0:
             return None
-        low = (points.min(0).values / self.cell_size_m).floor().long().tolist()
-        high = (points.max(0).values / self.cell_size_m).ceil().long().tolist()
+        cell_size_m = known.dtype.type(self.cell_size_m)
+        low = np.floor(known.min(0) / cell_size_m).astype(np.int64).tolist()
+        high = np.ceil(known.max(0) / cell_size_m).astype(np.int64).tolist()
         margin = round(MARGIN_M / self.cell_size_m)
         planes = [self._extended(plane, low, high, margin) for plane in range(3)]
         if planes == [self._rectangle(plane) for plane in range(3)]:

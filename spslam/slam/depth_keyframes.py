@@ -46,8 +46,7 @@ class DepthKeyframeStore:
         """Stores the images uint16 and uint8 [h, w] of frame number `frame`, asynchronously."""
         slots = [0] if frame % INTERVAL else [0, self._slot(frame)]
         for slot in slots:
-            self.images[slot].copy_(depth)
-            self.intensities[slot].copy_(intensity)
+            ops.trusted.copy_rows_([self.images, self.intensities], [slot, slot], [depth, intensity])
             self.frames[slot] = frame
 
     def select(self, frame: int, lost: np.ndarray, poses: torch.Tensor) -> ops.DepthKeyframes | None:

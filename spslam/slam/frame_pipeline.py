@@ -12,7 +12,6 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.errors import DatasetError
 from spslam.prior import load_prior
 from spslam.slam.constraints import Constraints, ConstraintSource
 from spslam.slam.device_events import event_recorder, fetch
@@ -25,7 +24,7 @@ from spslam.slam.image_features import extract_features
 from spslam.slam.mapper import Mapper, MappingTask
 from spslam.slam.multi_map import MultiMap
 from spslam.slam.pixels import FramePixels
-from spslam.slam.poses import pose_tensor
+from spslam.slam.poses import check_first_pose, pose_tensor
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.recovery import Recovery
@@ -39,7 +38,6 @@ from spslam.slam.upload import Upload
 # at its next turn it might see nothing known.
 MIN_MAPPED_SHARE = 0.5
 SETTLED_FRAMES = 3  # trusted frames in a row, this one included, before mapping continues after a lost frame
-MAX_DISTANCE_M = 10_000.0  # a float32 still resolves a millimeter there
 
 # Takes a frame's pose, float64 [4, 4] T_world_camera, or None where it is lost.
 PoseCallback = Callable[[np.ndarray | None], None]
@@ -102,7 +100,7 @@ class FramePipeline:
             DatasetError: as `SlamSystem`; nothing is forgotten then.
         """
         first_pose = self.first_pose if first_pose is None else np.array(first_pose, np.float64)
-        _check_first_pose(first_pose)
+        check_first_pose(first_pose)
         self.first_pose = first_pose
         self.adopt(SlamState.start(self.config, self.camera, first_pose, self._decoder, self.device))
 
@@ -145,30 +143,30 @@ class FramePipeline:
         read = self._receive(frame, events)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
-        shutter = None
-        if self._measures_timing:
-            shutter = self._rectifier.motion(self.state, self.history, frame.depth_time, self.tracker.predict)
-        pixels, constraints = read, Constraints()
-        if shutter is not None and self.state.frames.knows_speed:
-            pixels = self._rectifier.records(read, shutter)
+        pixels, constraints, predicted, shutter = read, Constraints(), None, None
         if not begins_map:
+            predicted = self.tracker.predict(self.state.frames)
+            if self._measures_timing:
+                shutter = self._rectifier.motion(self.state, self.history, frame.depth_time, predicted)
+            if shutter is not None and self.state.frames.knows_speed:
+                pixels = self._rectifier.records(read, shutter)
             gathered = self.constraints.gather(self.history, pixels, frame.depth_time, frame.offsets.color)
             constraints = replace(gathered, shutter=shutter)
-        tracked = self._track(pixels, constraints, number, events)
+        tracked = self._track(pixels, predicted, constraints, number, events)
         shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
         pixels = read if shutter is None else self._rectifier.frame(read, shutter)
         self._store(frame, pixels, constraints, tracked)
         if not begins_map:
-            self._tell(on_pose)
+            self._tell(on_pose, tracked)
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
-            self._tell(on_pose)
+            self._tell(on_pose, tracked)
         self._keep_features(frame, read, tracked, number, shutter)
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
-            self.global_mapping.after_frame(number, pixels, tracked.matrix())
-        pose = self._last_pose()
+            self.global_mapping.after_frame(number, pixels, tracked.matrix)
+        pose = self._pose(tracked)
         iterations, loss = self._optimize(begins_map, defer_mapping, events) if is_mapped else (0, None)
         if defer_mapping:
             loops = self._take_up_ready(number)
@@ -273,8 +271,16 @@ class FramePipeline:
         events.upload = (frame.pixels.begin, frame.pixels.end)
         return frame.pixels.received()
 
-    def _track(self, pixels: FramePixels, constraints: Constraints, number: int, events: FrameEvents) -> TrackedFrame:
-        if not self._has_map:
+    def _track(
+        self,
+        pixels: FramePixels,
+        predicted: torch.Tensor | None,
+        constraints: Constraints,
+        number: int,
+        events: FrameEvents,
+    ) -> TrackedFrame:
+        """Finds the pose; `predicted` is None where there is no map yet."""
+        if predicted is None:
             first = pose_tensor(self.first_pose, self.device)
             return TrackedFrame.untracked(first, lost=self._has_too_little_depth(pixels))
         begin = self._record()
@@ -282,7 +288,6 @@ class FramePipeline:
             has_depth = not self._has_too_little_depth(pixels)
             tracked = self._other_maps.find_camera(pixels, number, self.history.noise, has_depth)
         else:
-            predicted = self.tracker.predict(self.state.frames)
             tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints)
         events.tracking = (begin, self._record())
         return tracked
@@ -360,15 +365,19 @@ class FramePipeline:
             events.mapping = (events.encode[1], self._record())
         return iterations, None if losses is None else fetch(losses[0])
 
-    def _last_pose(self) -> torch.Tensor | None:
-        """The newest frame's pose float32 [7], on its way to the CPU; None where it is lost."""
-        return None if self.state.frames.is_lost(-1) else fetch(self.state.frames.poses[-1])
+    def _pose(self, tracked: TrackedFrame) -> np.ndarray | torch.Tensor | None:
+        """The newest frame's pose, float64 [4, 4], or float32 [7] on its way to the CPU; None where it is lost."""
+        if self.state.frames.is_lost(-1):
+            return None
+        return tracked.matrix if tracked.is_on_host else fetch(self.state.frames.poses[-1])
 
-    def _tell(self, on_pose: PoseCallback | None) -> None:
-        if on_pose is not None:
-            pose = self._last_pose()
+    def _tell(self, on_pose: PoseCallback | None, tracked: TrackedFrame) -> None:
+        if on_pose is None:
+            return
+        pose = self._pose(tracked)
+        if isinstance(pose, torch.Tensor):
             self._record().wait()
-            on_pose(pose_matrix(pose))
+        on_pose(pose_matrix(pose))
 
     def _has_too_little_depth(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to determine a pose."""
@@ -383,12 +392,3 @@ class FramePipeline:
             return not self.state.frames.is_lost(-1)
         is_wanted = self._is_mapping_turn(number) or tracked.fit.inlier_share < MIN_MAPPED_SHARE
         return is_wanted and not self.state.frames.any_lost(SETTLED_FRAMES)
-
-
-def _check_first_pose(pose: np.ndarray) -> None:
-    distance = float(np.linalg.norm(pose[:3, 3]))
-    if not distance <= MAX_DISTANCE_M:
-        raise DatasetError(
-            f"the first pose must lie within {MAX_DISTANCE_M / 1000:.0f} km of the world's origin, got "
-            f"{distance / 1000:.0f} km; scene.first_pose=identity starts at the origin instead"
-        )

@@ -41,7 +41,7 @@ class FrameReport:
         loss: total loss of the last mapping iteration; None where there was none.
         upload_ms: copying it to the device, beside other work; 0 on the CPU.
         wait_ms: time in which the device was idle because the frame had not been read yet.
-        tracking_ms: predicting and finding its pose.
+        tracking_ms: finding its pose.
         encode_ms: allocation, encoding and fusion; 0 where the frame was not mapped.
         mapping_ms: joint optimization; 0 where there was none.
         other_ms: the rest of the time from when the frame was requested until it was done.
@@ -75,12 +75,11 @@ class FrameReport:
 
     def log_row(self) -> dict[str, Any]:
         """All fields but the pose in one flat JSON object, those of `fit` among them; None for NaN, unknown to JSON."""
-        row = asdict(replace(self, pose=None))
-        del row["pose"]
-        row["loops"] = list(row["loops"])
-        flat = {**row, **row.pop("fit")}
+        flat = {**vars(self), "loops": [asdict(loop) for loop in self.loops], **vars(self.fit)}
         return {
-            name: None if isinstance(x, float) and math.isnan(x) else x for name, x in flat.items() if name != "fit"
+            name: None if isinstance(x, float) and math.isnan(x) else x
+            for name, x in flat.items()
+            if name not in ("fit", "pose")
         }
 
     def __repr__(self) -> str:
@@ -139,14 +138,14 @@ class PendingReport:
         events: of the stages.
         host_wait_ms: how long the host waited for the frame to be read.
         loss: float32 [] in page-locked memory, on its way there; None where there is none.
-        pose: float32 [7] likewise; None where the frame is lost.
+        pose: float64 [4, 4] T_world_camera, or float32 [7] on its way as the loss; None where the frame is lost.
     """
 
     report: FrameReport
     events: FrameEvents
     host_wait_ms: float
     loss: torch.Tensor | None
-    pose: torch.Tensor | None = None
+    pose: np.ndarray | torch.Tensor | None = None
 
     def is_done(self) -> bool:
         """Whether `result()` would return at once."""
@@ -160,9 +159,11 @@ class PendingReport:
         return replace(self.report, loss=loss, pose=pose_matrix(self.pose), **times)
 
 
-def pose_matrix(pose: torch.Tensor | None) -> np.ndarray | None:
-    """float64 [4, 4] of a pose float32 [7] on the CPU; None of None."""
-    return None if pose is None else pose7_to_matrix(pose.numpy().astype(np.float64))
+def pose_matrix(pose: np.ndarray | torch.Tensor | None) -> np.ndarray | None:
+    """float64 [4, 4] of a pose float32 [7] on the CPU; a copy of one that is a matrix already; None of None."""
+    if isinstance(pose, torch.Tensor):
+        return pose7_to_matrix(pose.numpy().astype(np.float64))
+    return None if pose is None else pose.copy()
 
 
 def _length_ms(stage: tuple[DeviceEvent, DeviceEvent] | None) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from spslam import ops
 from spslam.camera import Camera
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.geometry import pose7_to_matrix
@@ -145,8 +146,9 @@ class FrameTable:
         if self._count == len(self._columns["poses"]):
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._set_columns({name: _with_capacity(column, capacity) for name, column in self._columns.items()})
-        self._columns["poses"][self._count] = pose
-        self._columns["depth_thumbnails"][self._count] = depth_thumbnail
+        tables = [self._columns["poses"], self._columns["depth_thumbnails"]]
+        rows = [pose.to(tables[0]), depth_thumbnail.to(tables[1])]
+        ops.trusted.copy_rows_(tables, [self._count] * 2, rows)
         values: dict[str, Any] = {
             "timestamps": timestamp,
             "depth_times": timestamp + offsets.depth,

@@ -85,16 +85,18 @@ class Mapper:
         """Selects frames and resets the optimizer for an optimization that `advance` makes; None if there is none."""
         if iterations == 0 or state.scene.volume.num_voxels == 0:
             return None
-        if not bool(state.usable.any()):
+        usable = state.usable
+        if not bool(usable.any()):
             return None
-        return self.begin_on(state, self._select(state), iterations)
+        return self.begin_on(state, self._select(state, usable), iterations)
 
     def begin_on(self, state: SlamState, frames: torch.Tensor, iterations: int) -> MappingTask:
         """As `begin`, of an optimization over given frames, int64 [n] rows; some frame must have pixels and a pose."""
         if self.config.mapping.reset_moments:
             _reset(state)
         # The first usable frame is kept fixed: it defines the world frame.
-        return MappingTask(frames, len(state.frames) - 1, int(state.usable.nonzero()[0, 0]), iterations)
+        first_usable = int(state.usable.numpy().argmax())
+        return MappingTask(frames, len(state.frames) - 1, first_usable, iterations)
 
     def advance(self, state: SlamState, task: MappingTask, iterations: int) -> torch.Tensor:
         """Makes the next iterations of a task.
@@ -112,7 +114,7 @@ class Mapper:
             render_options(config, ops.RandomStream.MAPPING_RAYS, task.newest),
             iteration=task.done,
         )
-        losses = ops.optimize_map_(
+        losses = ops.trusted.optimize_map_(
             state.scene.view(),
             state.pixels.records,
             state.frames.poses,
@@ -120,12 +122,15 @@ class Mapper:
             self.intrinsics,
             options,
             self._moments(state),
-            num_pixels=config.mapping.pixels,
-            iterations=iterations,
-            fixed_frame=task.fixed_frame,
-            first_step=state.steps + 1,
-            first_stamp=state.stamp + 1,
-            graph=self._graph,
+            (
+                int(ops.RandomStream.MAPPING_PIXELS),
+                config.mapping.pixels,
+                iterations,
+                task.fixed_frame,
+                state.steps + 1,
+                state.stamp + 1,
+            ),
+            self._graph,
         )
         task.done += iterations
         state.steps += iterations
@@ -147,10 +152,10 @@ class Mapper:
             else None,
         )
 
-    def _select(self, state: SlamState) -> torch.Tensor:
+    def _select(self, state: SlamState, usable: torch.Tensor) -> torch.Tensor:
         frames = state.frames
         return select_frames(
-            state.pixels.records, frames.poses, frames.depth_thumbnails, state.usable, self.camera, self.config
+            state.pixels.records, frames.poses, frames.depth_thumbnails, usable, self.camera, self.config
         )
 
 
@@ -169,6 +174,7 @@ def _decoder(
 
 
 def _reset(state: SlamState) -> None:
-    for moments in state.moments.values():
-        moments.reset()
+    past = [each for moments in state.moments.values() for each in (moments.first, moments.second)]
+    if past:
+        torch._foreach_zero_(past)
     state.steps = 0

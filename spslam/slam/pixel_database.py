@@ -5,6 +5,7 @@ import mmap
 import numpy as np
 import torch
 
+from spslam import ops
 from spslam.errors import SpslamError
 
 RECORD_BYTES = 12
@@ -99,7 +100,8 @@ class PixelDatabase:
         self.num_frames += 1
         if len(records):
             repeated = records.repeat(-(-count // len(records)), 1) if len(records) < count else records
-            self.records[-1].copy_(repeated[:count], non_blocking=True)
+            kept = (repeated if len(repeated) == count else repeated[:count]).to(self._words.device, non_blocking=True)
+            ops.trusted.copy_rows_([self.records], [self.num_frames - 1], [kept])
         else:
             self.records[-1].zero_()
         self._has_pixels[self.num_frames - 1] = len(records) > 0

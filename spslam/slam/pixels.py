@@ -5,6 +5,7 @@ c is the foreshortening n . d times 128 (n the surface normal, d the ray directi
 turns a depth difference along the ray into a distance to the surface's tangent plane.
 """
 
+import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -85,6 +86,12 @@ class FramePixels:
     def holding(self, buffer: torch.Tensor) -> "FramePixels":
         """The same in another buffer, to which the words were copied."""
         return replace(self, buffer=buffer)
+
+    def having(self, **views: torch.Tensor) -> "FramePixels":
+        """The same, but for views by their names, which are tensors of their own; the buffer is as it was read."""
+        other = copy.copy(self)
+        other.__dict__.update(views)
+        return other
 
 
 def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixels:

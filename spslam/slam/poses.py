@@ -3,7 +3,20 @@
 import numpy as np
 import torch
 
+from spslam.errors import DatasetError
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
+
+MAX_DISTANCE_M = 10_000.0  # a float32 still resolves a millimeter there
+
+
+def check_first_pose(pose: np.ndarray) -> None:
+    """Raises DatasetError where a system can't begin at a pose float64 [4, 4]: too far from the world's origin."""
+    distance = float(np.linalg.norm(pose[:3, 3]))
+    if not distance <= MAX_DISTANCE_M:
+        raise DatasetError(
+            f"the first pose must lie within {MAX_DISTANCE_M / 1000:.0f} km of the world's origin, got "
+            f"{distance / 1000:.0f} km; scene.first_pose=identity starts at the origin instead"
+        )
 
 
 def pose_tensor(matrix: np.ndarray, device: torch.device) -> torch.Tensor:

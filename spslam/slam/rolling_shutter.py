@@ -1,6 +1,5 @@
 """Frames of a rolling shutter, as of their middle row's moment; see `spslam.ops.rolling_shutter`."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from spslam.camera import Camera
 from spslam.pose_graph import rotation_vectors
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.frame_history import FrameHistory
-from spslam.slam.frame_table import FrameTable
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import pose_matrix
@@ -33,13 +31,14 @@ class ShutterRectifier:
     def __init__(self, camera: Camera, max_depth_m: float):
         self._camera, self._unit = camera, depth_unit(max_depth_m)
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+        self._image_intrinsics = depth_image_intrinsics(camera)
 
     @staticmethod
     def motion(
         state: SlamState,
         history: FrameHistory,
         depth_time: float,
-        predict: Callable[[FrameTable], torch.Tensor],
+        predicted: torch.Tensor,
     ) -> ops.ShutterMotion | None:
         """How the camera is predicted to move while the next frame is read; None where that does not matter.
 
@@ -47,37 +46,33 @@ class ShutterRectifier:
             state: before that frame.
             history: of the state.
             depth_time: when the frame's depth image was taken, s.
-            predict: the next pose after those of a table.
+            predicted: float32 [7], the next pose.
         """
         frames, readout = state.frames, state.noise.readout
         motion = history.motion(len(frames), depth_time)
         if motion.row < 0 or (readout.device.type == "cpu" and float(readout) == 0):
             return None
         # A copy: the frame itself changes the estimate before its features are kept.
-        return ops.ShutterMotion(frames.poses[-1].clone(), predict(frames), motion.seconds, readout.clone())
+        return ops.ShutterMotion(frames.poses[-1], predicted, motion.seconds, readout.clone())
 
     def records(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
         """The frame with its records rectified; images, normals and thumbnail are as they were read."""
-        rectified = pixels.holding(pixels.buffer.clone())
-        if pixels.count and min(self._camera.height, self._camera.width) > 1:
-            size = {"height": self._camera.height, "width": self._camera.width}
-            ops.rectify_shutter_records_(rectified.records, pixels.records, motion, self._intrinsics, **size)
-        return rectified
+        height, width = self._camera.height, self._camera.width
+        if pixels.count == 0 or min(height, width) < 2:
+            return pixels
+        records = torch.empty_like(pixels.records)
+        ops.trusted.rectify_shutter_records_(records, pixels.records, motion, self._intrinsics, height, width)
+        return pixels.having(records=records)
 
     def frame(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
         """The frame with its records and images rectified."""
         rectified = self.records(pixels, motion)
-        if min(pixels.depth_image_shape) > 1:
-            images = pixels.depth_image, pixels.intensity_image
-            ops.rectify_shutter_images_(
-                rectified.depth_image,
-                rectified.intensity_image,
-                *images,
-                motion,
-                depth_image_intrinsics(self._camera),
-                unit=self._unit,
-            )
-        return rectified
+        if min(pixels.depth_image_shape) < 2:
+            return rectified
+        images = pixels.depth_image, pixels.intensity_image
+        depth, intensity = (torch.empty_like(image) for image in images)
+        ops.trusted.rectify_shutter_images_(depth, intensity, *images, motion, self._image_intrinsics, self._unit)
+        return rectified.having(depth_image=depth, intensity_image=intensity)
 
     def features(self, features: ImageFeatures, motion: ops.ShutterMotion) -> ImageFeatures:
         """Image features of the frame as it was read, rectified; waits for the device."""
@@ -89,7 +84,7 @@ class ShutterRectifier:
         linear = pose[:3, :3].T @ (pose[:3, 3] - before[:3, 3]) / motion.seconds
         if max(np.linalg.norm(angular), np.linalg.norm(linear)) * abs(readout) > MAX_READOUT_MOTION:
             return features
-        k, height = depth_image_intrinsics(self._camera), -(-self._camera.height // depth_image_step(self._camera))
+        k, height = self._image_intrinsics, -(-self._camera.height // depth_image_step(self._camera))
         positions = features.positions.astype(np.float64)
         known = features.points[:, 2:] > 0
         rays = np.concatenate([(positions - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(positions), 1))], 1)

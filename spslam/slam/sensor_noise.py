@@ -45,8 +45,10 @@ class SensorNoiseEstimate:
         """Takes account of a frame at a trusted pose, float32 [7]; asynchronously."""
         if depth_keyframes.timing is not None:
             records = pixels.records[:TIMING_PIXELS]
-            ops.measure_capture_timing_(self._timing, records, pose, self._intrinsics, self.model, depth_keyframes)
-        ops.measure_noise_(self._noise, pixels.records[:PIXELS], pose, self._intrinsics, depth_keyframes)
+            ops.trusted.measure_capture_timing_(
+                self._timing, records, pose, self._intrinsics, self.model, depth_keyframes
+            )
+        ops.trusted.measure_noise_(self._noise, pixels.records[:PIXELS], pose, self._intrinsics, depth_keyframes)
         self._fix_depth()
 
     def tensors(self) -> dict[str, torch.Tensor]:

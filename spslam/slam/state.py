@@ -74,8 +74,7 @@ class Moments:
 
     def reset(self) -> None:
         """Forgets the past steps."""
-        self.first.zero_()
-        self.second.zero_()
+        torch._foreach_zero_([self.first, self.second])
 
 
 @dataclass
@@ -193,7 +192,7 @@ class SlamState:
 
     def cover_planes(self, bounds: torch.Tensor) -> None:
         """Grows the planes to cover surface within bounds float32 [2, 3], and what optimizes them with them."""
-        margin = torch.tensor([[-1.0], [1.0]]) * self.scene.settings.truncation_m
-        moved = self.scene.planes.cover(bounds + margin)
+        margin = np.array([[-1], [1]], np.float32) * np.float32(self.scene.settings.truncation_m)
+        moved = self.scene.planes.cover(torch.from_numpy(bounds.numpy() + margin))
         if moved is not None and "texels" in self.moments:
             self.moments["texels"].move_rows(moved, len(self.scene.planes.texels))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -39,6 +40,11 @@ class TrackingProblem:
     predicted: torch.Tensor
     frame: int
     constraints: Constraints = Constraints()
+
+    @cached_property
+    def predicted_numbers(self) -> list[float]:
+        """The seven numbers of `predicted`; waits for the device."""
+        return self.predicted.tolist()
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,8 @@ class Tracker:
         """The next pose at constant velocity, float32 [7]; the last pose after one frame only, or a lost one."""
         if not frames.knows_speed:
             return frames.poses[-1].clone()
-        return ops.predict_pose(frames.poses[-2], frames.poses[-1])
+        poses = frames.poses
+        return ops.trusted.predict_pose(poses[-2], poses[-1])
 
     def track(self, problem: TrackingProblem) -> PoseEstimate:
         """Optimizes the pose from the predicted one, with the configured optimizer."""
@@ -122,7 +129,7 @@ class Tracker:
         self, problem: TrackingProblem, start: torch.Tensor, iterations: int, kernel_start_m: float
     ) -> PoseEstimate:
         tracking = self.config.tracking
-        pose, stats, hessian = ops.track_gauss_newton(
+        found = ops.trusted.track_gauss_newton(
             problem.scene.view(),
             problem.records,
             start,
@@ -141,22 +148,24 @@ class Tracker:
                 held_information=HELD_INFORMATION,
                 tf32=self.config.precision == "tf32",
             ),
-            noise=problem.constraints.noise,
-            reference=problem.constraints.reference,
-            depth_keyframes=problem.constraints.depth_keyframes_of(iterations),
+            problem.constraints.noise,
+            problem.constraints.reference,
+            problem.constraints.depth_keyframes_of(iterations),
         )
         # Waits for the device: whether the pose is trusted decides what is done next.
-        numbers = torch.cat([problem.predicted, pose, stats[-1], hessian.view(-1)]).tolist()
-        mean_square, inlier_share, _, _, mean_robust_weight = numbers[14:19]
-        error_cm, error_deg = prediction_error(numbers[:7], numbers[7:14])
+        numbers = found.tolist()
+        start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], numbers[14:50]
+        mean_square, inlier_share, _, _, mean_robust_weight = numbers[-5:]
+        predicted = start_numbers if start is problem.predicted else problem.predicted_numbers
+        error_cm, error_deg = prediction_error(predicted, pose_numbers)
         fit = Fit(
             residual_cm=100 * math.sqrt(max(mean_square, 0.0)),
             inlier_share=inlier_share,
             mean_robust_weight=mean_robust_weight,
-            min_eigenvalue=min_eigenvalue(numbers[19:], tracking.pixels),
+            min_eigenvalue=min_eigenvalue(hessian, tracking.pixels),
             prediction_error_cm=error_cm,
             prediction_error_deg=error_deg,
         )
         variance = max(mean_square, LEAST_DEVIATION_M**2) * tracking.pixels / INDEPENDENT_PIXELS
-        information = np.array(numbers[19:]).reshape(6, 6) / variance
-        return PoseEstimate(pose, iterations, fit, information, tuple(numbers[7:14]))
+        information = np.array(hessian).reshape(6, 6) / variance
+        return PoseEstimate(found[7:14], iterations, fit, information, tuple(pose_numbers))

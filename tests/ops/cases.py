@@ -284,6 +284,7 @@ CASES = {
     "track_adam": Case(scene_cases.track_adam),
     "optimize_map_": Case(scene_cases.optimize_map),
     "predict_pose": Case(scene_cases.predict),
+    "copy_rows_": Case(scene_cases.copy_rows),
     "projective_icp": Case(scene_cases.icp),
     "frame_overlap": Case(scene_cases.overlap),
     "select_covisible_frames": Case(scene_cases.select),

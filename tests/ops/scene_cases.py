@@ -177,6 +177,14 @@ def predict(generator, device, n):
     return dict(before=POSE.to(device), last=(POSE + torch.tensor([0, 0, 0, 0, 0.1, 0, 0])).to(device))
 
 
+def copy_rows(generator, device, n):
+    tables = [uniform(generator, n + 1, 7), torch.zeros(4, 3, dtype=torch.int32)]
+    values = [uniform(generator, 7), torch.ones(3, dtype=torch.int32)]
+    return dict(
+        tables=[table.to(device) for table in tables], rows=[n, 2], values=[value.to(device) for value in values]
+    )
+
+
 def icp(generator, device, n):
     vertices = uniform(generator, 6, 8, 3) + torch.tensor([-0.5, -0.5, 1.0])
     normals = torch.nn.functional.normalize(normal(generator, 6, 8, 3), dim=-1)

@@ -72,7 +72,8 @@ class GlobalMapping:
         self._worker.submit(importlib.import_module, "scipy.sparse.linalg")
         self._running: Future[Any] | None = None  # None also after the state was loaded
         self._abandoned = threading.Event()  # of the map that is being made again
-        self._reference: tuple[int, np.ndarray] | None = None  # the newest keyframe's number and pose
+        # The newest keyframe's number, the state's stamp when its pose was read, and that pose.
+        self._reference: tuple[int, int, np.ndarray] | None = None
         self._coming: tuple[int, torch.Tensor, DeviceEvent] | None = None  # the same on its way to the host
         self._next = 0  # number of the frame at which a live run may begin another solution
         self._taken_up = 0  # number of the frame after which it took up something last
@@ -132,7 +133,7 @@ class GlobalMapping:
 
     def before_tracking(self) -> None:
         """Sends the newest keyframe's pose to the host, for `after_frame`: tracking waits for the device anyway."""
-        newest = self._store.newest
+        newest, self._coming = self._store.newest, None
         if newest is not None and not self._knows_last_pose():
             pose = fetch(self._state.frames.poses[newest])
             self._coming = newest, pose, event_recorder(self._state.scene.device)()
@@ -154,7 +155,7 @@ class GlobalMapping:
             moved = inverse(known) @ pose
             relocalized = bool(state.frames.lost[last:number].any()) or last < state.frames.opened
             store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(moved, relocalized))
-            self._reference = number, pose
+            self._reference = number, state.stamp, pose
 
     def newest_pose(self) -> np.ndarray:
         """float64 [4, 4] T_world_camera of the newest keyframe; identity where there is none."""
@@ -229,9 +230,10 @@ class GlobalMapping:
             store.begun = store.target = None
 
     def _knows_last_pose(self) -> bool:
-        """Whether the newest keyframe's pose is as it was last read; mapping may have moved it."""
-        is_read = self._reference is not None and self._reference[0] == self._store.newest
-        return is_read and self._config.mapping.pose_rate == 0
+        """Whether the newest keyframe's pose is as it was last read: only mapping moves it."""
+        if self._reference is None or self._reference[0] != self._store.newest:
+            return False
+        return self._reference[1] == self._state.stamp or self._config.mapping.pose_rate == 0
 
     def _last_pose(self, newest: int) -> np.ndarray:
         """float64 [4, 4] T_world_camera of the newest keyframe, that of frame `newest`."""
@@ -241,8 +243,8 @@ class GlobalMapping:
                 sent.wait()
             else:
                 pose = self._state.frames.poses[newest].cpu()
-            self._reference = newest, pose7_to_matrix(pose.double().numpy())
-        return self._reference[1]
+            self._reference = newest, self._state.stamp, pose7_to_matrix(pose.double().numpy())
+        return self._reference[2]
 
     def _is_far(self, known: np.ndarray, pose: np.ndarray) -> bool:
         """Whether a pose is to be a keyframe's, `known` being that of the newest one; every frame asks."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -51,9 +52,15 @@ class TrackedFrame:
         """A frame at a given pose, of which nothing was measured."""
         return cls(pose, 0, Fit(), math.nan, lost)
 
+    @property
+    def is_on_host(self) -> bool:
+        """Whether the pose was read already, so that nothing waits for the device to know it."""
+        return self.on_host is not None and self.on_host[0] is self.pose
+
+    @cached_property
     def matrix(self) -> np.ndarray:
         """The pose float64 [4, 4]; waits for the device if it was not read already."""
-        if self.on_host is not None and self.on_host[0] is self.pose:
+        if self.on_host is not None and self.is_on_host:
             return pose7_to_matrix(np.array(self.on_host[1]))
         return pose7_to_matrix(self.pose.cpu().double().numpy())
 

@@ -1,0 +1,50 @@
+// Rows of tables overwritten, many in one call: a frame that is stored is a handful of copies, each a few microseconds.
+#include "bindings/common.h"
+
+namespace spslam::bindings {
+namespace {
+
+constexpr char kName[] = "copy_rows_";
+
+bool is_beside(const Tensor& tensor, const Tensor& other) {
+  return tensor.is_cpu() == other.is_cpu() && tensor.get_device_index() == other.get_device_index();
+}
+
+// Copies to one row; the tensors must outlive the copy's launch.
+void copy_row(const Context& context, const Tensor& table, std::int64_t row, const Tensor& value) {
+  SPS_CHECK(table.dim() == value.dim() + 1 && table.is_contiguous() && table.scalar_type() == value.scalar_type(),
+            kName, ": each table must be contiguous, of the dtype of its value and with one more axis");
+  SPS_CHECK(row >= 0 && row < table.size(0), kName, ": rows must be in [0, ", table.size(0), "), got ", row);
+  for (std::int64_t axis = 0; axis < value.dim(); ++axis) {
+    SPS_CHECK(table.size(axis + 1) == value.size(axis), kName, ": each value must have the shape of its table's rows");
+  }
+  const std::size_t bytes = static_cast<std::size_t>(value.numel()) * value.element_size();
+  copy_bytes(context, static_cast<char*>(table.mutable_data_ptr()) + static_cast<std::size_t>(row) * bytes,
+             value.const_data_ptr(), bytes);
+}
+
+void copy_rows(std::vector<Tensor> tables, std::vector<std::int64_t> rows, std::vector<Tensor> values) {
+  SPS_CHECK(tables.size() == rows.size() && tables.size() == values.size(), kName,
+            ": tables, rows and values must be as many");
+  if (tables.empty()) return;
+  for (std::size_t i = 0; i < tables.size(); ++i) {
+    SPS_CHECK(is_beside(tables[i], tables[0]) && is_beside(values[i], tables[0]), kName,
+              ": all tensors must be on one device");
+  }
+  DeviceScope scope(tables[0]);
+  for (std::size_t i = 0; i < tables.size(); ++i) copy_row(scope.context, tables[i], rows[i], as_contiguous(values[i]));
+}
+
+}  // namespace
+
+#ifndef SPS_CUDA
+STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
+  m.def("copy_rows_(Tensor(a!)[] tables, int[] rows, Tensor[] values) -> ()");
+}
+#endif
+
+SPS_LIBRARY_IMPL(m) {
+  m.impl("copy_rows_", TORCH_BOX(&copy_rows));
+}
+
+}  // namespace spslam::bindings

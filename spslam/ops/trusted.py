@@ -1,0 +1,149 @@
+"""The ops that each frame of a run calls, without the checks of their arguments, which take as long as the calls.
+
+They are for callers whose arguments come from objects that are right by construction, as `spslam.slam` has them; the
+public op of the same name says what arguments must be, and calls these once it has checked them. The bindings still
+refuse what would have a kernel read or write where nothing is. Nothing is cast in an autocast region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from spslam.ops import _library  # noqa: F401
+
+if TYPE_CHECKING:
+    from spslam.ops.capture_timing import CaptureTiming
+    from spslam.ops.earlier_frames import DepthKeyframes, ReferenceImage
+    from spslam.ops.gauss_newton import GaussNewtonOptions
+    from spslam.ops.launch_graph import LaunchGraph
+    from spslam.ops.optimize_map import MapMoments
+    from spslam.ops.render_step import RenderOptions
+    from spslam.ops.rolling_shutter import ShutterMotion
+    from spslam.ops.scene_view import Intrinsics, SceneView
+    from spslam.ops.sensor_noise import SensorNoise
+
+_NO_REFERENCE: tuple[list, list] = ([], [])
+_NO_KEYFRAMES: tuple[list, list, list] = ([], [], [])
+
+
+def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+    """See `spslam.ops.predict_pose`."""
+    return torch.ops.spslam.predict_pose(before, last)
+
+
+def track_gauss_newton(
+    scene: SceneView,
+    pixels: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    options: GaussNewtonOptions,
+    noise: torch.Tensor | None,
+    reference: ReferenceImage | None,
+    depth_keyframes: DepthKeyframes | None,
+) -> torch.Tensor:
+    """See `spslam.ops.track_gauss_newton`.
+
+    Returns:
+        float32 [50 + 5 iterations], so that the host reads all in one go: the pose that tracking started from, the pose
+        that it found, H and the statistics of each iteration.
+    """
+    return torch.ops.spslam.track_gauss_newton(
+        *scene.arguments(),
+        [pixels, pose] if noise is None else [pixels, pose, noise],
+        *options.arguments(intrinsics),
+        *(_NO_REFERENCE if reference is None else reference.arguments()),
+        *(_NO_KEYFRAMES if depth_keyframes is None else depth_keyframes.arguments()),
+    )
+
+
+def rectify_shutter_records_(
+    out: torch.Tensor, records: torch.Tensor, motion: ShutterMotion, intrinsics: Intrinsics, height: int, width: int
+) -> None:
+    """See `spslam.ops.rectify_shutter_records_`."""
+    torch.ops.spslam.rectify_shutter_records_(
+        out, records, motion.before, motion.pose, motion.readout, [*intrinsics, motion.seconds], height, width
+    )
+
+
+def rectify_shutter_images_(
+    out_depth: torch.Tensor,
+    out_intensity: torch.Tensor,
+    depth: torch.Tensor,
+    intensity: torch.Tensor,
+    motion: ShutterMotion,
+    intrinsics: Intrinsics,
+    unit: float,
+) -> None:
+    """See `spslam.ops.rectify_shutter_images_`."""
+    torch.ops.spslam.rectify_shutter_images_(
+        out_depth, out_intensity, depth, intensity, motion.before, motion.pose, motion.readout,
+        [*intrinsics, motion.seconds, unit],
+    )  # fmt: skip
+
+
+def measure_capture_timing_(
+    timing: CaptureTiming,
+    pixels: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    noise: torch.Tensor,
+    depth_keyframes: DepthKeyframes,
+) -> None:
+    """See `spslam.ops.measure_capture_timing_`."""
+    torch.ops.spslam.measure_capture_timing_(
+        timing.state, timing.seconds, pixels, pose, noise, list(intrinsics), *depth_keyframes.arguments()
+    )
+
+
+def measure_noise_(
+    noise: SensorNoise,
+    pixels: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    depth_keyframes: DepthKeyframes,
+) -> None:
+    """See `spslam.ops.measure_noise_`."""
+    torch.ops.spslam.measure_noise_(
+        noise.counts, noise.model, pixels, pose, list(intrinsics), *depth_keyframes.arguments()
+    )
+
+
+def copy_rows_(tables: Sequence[torch.Tensor], rows: Sequence[int], values: Sequence[torch.Tensor]) -> None:
+    """See `spslam.ops.copy_rows_`; there must be a table."""
+    torch.ops.spslam.copy_rows_(tables, rows, values)
+
+
+def optimize_map_(
+    scene: SceneView,
+    records: torch.Tensor,
+    poses: torch.Tensor,
+    frames: torch.Tensor,
+    intrinsics: Intrinsics,
+    options: RenderOptions,
+    moments: MapMoments,
+    integers: Sequence[int],
+    graph: LaunchGraph | None,
+) -> torch.Tensor:
+    """See `spslam.ops.optimize_map_`.
+
+    Args:
+        scene, records, poses, frames, intrinsics, options, moments, graph: as there.
+        integers: `pixel_stream`, `num_pixels`, `iterations`, `fixed_frame`, `first_step` and `first_stamp`.
+    """
+    losses = poses.new_empty(integers[2], 5)
+    with torch.no_grad():
+        torch.ops.spslam.optimize_map_(
+            *scene.arguments(),
+            records,
+            poses,
+            frames,
+            *options.arguments(intrinsics),
+            *moments.arguments(),
+            # The enum Integer in csrc/bindings/optimize_map.cpp.
+            [*integers, 0 if graph is None else graph.number(poses.device)],
+            losses,
+        )
+    return losses
