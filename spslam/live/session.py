@@ -30,7 +30,7 @@ from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest
 from spslam.run.results import RunInput, write_results
 from spslam.run.session import RunSession
-from spslam.run.threads import kernel_threads_limited, library_threads_limited
+from spslam.run.threads import interpreter_shared, kernel_threads_limited, library_threads_limited
 from spslam.run.warm_up import warm_up
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
@@ -63,7 +63,12 @@ def run_live(
         Exception: what a source of the program's own raised, after the results of the frames before are written.
     """
     device = resolve_device(request.config.device)
-    with library_threads_limited(), kernel_threads_limited(device), explained_failures(device):
+    with (
+        library_threads_limited(),
+        kernel_threads_limited(device),
+        interpreter_shared(),
+        explained_failures(device),
+    ):
         started = time.perf_counter()
         system = SlamSystem(request.config, source.camera, first_pose, device)
         warm_up(request.config, source.camera, device)

@@ -19,7 +19,7 @@ from spslam.run.output_folder import OutputFolder
 from spslam.run.request import RunRequest
 from spslam.run.results import RunInput, write_results
 from spslam.run.session import RunSession, finished_metrics, open_session
-from spslam.run.threads import kernel_threads_limited, library_threads_limited
+from spslam.run.threads import interpreter_shared, kernel_threads_limited, library_threads_limited
 from spslam.run.warm_up import warm_up
 from spslam.slam.system import SlamSystem
 
@@ -107,7 +107,7 @@ def _process(
         torch.cuda.reset_peak_memory_stats(device)
     feed.prepare()
     session.clock.start_s = time.perf_counter() - started
-    with kernel_threads_limited(device):
+    with kernel_threads_limited(device), interpreter_shared():
         RunLoop(system, feed, session, progress, observer).run()
 
 
