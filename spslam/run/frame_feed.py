@@ -60,6 +60,8 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
             with self._fallback():
                 self._process = ReaderProcess.start(dataset, config, start, workers, ahead, uploader)
         self._reader: Prefetcher[PreparedFrame] | ReaderProcess | None = None
+        # The next frame, or what is to be raised instead, where it was taken ahead.
+        self._ahead: tuple[PreparedFrame | DatasetError | None, Exception | None] | None = None
 
     def prepare(self) -> Iterator[PreparedFrame | DatasetError]:
         """Waits until frames can be requested; reads none. Returns the iterator over the frames."""
@@ -79,12 +81,32 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
     def __next__(self) -> PreparedFrame | DatasetError:
         reader = self.prepare()
         requested, started = self._record(), time.perf_counter()
-        item = next(reader)
+        item = self._taken_ahead() or next(reader)
         if isinstance(item, DatasetError):
             return item
         if self._is_frozen(item):
             return DatasetError(f"{self._dataset.describe(item.index)}: {FROZEN}")
         item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
+        return item
+
+    def look_ahead(self) -> None:
+        """Takes the next frame from the reading process, and sends it to the device, if it is there; does not wait.
+
+        What is wrong with it is raised where it is requested.
+        """
+        if self._ahead is None and isinstance(self._reader, ReaderProcess) and self._reader.is_ready():
+            try:
+                self._ahead = next(self._reader), None
+            except Exception as error:
+                self._ahead = None, error
+
+    def _taken_ahead(self) -> PreparedFrame | DatasetError | None:
+        """The frame that was taken ahead; None where none was."""
+        if self._ahead is None:
+            return None
+        (item, error), self._ahead = self._ahead, None
+        if error is not None:
+            raise error
         return item
 
     def _is_frozen(self, item: PreparedFrame) -> bool:

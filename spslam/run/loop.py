@@ -1,6 +1,7 @@
 """The frame loop of a run: frames go to the SLAM system, reports to the log, the state to checkpoints."""
 
 import contextlib
+import functools
 from collections import deque
 from collections.abc import Callable
 
@@ -63,8 +64,11 @@ class RunLoop:
                 with contextlib.suppress(Exception):
                     self._flush_reports(log, wait=True)
                 raise
+            finally:
+                self.system.while_tracking = None
 
     def _process(self, log: RunLog, writer: CheckpointWriter, interruption: Interruption) -> None:
+        self.system.while_tracking = functools.partial(self._work_ahead, log)
         every = self.system.config.run.checkpoint_every
         done = last_saved = self.session.start
         for done, item in enumerate(self.feed, self.session.start + 1):
@@ -99,6 +103,11 @@ class RunLoop:
             self.session.folder.record_skipped(position, item)
             return None
         return self.system.submit(item)
+
+    def _work_ahead(self, log: RunLog) -> None:
+        """What the host does while the device tracks a frame, instead of having it wait later."""
+        self._flush_reports(log)
+        self.feed.look_ahead()
 
     def _flush_reports(self, log: RunLog, wait: bool = False) -> None:
         """Logs the frames that the device has finished; with `wait`, waits for all of them."""

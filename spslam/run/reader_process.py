@@ -125,6 +125,10 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         if self._uploader is not None:
             self._is_locked = self._uploader.lock_pages(self._memory)
 
+    def is_ready(self) -> bool:
+        """Whether the next frame, or what there is instead, is there; the first has to be requested."""
+        return self._has_started and not self._connection.closed and self._connection.poll()
+
     def __next__(self) -> PreparedFrame | DatasetError:
         try:
             return self._receive()

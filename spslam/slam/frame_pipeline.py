@@ -52,6 +52,7 @@ class FramePipeline:
         device: where the map lives.
         first_pose: float64 [4, 4] T_world_camera of the first frame.
         state: everything known between two frames.
+        while_tracking: called in each frame while the device tracks it, for what the host has to do in any case.
         mapping_loss: float32 [] total loss of the last iteration that `optimize_map` made; None before.
     """
 
@@ -88,6 +89,7 @@ class FramePipeline:
         self.first_pose = np.eye(4)
         self._prior = prior
         self.global_mapping: GlobalMapping | None = None
+        self.while_tracking: Callable[[], None] | None = None
         self.reset(first_pose)
 
     def reset(self, first_pose: np.ndarray | None = None) -> None:
@@ -232,7 +234,7 @@ class FramePipeline:
             return TrackedFrame.untracked(predicted.clone(), lost=True)
         constraints = self.constraints.gather(self.history, pixels) if constraints is None else constraints
         problem = TrackingProblem(self.state.scene, pixels.records, predicted, number, constraints)
-        estimate = self.tracker.track(problem)
+        estimate = self.tracker.track(problem, self.while_tracking)
         return self.recovery.resolve(problem, estimate, pixels, self.history, to_be_mapped)
 
     @property

@@ -1,6 +1,7 @@
 """Finds the pose of one frame against the frozen map (section III.D)."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -89,14 +90,19 @@ class Tracker:
         poses = frames.poses
         return ops.trusted.predict_pose(poses[-2], poses[-1])
 
-    def track(self, problem: TrackingProblem) -> PoseEstimate:
-        """Optimizes the pose from the predicted one, with the configured optimizer."""
+    def track(self, problem: TrackingProblem, meanwhile: Callable[[], None] | None = None) -> PoseEstimate:
+        """Optimizes the pose from the predicted one, with the configured optimizer.
+
+        Args:
+            problem: the frame.
+            meanwhile: called once the device has its work, before its result is waited for; only by Gauss-Newton.
+        """
         tracking = self.config.tracking
         first = problem.frame <= tracking.first_frames
         iterations = tracking.first_iterations if first else tracking.iterations
         if tracking.optimizer == "adam":
             return self._track_adam(problem, iterations)
-        return self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m)
+        return self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
         """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
@@ -126,7 +132,12 @@ class Tracker:
         return replace(estimate, pose=pose, iterations=0, numbers=None)
 
     def _gauss_newton(
-        self, problem: TrackingProblem, start: torch.Tensor, iterations: int, kernel_start_m: float
+        self,
+        problem: TrackingProblem,
+        start: torch.Tensor,
+        iterations: int,
+        kernel_start_m: float,
+        meanwhile: Callable[[], None] | None = None,
     ) -> PoseEstimate:
         tracking = self.config.tracking
         found = ops.trusted.track_gauss_newton(
@@ -152,6 +163,8 @@ class Tracker:
             problem.constraints.reference,
             problem.constraints.depth_keyframes_of(iterations),
         )
+        if meanwhile is not None:
+            meanwhile()
         # Waits for the device: whether the pose is trusted decides what is done next.
         numbers = found.tolist()
         start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], numbers[14:50]

@@ -37,6 +37,11 @@ def fail(frame):
     raise ZeroDivisionError("a bug")
 
 
+def fail_second(frame):
+    if frame.index == 1:
+        fail(frame)
+
+
 def has_ended(pid: int) -> bool:
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
@@ -151,6 +156,38 @@ def test_slots_are_freed_when_their_uploads_are_complete(can_lock, notes):
         want = sample_frame(dataset[frame.index], dataset.camera, config)
         assert torch.equal(frame.pixels.pixels.buffer, want.buffer)
     assert uploader.notes == notes
+
+
+def look_ahead(feed):
+    """Waits until there is something to look at."""
+    end = time.monotonic() + PATIENCE_S
+    while not feed.prepare().is_ready():
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+    feed.look_ahead()
+    feed.look_ahead()  # changes nothing: it is held already
+
+
+def test_frames_taken_ahead_are_the_same():
+    with feed_of(Recorded(FRAMES)) as feed:
+        feed.prepare()
+        feed.look_ahead()  # nothing was requested yet
+        indices = [next(feed).index]
+        for _ in range(1, FRAMES):
+            look_ahead(feed)
+            indices.append(next(feed).index)
+        assert indices == list(range(FRAMES))
+        look_ahead(feed)
+        with pytest.raises(StopIteration):
+            next(feed)
+
+
+def test_what_fails_ahead_is_raised_where_it_is_requested():
+    with feed_of(Recorded(FRAMES, fail_second)) as feed:
+        next(feed)
+        look_ahead(feed)
+        with pytest.raises(RuntimeError, match="ZeroDivisionError: a bug"):
+            next(feed)
 
 
 def test_unused_standby_reader_is_ended():

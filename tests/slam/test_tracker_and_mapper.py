@@ -88,6 +88,14 @@ def test_a_frame_near_the_map_is_found(dataset, preset):
     assert np.linalg.norm(result.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
 
 
+def test_the_host_may_work_while_a_frame_is_tracked(dataset):
+    system, states = processed(dataset, 1), []
+    system.while_tracking = lambda: states.append(len(system.state.frames))
+    for i in range(1, 4):
+        system.process(dataset[i])
+    assert states == [1, 2, 3]
+
+
 def test_little_depth_is_lost_without_a_try(dataset):
     system = processed(dataset, 1)
     frame = dataset[1]
