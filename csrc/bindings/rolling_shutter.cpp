@@ -8,6 +8,8 @@ namespace {
 // Places in the ops' lists of numbers; spslam/ops/rolling_shutter.py fills them.
 enum class RecordScalar { kFx, kFy, kCx, kCy, kSeconds, kCount };
 enum class ImageScalar { kFx, kFy, kCx, kCy, kSeconds, kUnit, kCount };
+// Those of the records, the images' camera, seconds and the unit.
+enum class FrameScalar { kFx, kFy, kCx, kCy, kImageFx, kImageFy, kImageCx, kImageCy, kSeconds, kUnit, kCount };
 
 // The tensors must outlive the launch.
 ShutterMotion load_shutter_motion(const char* name, const Tensor& before, const Tensor& pose, const Tensor& readout,
@@ -53,6 +55,26 @@ void rectify_shutter_images(Tensor out_depth, Tensor out_intensity, Tensor depth
       mutable_data<std::uint8_t>(out_intensity));
 }
 
+// Both in one call, to new tensors.
+std::tuple<Tensor, Tensor, Tensor> rectify_shutter_frame(Tensor records, Tensor depth, Tensor intensity, Tensor before,
+                                                         Tensor pose, Tensor readout, std::vector<double> numbers,
+                                                         std::int64_t height, std::int64_t width) {
+  const Scalars<FrameScalar> scalars("rectify_shutter_frame", "scalars", numbers);
+  SPS_CHECK(has_shape(records, {-1, 3}) && depth.dim() == 2, "rectify_shutter_frame: records must have shape [P, 3], ",
+            "depth [H, W]");
+  const std::vector<std::int64_t> size{depth.size(0), depth.size(1)};
+  Tensor out = empty(records, {records.size(0), 3}, ScalarType::Int);
+  Tensor out_depth = empty(depth, size, ScalarType::UInt16);
+  Tensor out_intensity = empty(depth, size, ScalarType::Byte);
+  const double *camera = numbers.data(), *image_camera = camera + 4, seconds = scalars[FrameScalar::kSeconds];
+  rectify_shutter_records(out, records, before, pose, readout, {camera[0], camera[1], camera[2], camera[3], seconds},
+                          height, width);
+  rectify_shutter_images(
+      out_depth, out_intensity, depth, intensity, before, pose, readout,
+      {image_camera[0], image_camera[1], image_camera[2], image_camera[3], seconds, scalars[FrameScalar::kUnit]});
+  return {out, out_depth, out_intensity};
+}
+
 }  // namespace
 
 #ifndef SPS_CUDA
@@ -63,12 +85,16 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
   m.def(
       "rectify_shutter_images_(Tensor(a!) out_depth, Tensor(b!) out_intensity, Tensor depth, Tensor intensity, Tensor "
       "before, Tensor pose, Tensor readout, float[] scalars) -> ()");
+  m.def(
+      "rectify_shutter_frame(Tensor records, Tensor depth, Tensor intensity, Tensor before, Tensor pose, Tensor "
+      "readout, float[] scalars, int height, int width) -> (Tensor, Tensor, Tensor)");
 }
 #endif
 
 SPS_LIBRARY_IMPL(m) {
   m.impl("rectify_shutter_records_", TORCH_BOX(&rectify_shutter_records));
   m.impl("rectify_shutter_images_", TORCH_BOX(&rectify_shutter_images));
+  m.impl("rectify_shutter_frame", TORCH_BOX(&rectify_shutter_frame));
 }
 
 }  // namespace spslam::bindings

@@ -84,6 +84,52 @@ def rectify_shutter_images_(
     )  # fmt: skip
 
 
+def rectify_shutter_frame(
+    records: torch.Tensor,
+    depth: torch.Tensor,
+    intensity: torch.Tensor,
+    motion: ShutterMotion,
+    intrinsics: Intrinsics,
+    size: tuple[int, int],
+    image_intrinsics: Intrinsics,
+    unit: float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Records and images of a frame as `rectify_shutter_records_` and `rectify_shutter_images_` write them, new ones.
+
+    Args:
+        records, depth, intensity, motion, unit: as there.
+        intrinsics: of the images that the records are of.
+        size: rows and columns of these.
+        image_intrinsics: of `depth` and `intensity`.
+    """
+    return torch.ops.spslam.rectify_shutter_frame(
+        records, depth, intensity, motion.before, motion.pose, motion.readout,
+        [*intrinsics, *image_intrinsics, motion.seconds, unit], *size,
+    )  # fmt: skip
+
+
+def measure_frame_(
+    noise: SensorNoise,
+    timing: CaptureTiming,
+    pixels: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    depth_keyframes: DepthKeyframes,
+    pixel_counts: tuple[int, int],
+) -> None:
+    """`measure_capture_timing_` where the keyframes have a timing, and then `measure_noise_`.
+
+    Args:
+        noise, timing, pose, intrinsics, depth_keyframes: as there.
+        pixels: int32 [P, 3] all of the frame.
+        pixel_counts: of how many of these at most times and noise are measured.
+    """
+    torch.ops.spslam.measure_frame_(
+        noise.counts, noise.model, timing.state, timing.seconds, pixels, pose, list(intrinsics), list(pixel_counts),
+        *depth_keyframes.arguments(),
+    )  # fmt: skip
+
+
 def measure_capture_timing_(
     timing: CaptureTiming,
     pixels: torch.Tensor,
@@ -147,3 +193,13 @@ def optimize_map_(
             losses,
         )
     return losses
+
+
+@torch.library.register_fake("spslam::rectify_shutter_frame")
+def _(records, depth, intensity, *_):
+    return torch.empty_like(records), torch.empty_like(depth), torch.empty_like(intensity)
+
+
+@torch.library.register_fake("spslam::measure_frame_")
+def _(counts, noise, state, timing, *_):
+    return None

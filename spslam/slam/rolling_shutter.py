@@ -66,13 +66,19 @@ class ShutterRectifier:
 
     def frame(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
         """The frame with its records and images rectified."""
-        rectified = self.records(pixels, motion)
         if min(pixels.depth_image_shape) < 2:
-            return rectified
-        images = pixels.depth_image, pixels.intensity_image
-        depth, intensity = (torch.empty_like(image) for image in images)
-        ops.trusted.rectify_shutter_images_(depth, intensity, *images, motion, self._image_intrinsics, self._unit)
-        return rectified.having(depth_image=depth, intensity_image=intensity)
+            return self.records(pixels, motion)
+        records, depth, intensity = ops.trusted.rectify_shutter_frame(
+            pixels.records,
+            pixels.depth_image,
+            pixels.intensity_image,
+            motion,
+            self._intrinsics,
+            (self._camera.height, self._camera.width),
+            self._image_intrinsics,
+            self._unit,
+        )
+        return pixels.having(records=records, depth_image=depth, intensity_image=intensity)
 
     def features(self, features: ImageFeatures, motion: ops.ShutterMotion) -> ImageFeatures:
         """Image features of the frame as it was read, rectified; waits for the device."""

@@ -43,12 +43,10 @@ class SensorNoiseEstimate:
 
     def measure(self, pixels: FramePixels, pose: torch.Tensor, depth_keyframes: ops.DepthKeyframes) -> None:
         """Takes account of a frame at a trusted pose, float32 [7]; asynchronously."""
-        if depth_keyframes.timing is not None:
-            records = pixels.records[:TIMING_PIXELS]
-            ops.trusted.measure_capture_timing_(
-                self._timing, records, pose, self._intrinsics, self.model, depth_keyframes
-            )
-        ops.trusted.measure_noise_(self._noise, pixels.records[:PIXELS], pose, self._intrinsics, depth_keyframes)
+        counts = TIMING_PIXELS, PIXELS
+        ops.trusted.measure_frame_(
+            self._noise, self._timing, pixels.records, pose, self._intrinsics, depth_keyframes, counts
+        )
         self._fix_depth()
 
     def tensors(self) -> dict[str, torch.Tensor]:
