@@ -30,8 +30,9 @@ from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest
 from spslam.run.results import RunInput, write_results
 from spslam.run.session import RunSession
-from spslam.run.threads import interpreter_shared, kernel_threads_limited, library_threads_limited
+from spslam.run.threads import kernel_threads_limited, library_threads_limited
 from spslam.run.warm_up import warm_up
+from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 

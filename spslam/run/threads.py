@@ -1,28 +1,12 @@
-"""How many threads libraries and kernels use during a run, and how long one may keep the others from Python."""
+"""How many threads libraries and kernels use during a run."""
 
 import contextlib
-import sys
 from collections.abc import Iterator
 
 import cv2
 import torch
 
 from spslam import ops
-
-# s, for which a thread may hold Python's interpreter while another waits for it. Python's own 5 ms are as long as a
-# frame on a GPU: the loop would wait for them when it comes back from a kernel while the keyframe graph's thread runs.
-INTERPRETER_SHARE_S = 1e-4
-
-
-@contextlib.contextmanager
-def interpreter_shared() -> Iterator[None]:
-    """Has threads hand Python's interpreter to one another early, so that none keeps the frame loop waiting."""
-    interval_s = sys.getswitchinterval()
-    sys.setswitchinterval(min(interval_s, INTERPRETER_SHARE_S))
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(interval_s)
 
 
 @contextlib.contextmanager

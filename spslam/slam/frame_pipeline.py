@@ -21,6 +21,7 @@ from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report, p
 from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
 from spslam.slam.image_features import extract_features
+from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.mapper import Mapper, MappingTask
 from spslam.slam.multi_map import MultiMap
 from spslam.slam.pixels import FramePixels
@@ -126,6 +127,7 @@ class FramePipeline:
             self.global_mapping.close()
             self._other_maps.close()
 
+    @interpreter_shared()
     def submit(
         self, frame: PreparedFrame, on_pose: PoseCallback | None = None, defer_mapping: bool = False
     ) -> PendingReport:

@@ -16,6 +16,7 @@ from spslam.run_folder import RunFolder
 from spslam.scene import Scene
 from spslam.slam.frame_pipeline import FramePipeline, PoseCallback
 from spslam.slam.frame_report import FrameReport
+from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.opened_map import check_settings, load_archive, map_settings, open_map
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.saved_system import SystemSettings, load_state, read_settings, save_system
@@ -35,6 +36,7 @@ class SlamSystem(FramePipeline):
         >>> system.mesh().save("mesh.ply")                              # doctest: +SKIP
     """
 
+    @interpreter_shared()
     def process(
         self, frame: RgbdFrame, on_pose: PoseCallback | None = None, defer_mapping: bool = False
     ) -> FrameReport:
