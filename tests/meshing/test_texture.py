@@ -8,12 +8,13 @@ import pytest
 
 from spslam.errors import DatasetError
 from spslam.meshing import TriangleMesh
-from spslam.meshing.texture import TextureOptions, atlas, texture_mesh
+from spslam.meshing.texture import TextureOptions, atlas, texture_mesh, texturing
+from spslam.meshing.texture.registration import register
 from spslam.meshing.texture.sharpness import sharpness
-from tests.meshing.painted import FLOOR, GRAY, NOISE, SIGN, WALL, frames, mesh_of, pattern
+from spslam.meshing.texture.views import ColorView
+from tests.meshing.painted import CAMERA, FLOOR, GRAY, NOISE, SIGN, WALL, Painted, frames, mesh_of, pattern
 
 TEXEL_M = 0.008
-MIDDLE = np.full((1, 3), 1 / 3)
 CORNER = WALL, FLOOR
 OPTIONS = TextureOptions(NOISE, TEXEL_M)
 
@@ -153,6 +154,42 @@ def test_layers_over_each_other_have_their_own_texels():
     # With two faces at one place one of them would have none.
     assert np.mean(own[areas > 3] == 0) == 0
     assert len(np.unique(texels.places)) == len(texels.places)
+
+
+class Moved(Painted):
+    """Color images that are off by some pixels and turned by a degree, each in its own way."""
+
+    def read(self, index):
+        frame = super().read(index)
+        motion = cv2.getRotationMatrix2D((80, 60), (-1) ** index * 0.8, 1.0)
+        motion[:, 2] += (3 * (-1) ** (index // 2), 2 * (-1) ** (index // 3))
+        size = frame.color.shape[1::-1]
+        return replace(frame, color=cv2.warpAffine(frame.color, motion, size, borderMode=cv2.BORDER_REPLICATE))
+
+
+def test_images_that_are_off_are_brought_to_each_other(monkeypatch):
+    plain = frames(WALL)
+    moved = replace(plain, dataset=Moved((WALL,), plain.poses))
+    mesh = mesh_of(WALL)
+    mesh = replace(mesh, colors=np.rint(pattern(mesh.vertices)).clip(0, 255).astype(np.uint8))
+    points, colors = surface_colors(texture_mesh(mesh, moved, OPTIONS))
+    registered = rms(colors, points)
+    monkeypatch.setattr(texturing, "register", lambda view, places, gray, start: start)
+    points, colors = surface_colors(texture_mesh(mesh, moved, OPTIONS))
+    assert registered < 6 and 1.5 * registered < rms(colors, points)
+
+
+def test_nothing_to_register_by_leaves_images_where_they_are():
+    frame = frames(WALL)[6]
+    view = ColorView(0, frame, CAMERA, np.eye(4), NOISE)
+    v, u = (each.ravel() for each in np.mgrid[20:100:2, 20:140:2])
+    places = np.stack([u, v, np.ones_like(u)], 1).astype(np.float32)
+    start = np.eye(3) + [[0, 0, 0.5], [0, 0, 0], [0, 0, 0]]
+    assert register(view, places, np.full(len(u), 90, np.float32), start) is start
+    assert register(view, places[:50], np.arange(50, dtype=np.float32), start) is start
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)[v, u].astype(np.float32)
+    middle = np.array([79.5, 59.5, 1])
+    assert np.abs(register(view, places, gray, start) @ middle - middle).max() < 0.2
 
 
 def test_sharpness_tells_blur_and_not_contrast():

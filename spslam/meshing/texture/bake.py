@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,6 +17,19 @@ _OWN_WEIGHT = 1e-3
 # Texels looked at at once; some 100 bytes each.
 _CHUNK = 1 << 19
 _ROW = 512  # of the images that points are handed to OpenCV as
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """By what the colors of frames are made to agree.
+
+    Attributes:
+        gains: float64 [F, 3], what the colors of each frame are multiplied by.
+        warps: float64 [F, 3, 3], from (u, v, 1) by the pose to (u, v, 1) in the color image.
+    """
+
+    gains: np.ndarray
+    warps: np.ndarray
 
 
 class ViewWeights:
@@ -54,7 +68,7 @@ def accumulate(
     sets: Sequence[Texels],
     views: Iterable[ColorView],
     weights: ViewWeights,
-    gains: np.ndarray,
+    corrections: Corrections,
 ) -> list[np.ndarray]:
     """Sums of the views' colors at texels.
 
@@ -63,7 +77,7 @@ def accumulate(
         sets: texels.
         views: all frames.
         weights: what frames count.
-        gains: float [F, 3], what the colors of each frame are multiplied by.
+        corrections: of the frames' colors.
 
     Returns:
         float32 [N, 4] for each set: RGB times weights, and weights. Deterministic.
@@ -72,11 +86,12 @@ def accumulate(
     for view in views:
         dense = weights.of(view.number)
         faces = np.flatnonzero((dense > 0)[mesh.faces].any(1))
-        seen = np.concatenate([view.homogeneous(mesh.vertices), dense[:, None]], axis=1)
+        places = warped(view.homogeneous(mesh.vertices), corrections.warps[view.number])
+        seen, gain = np.concatenate([places, dense[:, None]], axis=1), corrections.gains[view.number]
         for texels, total in zip(sets, sums, strict=True):
             for part, counts, rows in _texels_of(texels, faces):
                 corners = seen[mesh.faces[part]]
-                _add(total, rows, _spread(corners, counts, texels.weights[rows]), view.frame.color, gains[view.number])
+                _add(total, rows, _spread(corners, counts, texels.weights[rows]), view.frame.color, gain)
     return sums
 
 
@@ -149,6 +164,15 @@ def _add(total: np.ndarray, rows: np.ndarray, seen: np.ndarray, image: np.ndarra
     added[:, 3] = 1
     added *= counts[:, None]
     total[rows] += added
+
+
+def warped(places: np.ndarray, warp: np.ndarray) -> np.ndarray:
+    """Homogeneous pixel coordinates float32 [N, 3] after a warp [3, 3]."""
+    warp = warp.astype(np.float32)
+    return np.stack(
+        [warp[row, 0] * places[:, 0] + warp[row, 1] * places[:, 1] + warp[row, 2] * places[:, 2] for row in range(3)],
+        axis=1,
+    )
 
 
 def sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -11,9 +11,10 @@ import numpy as np
 from spslam.errors import DatasetError
 from spslam.meshing.frame_fusion import PosedFrames
 from spslam.meshing.mesh import TriangleMesh
-from spslam.meshing.texture.atlas import MOST_PAGE_PX, Atlas, Texels, find_texels, make_atlas
-from spslam.meshing.texture.bake import ViewWeights, accumulate, corner_texels, mixed_colors
+from spslam.meshing.texture.atlas import Atlas, Texels, find_texels, make_atlas
+from spslam.meshing.texture.bake import Corrections, ViewWeights, accumulate, corner_texels, mixed_colors, warped
 from spslam.meshing.texture.exposure import Exposures
+from spslam.meshing.texture.registration import MeanGray, register
 from spslam.meshing.texture.sharpness import sharpness
 from spslam.meshing.texture.textured_mesh import TexturedMesh
 from spslam.meshing.texture.unseen import fitted_to_seen
@@ -48,7 +49,7 @@ class TextureOptions:
 def texture_mesh(
     mesh: TriangleMesh, parts: PosedFrames | Sequence[PosedFrames], options: TextureOptions
 ) -> TexturedMesh:
-    """Bakes the colors of frames into an atlas of a mesh. All frames are read twice.
+    """Bakes the colors of frames into an atlas of a mesh. All frames are read three times.
 
     Args:
         mesh: of these frames, with at least one face. Its colors are taken where no frame saw it.
@@ -62,27 +63,57 @@ def texture_mesh(
         DatasetError: none of the frames can be read.
     """
     parts = [parts] if isinstance(parts, PosedFrames) else parts
-    best = BestViews(len(mesh.vertices), VIEWS + 1)
-    exposures = Exposures(len(mesh.vertices), sum(len(part) for part in parts))
+    survey = _survey(mesh, parts, options.noise)
+    texel_m = options.texel_m or _fine_enough(survey.finest_m, mesh)
+    atlas = make_atlas(mesh, texel_m, options.most_pages)
+    texels, corners = find_texels(atlas), corner_texels(mesh)
+    sets, views = (texels, corners), read_views(parts, options.noise)
+    sums, at_vertices = accumulate(mesh, sets, views, survey.weights, survey.corrections)
+    own = fitted_to_seen(mesh, corners, at_vertices)
+    return _textured(mesh, atlas, _pages(atlas, texels, mixed_colors(mesh, own, texels, sums)), texel_m)
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What frames saw.
+
+    Attributes:
+        weights: what each counts at each vertex.
+        corrections: of their colors.
+        finest_m: float32 [V], edge of the finest pixel on the surface, m; infinite where none saw it.
+    """
+
+    weights: ViewWeights
+    corrections: Corrections
+    finest_m: np.ndarray
+
+
+def _survey(mesh: TriangleMesh, parts: Sequence[PosedFrames], noise: tuple[float, float]) -> _Survey:
+    """Reads all frames: which are best where, how bright they are, and where their colors are."""
+    count = sum(len(part) for part in parts)
+    best, exposures = BestViews(len(mesh.vertices), VIEWS + 1), Exposures(len(mesh.vertices), count)
     finest = np.full(len(mesh.vertices), np.float32(np.inf))
+    warps = np.tile(np.eye(3), (count, 1, 1))
+    mean = MeanGray(mesh.colors)
     read = 0
-    for view in read_views(parts, options.noise):
-        read += 1
+    for view in read_views(parts, noise):
         seen = seen_vertices(mesh, view)
         best.add(view.number, seen.ids, seen.scores * np.float32(sharpness(view.frame.color) ** _SHARPNESS_POWER))
         finest[seen.ids] = np.minimum(finest[seen.ids], seen.footprints_m)
         exposures.add(view, seen)
+        places = view.homogeneous(mesh.vertices[seen.ids])
+        warps[view.number] = register(view, places, mean.gray[seen.ids], warps[view.number])
+        mean.add(view, seen.ids, warped(places, warps[view.number]), seen.scores)
+        read += 1
     if not read:
         names = ", ".join(part.dataset.name for part in parts)
         raise DatasetError(f"{names}: a texture is made of frames, none of which can be read")
-    texel_m = options.texel_m or _fine_enough(finest, mesh)
-    atlas = make_atlas(mesh, texel_m, options.most_pages)
-    texels, corners = find_texels(atlas), corner_texels(mesh)
-    weights, gains = ViewWeights(best), exposures.gains()
-    del best, exposures
-    sums, at_vertices = accumulate(mesh, (texels, corners), read_views(parts, options.noise), weights, gains)
-    own = fitted_to_seen(mesh, corners, at_vertices)
-    return _textured(mesh, atlas, _pages(atlas, texels, mixed_colors(mesh, own, texels, sums)), texel_m)
+    weights, gray = ViewWeights(best), mean.of_views()
+    for view in read_views(parts, noise):
+        ids = np.flatnonzero(weights.of(view.number))
+        places = view.homogeneous(mesh.vertices[ids])
+        warps[view.number] = register(view, places, gray[ids], warps[view.number])
+    return _Survey(weights, Corrections(exposures.gains(), warps), finest)
 
 
 def _fine_enough(finest: np.ndarray, mesh: TriangleMesh) -> float:
