@@ -1,22 +1,27 @@
-"""Colors of fused meshes at views that were held out: spslam's beside Open3D's fusion of the same frames and poses.
+"""Colors of fused meshes at views that were held out: of vertices and of textures, beside Open3D's fusion.
 
-    python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxel 0.01
+    python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxels 0.01 0.005
 
-Of the tracked frames of a finished run every so many-th is held out; the others are fused at the run's poses by both,
-without the map's filling. Both meshes are rendered at the poses of the frames held out, the colors of their vertices
-interpolated, and compared with the images over the pixels that both show: PSNR in dB, mean over the views, and SSIM;
-and PSNR over those of them where both have the frame's depth to 3 cm, as elsewhere the surface is wrong, not its color.
-Coverage is the share of all pixels that a mesh shows. Of Open3D's weight thresholds the one with the better PSNR
-counts. Needs `pip install 'spslam[open3d]'`.
+Of the tracked frames of a finished run every so many-th is held out; the others are fused at the run's poses, without
+the map's filling, by Open3D with the first size of voxels and by spslam with each, with colors of vertices and with a
+texture. All meshes are rendered at the poses of the frames held out and compared with the images over the pixels that
+all of them show: PSNR in dB, mean over the views, and SSIM; PSNR over those of them where all have the frame's depth to
+3 cm, as elsewhere the surface is wrong, not its color; and PSNR ("corrected") after the mesh's image was given another
+gain per channel and moved by an affine warp so that it agrees best with the frame, each mesh by its own: what a
+camera with automatic exposure, or whose color is late, does to the image held out is no error of a mesh. Coverage is
+the share of all pixels that a mesh shows. Of Open3D's weight thresholds the one with the better PSNR counts. Needs
+`pip install 'spslam[open3d]'`.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from experiments.arguments import make_parser
@@ -27,41 +32,67 @@ from spslam.datasets import open_dataset
 from spslam.datasets.base import RgbdFrame
 from spslam.evaluation.image_metrics import psnr_db, ssim
 from spslam.evaluation.run_output import RunOutput
+from spslam.geometry import transform_points
 from spslam.meshing import TriangleMesh
 from spslam.meshing.frame_fusion import FusionOptions, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
-from spslam.meshing.render import render_colors
+from spslam.meshing.render import rasterize, render_colors
+from spslam.meshing.shading import barycentric, cross
+from spslam.meshing.texture import TexturedMesh, TextureOptions, texture_mesh
+from spslam.meshing.texture.registration import register
+from spslam.meshing.texture.views import ColorView
 from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.run.mesh import measured_noise, posed_frames
 from spslam.trajectory import Trajectory
 
 MOST_VIEWS, MEMORY_MB = 40, 4000
 SAME_M = 0.03
-FIGURES = ("psnr_db", "ssim", "same_db", "coverage")
+FIGURES = ("psnr_db", "ssim", "same_db", "corrected_db", "coverage")
+_EVERY_PX = 3  # of the pixels that a view is registered by
 
 
 def main() -> None:
-    """Parses the arguments; prints a row per run."""
+    """Parses the arguments; prints a table per run."""
     args = _parser().parse_args()
-    print("| run | views | PSNR dB | SSIM | PSNR of the same surface | coverage % |\n|---|---|---|---|---|---|")
     for folder in args.runs:
-        views, own, other = measure(RunOutput.read(folder), args)
-        cells = [f"{own[name]:.2f} / {other[name]:.2f}" for name in FIGURES]
-        print(f"| {folder.name} | {views} | {' | '.join(cells)} |", flush=True)
+        run = RunOutput.read(folder)
+        views, figures = measure(run, args)
+        print(f"\n{folder.name}, {views} views\n")
+        print(
+            "| mesh | PSNR dB | SSIM | PSNR of the same surface | corrected PSNR | coverage % |\n"
+            "|---|---|---|---|---|---|"
+        )
+        for name, row in figures.items():
+            print(f"| {name} | {' | '.join(f'{row[figure]:.2f}' for figure in FIGURES)} |", flush=True)
 
 
-def measure(run: RunOutput, args: argparse.Namespace) -> tuple[int, dict[str, float], dict[str, float]]:
-    """The number of views, and the figures of spslam's mesh and of Open3D's at them."""
+def measure(run: RunOutput, args: argparse.Namespace) -> tuple[int, dict[str, dict[str, float]]]:
+    """The number of views, and the figures of each mesh at them."""
     dataset = open_dataset(load_config(run.folder.config).dataset)
     fused, held = split(run.trajectory, args.every)
     frames = posed_frames(dataset, fused)
-    options = FusionOptions(args.voxel, MEMORY_MB, measured_noise(run.metrics) or DEFAULT_NOISE)
-    own = extract_fused_mesh(fuse_frames(frames, options))
-    others = fuse(dataset, replace(run, trajectory=fused), args.voxel)
+    noise = measured_noise(run.metrics) or DEFAULT_NOISE
+    meshes: dict[str, TriangleMesh | TexturedMesh] = {}
+    for threshold, mesh in enumerate(
+        [] if args.no_open3d else fuse(dataset, replace(run, trajectory=fused), args.voxels[0])
+    ):
+        meshes[f"Open3D {1e3 * args.voxels[0]:g} mm, weights {threshold}"] = mesh
+    for voxel in args.voxels:
+        mesh = extract_fused_mesh(fuse_frames(frames, FusionOptions(voxel, MEMORY_MB, noise)))
+        meshes[f"vertices {1e3 * voxel:g} mm"] = mesh
+        started = time.perf_counter()
+        textured = texture_mesh(mesh, frames, TextureOptions(noise, args.texel))
+        print(f"{textured} of {len(frames)} frames in {time.perf_counter() - started:.0f} s", flush=True)
+        meshes[f"texture {1e3 * voxel:g} mm"] = textured
+        if args.save:
+            textured.save(args.save / f"{run.folder.path.name}-{1e3 * voxel:g}.glb")
     views = list(posed_frames(dataset, held).read())
     views = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
-    pairs = [compare([own, other], views, dataset.camera) for other in others]
-    return len(views), *max(pairs, key=lambda pair: pair[1]["psnr_db"])
+    figures = dict(zip(meshes, compare(list(meshes.values()), views, dataset.camera), strict=True))
+    others = sorted((name for name in figures if name.startswith("Open3D")), key=lambda name: figures[name]["psnr_db"])
+    for name in others[:-1]:
+        del figures[name]
+    return len(views), figures
 
 
 def split(trajectory: Trajectory, every: int) -> tuple[Trajectory, Trajectory]:
@@ -78,18 +109,54 @@ def split(trajectory: Trajectory, every: int) -> tuple[Trajectory, Trajectory]:
 
 
 def compare(
-    meshes: Sequence[TriangleMesh], views: Sequence[tuple[RgbdFrame, np.ndarray]], camera: Camera
+    meshes: Sequence[TriangleMesh | TexturedMesh],
+    views: Sequence[tuple[RgbdFrame, np.ndarray]],
+    camera: Camera,
 ) -> list[dict[str, float]]:
-    """`FIGURES` of each mesh, means over the views, PSNR and SSIM over the pixels that all of them show."""
+    """`FIGURES` of each mesh, means over the views; all but coverage over the pixels that all of them show."""
     figures: list[list[tuple[float, ...]]] = [[] for _ in meshes]
     for frame, pose in views:
-        images = [render_colors(each.vertices, each.faces, each.colors, camera, pose) for each in meshes]
+        images = [_rendered(each, camera, pose) for each in meshes]
         shown = np.all([depth > 0 for _, depth in images], axis=0)
         same = shown & np.all([np.abs(depth - frame.depth) < SAME_M for _, depth in images], axis=0)
         for rows, (color, depth) in zip(figures, images, strict=True):
             ratios = psnr_db(color, frame.color, shown), psnr_db(color, frame.color, same)
-            rows.append((ratios[0], ssim(color, frame.color, shown), ratios[1], 100 * float(np.mean(depth > 0))))
+            corrected = _corrected_db(color, frame, camera, shown)
+            covered = 100 * float(np.mean(depth > 0))
+            rows.append((ratios[0], ssim(color, frame.color, shown), ratios[1], corrected, covered))
     return [{name: _mean([row[i] for row in rows]) for i, name in enumerate(FIGURES)} for rows in figures]
+
+
+def _rendered(mesh: TriangleMesh | TexturedMesh, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colors uint8 [H, W, 3] and depth float32 [H, W] of a mesh, without light."""
+    if isinstance(mesh, TriangleMesh):
+        return render_colors(mesh.vertices, mesh.faces, mesh.colors, camera, pose)
+    raster = rasterize(mesh.vertices, mesh.faces, camera, pose)
+    hit = raster.face_ids >= 0
+    faces = raster.face_ids[hit]
+    points = transform_points(np.linalg.inv(pose), mesh.vertices.astype(np.float64)).astype(np.float32)
+    corners = points[mesh.faces[faces]]
+    normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    weights = barycentric(corners, (camera.ray_directions() * raster.depth[..., None])[hit], normals)
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    image[hit] = np.rint(mesh.colors_at(faces, weights))
+    return image, raster.depth
+
+
+def _corrected_db(color: np.ndarray, frame: RgbdFrame, camera: Camera, shown: np.ndarray) -> float:
+    """PSNR after a gain per channel and an affine warp of the mesh's image."""
+    v, u = np.nonzero(shown[::_EVERY_PX, ::_EVERY_PX])
+    places = np.stack([_EVERY_PX * u, _EVERY_PX * v, np.ones_like(u)], axis=1).astype(np.float32)
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[::_EVERY_PX, ::_EVERY_PX][v, u].astype(np.float32)
+    view = ColorView(0, frame, camera, np.eye(4), DEFAULT_NOISE)
+    warp = register(view, places, gray, np.eye(3))
+    # The mesh's image is moved, not the frame's: interpolation would take noise and edges from what is compared with.
+    size, motion = (camera.width, camera.height), np.linalg.inv(warp)[:2]
+    moved = cv2.warpAffine(color, motion, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+    counted = cv2.warpAffine(shown.astype(np.float32), motion, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP) == 1
+    wanted, given = frame.color[counted].astype(np.float64), moved[counted].astype(np.float64)
+    gains = (wanted * given).sum(0) / np.maximum((given**2).sum(0), 1)
+    return psnr_db(np.clip(np.rint(moved * gains), 0, 255).astype(np.uint8), frame.color, counted)
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -101,7 +168,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = make_parser(__doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="output folder of a finished run")
     parser.add_argument("--every", type=int, default=8, help="of so many tracked frames one is held out")
-    parser.add_argument("--voxel", type=float, default=0.01, help="m")
+    parser.add_argument("--voxels", type=float, nargs="+", default=[0.01], help="m; Open3D has the first")
+    parser.add_argument("--texel", type=float, help="m; as finely as the frames saw if not given")
+    parser.add_argument("--no-open3d", action="store_true", help="leave Open3D out")
+    parser.add_argument("--save", type=Path, help="folder for the textured meshes, as .glb")
     return parser
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from spslam.errors import OutputError
@@ -35,6 +35,37 @@ def atomic_write(path: str | os.PathLike, content: bytes | str | Callable[[Path]
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def atomic_write_all(files: Mapping[Path, bytes]) -> None:
+    """Writes files that belong together, the last of which names the others: all of them are complete under temporary
+    names before the last one's predecessor is removed and they are renamed, in order.
+
+    So the last file never goes with others than its own. A killed process leaves the files as they were or, between two
+    renames, no last one.
+
+    Args:
+        files: contents by path, in one folder, which must exist.
+
+    Raises:
+        OutputError: the operating system refuses. Temporary files are removed.
+    """
+    temporaries = {path: path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}") for path in files}
+    last = next(reversed(files))
+    try:
+        for path, content in files.items():
+            with writing(path):
+                _write(temporaries[path], content)
+                _flush_to_disk(temporaries[path])
+        with writing(last):
+            last.unlink(missing_ok=True)
+            for path, temporary in temporaries.items():
+                os.replace(temporary, path)
+            _flush_to_disk(last.parent)
+    finally:
+        for temporary in temporaries.values():
+            with contextlib.suppress(OSError):
+                temporary.unlink()
 
 
 @contextlib.contextmanager

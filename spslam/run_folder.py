@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MESH_FORMATS = ("ply", "glb", "obj")
+TEXTURED_FORMATS = ("glb", "obj")  # of those, the ones that a texture fits into
 
 _SEGMENT = re.compile(r"segment-([0-9]+)\.txt")
 _COLOR_PREVIEW = re.compile(r"frame-([0-9]{6,})\.png")
@@ -65,6 +66,10 @@ class RunFolder:
     def mesh_as(self, file_format: str) -> Path:
         """The mesh in one of `MESH_FORMATS`."""
         return self.path / f"mesh.{file_format}"
+
+    def texture_files(self) -> list[Path]:
+        """The files that there are beside a mesh.obj with a texture: its materials and their images."""
+        return sorted([*self.path.glob("mesh.mtl"), *self.path.glob("mesh-[0-9]*.png")])
 
     @property
     def metrics(self) -> Path:
@@ -141,7 +146,7 @@ class RunFolder:
 
     def files(self) -> list[Path]:
         """All files that a run or a later command may leave directly in the folder; `previews` is not among them."""
-        meshes = [self.mesh_as(file_format) for file_format in MESH_FORMATS]
+        meshes = [*(self.mesh_as(file_format) for file_format in MESH_FORMATS), *self.texture_files()]
         others = [self.metrics, self.report, self.config, self.log, self.skipped, self.checkpoint]
         return [self.trajectory, *self.segments(), self.map, self.keyframes, *meshes, *others]
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 from spslam.cli.arguments import add_run_folder, positive_meters, require_run_file
 from spslam.config import Config, load_config
 from spslam.errors import DatasetError, OutputError
-from spslam.run_folder import MESH_FORMATS, RunFolder, is_merged
+from spslam.run_folder import MESH_FORMATS, TEXTURED_FORMATS, RunFolder, is_merged
 
 if TYPE_CHECKING:
     from spslam.datasets.base import RgbdDataset
     from spslam.evaluation.run_output import RunOutput
     from spslam.meshing import TriangleMesh
-    from spslam.run.mesh import EarlierFrames
+    from spslam.run.mesh import EarlierFrames, TextureWish
 
 SOURCES = ("tsdf", "neural")
 
@@ -33,15 +33,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_meters,
         help="edge length of a voxel or marching-cubes cell in meters; the run's mesh.resolution_m if not given",
     )
-    parser.add_argument("--format", choices=MESH_FORMATS, default="ply", help="file format, ply if not given")
+    parser.add_argument(
+        "--format", choices=MESH_FORMATS, help="file format; ply if not given, glb with --texture, which ply can't have"
+    )
+    parser.add_argument(
+        "--texture",
+        action="store_true",
+        help="bake the frames' colors into a texture, finer than colors of vertices; reads the frames again",
+    )
+    parser.add_argument(
+        "--texel",
+        metavar="M",
+        type=positive_meters,
+        help="edge length of a texel of --texture in meters; as finely as the frames saw the surface if not given",
+    )
 
 
 def execute(args: argparse.Namespace) -> None:
+    file_format = _file_format(args)
     folder = RunFolder(args.output)
     map_file = require_run_file(folder.map)
     config = load_config(require_run_file(folder.config))
     if is_merged(folder):
-        _execute_merged(args, folder, config)
+        _execute_merged(args, folder, config, file_format)
         return
 
     from spslam.evaluation.finished_run import add_metrics
@@ -53,17 +67,41 @@ def execute(args: argparse.Namespace) -> None:
     source = args.source or ("neural" if _is_live(run) else config.mesh.source)
     changes = {"source": source, "resolution_m": args.resolution or config.mesh.resolution_m}
     options = config.mesh.model_copy(update=changes)
-    dataset = _open_again(run, config) if source == "tsdf" else None
+    dataset = _open_again(run, config, args.texture) if source == "tsdf" or args.texture else None
     earlier = _earlier(folder) if "map" in run.metrics else []
-    job = MeshJob(Scene.load(map_file), run.trajectory, run.camera, options, measured_noise(run.metrics), earlier)
-    path = folder.mesh_as(args.format)
+    scene, noise = Scene.load(map_file), measured_noise(run.metrics)
+    job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args))
+    path = folder.mesh_as(file_format)
     mesh, figures = write_mesh(path, job, dataset)
     if path == folder.mesh:
         add_metrics(run, figures)
     _print_mesh(path, mesh, figures)
 
 
-def _execute_merged(args: argparse.Namespace, folder: RunFolder, config: Config) -> None:
+def _file_format(args: argparse.Namespace) -> str:
+    """The format asked for, or the usual one.
+
+    Raises:
+        OutputError: a format without textures was asked for with one, or a size of texels without a texture.
+    """
+    if args.texel and not args.texture:
+        raise OutputError("--texel is the size of what --texture makes, and needs it")
+    if not args.texture:
+        return args.format or "ply"
+    if args.format and args.format not in TEXTURED_FORMATS:
+        raise OutputError(
+            f"--format {args.format} can't have a texture: --texture needs {' or '.join(TEXTURED_FORMATS)}"
+        )
+    return args.format or TEXTURED_FORMATS[0]
+
+
+def _texture(args: argparse.Namespace) -> TextureWish | None:
+    from spslam.run.mesh import TextureWish
+
+    return TextureWish(args.texel) if args.texture else None
+
+
+def _execute_merged(args: argparse.Namespace, folder: RunFolder, config: Config, file_format: str) -> None:
     from spslam.run.recordings import write_map_mesh
     from spslam.scene import Scene
     from spslam.slam.graph.archive import KeyframeArchive
@@ -73,8 +111,8 @@ def _execute_merged(args: argparse.Namespace, folder: RunFolder, config: Config)
         "resolution_m": args.resolution or config.mesh.resolution_m,
     }
     archive = KeyframeArchive.load(require_run_file(folder.keyframes))
-    path, options = folder.mesh_as(args.format), config.mesh.model_copy(update=changes)
-    mesh, figures, missing = write_map_mesh(path, Scene.load(folder.map), archive, options)
+    path, options = folder.mesh_as(file_format), config.mesh.model_copy(update=changes)
+    mesh, figures, missing = write_map_mesh(path, Scene.load(folder.map), archive, options, _texture(args))
     for line in missing:
         print(f"! {line}")
     _print_mesh(path, mesh, figures)
@@ -84,7 +122,14 @@ def _print_mesh(path: Path, mesh: TriangleMesh, figures: dict[str, Any]) -> None
     size = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
     made_of = f", {figures['mesh_mb']:.0f} MB of voxels" if "mesh_mb" in figures else ""
     made_at = f"{figures['mesh_source']} at {figures['mesh_resolution_m']:g} m"
-    print(f"{path}: {size}; {made_at}{made_of}, {figures['mesh_s']:.1f} s")
+    textured = ""
+    if "texel_m" in figures:
+        pages, width, height = figures["texture_size"]
+        textured = f"; texels of {1e3 * figures['texel_m']:.1f} mm, {pages} x {width}x{height} px"
+        if figures["texel_m"] > figures["wanted_texel_m"]:
+            wanted = f"{1e3 * figures['wanted_texel_m']:.1f} mm"
+            print(f"! texels of {wanted} would need more than {figures['most_pages']} pages; larger ones are taken")
+    print(f"{path}: {size}; {made_at}{made_of}{textured}, {figures['mesh_s']:.1f} s")
 
 
 def _is_live(run: RunOutput) -> bool:
@@ -104,12 +149,16 @@ def _earlier(folder: RunFolder) -> list[EarlierFrames]:
     return earlier
 
 
-def _open_again(run: RunOutput, config: Config) -> RgbdDataset:
+def _open_again(run: RunOutput, config: Config, for_texture: bool) -> RgbdDataset:
     from spslam.datasets import open_dataset
 
     try:
         return open_dataset(config.dataset)
     except DatasetError as error:
+        if for_texture:
+            raise OutputError(
+                f"{run.folder.path}: a texture is made of the run's frames, which can't be read again ({error})"
+            ) from None
         if not _is_live(run):
             raise
         raise OutputError(

@@ -28,6 +28,7 @@ _SCALAR_BYTES = {
     **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
     **dict.fromkeys(("double", "float64", "int64", "uint64"), 8),
 }
+_GRAY = 102  # trimesh's, of meshes without colors
 _TEXT_BYTES = 2  # of a number in a text: a digit and what separates it from the next
 
 
@@ -133,4 +134,6 @@ def _check(vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def _vertex_colors(mesh: trimesh.Trimesh) -> np.ndarray:
+    if mesh.visual.kind == "texture":  # which is left alone
+        return np.full((len(mesh.vertices), 3), _GRAY, np.uint8)
     return np.array(mesh.visual.vertex_colors, np.uint8).reshape(-1, 4)[:, :3]  # type: ignore[union-attr]

@@ -18,6 +18,7 @@ from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
+from spslam.meshing.texture.export import check_textured_format
 from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.options import MeshOptions
 from spslam.scene import Scene
@@ -40,6 +41,17 @@ class EarlierFrames:
 
 
 @dataclass(frozen=True)
+class TextureWish:
+    """That a mesh is to have a texture.
+
+    Attributes:
+        texel_m: edge of a texel, m; None is as finely as the frames saw the surface.
+    """
+
+    texel_m: float | None = None
+
+
+@dataclass(frozen=True)
 class MeshJob:
     """What a mesh is made of.
 
@@ -50,6 +62,7 @@ class MeshJob:
         options: of the mesh.
         noise: of depth, see `ops.measure_planes`; where it was not measured, None.
         earlier: recordings that the map is of beside the run's.
+        texture: whether the frames' colors are baked into a texture; None for colors of vertices.
     """
 
     scene: Scene
@@ -58,6 +71,7 @@ class MeshJob:
     options: MeshOptions
     noise: tuple[float, float] | None = None
     earlier: Sequence[EarlierFrames] = ()
+    texture: TextureWish | None = None
 
 
 def measured_noise(metrics: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -78,16 +92,20 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
     Args:
         path: of the mesh.
         job: what it is made of.
-        dataset: the run's frames, or a dataset that contains them; not read for a mesh from the map alone.
+        dataset: the run's frames, or a dataset that contains them; not read for a mesh from the map alone without a
+            texture.
 
     Returns:
         The mesh, and what metrics.json says of it.
 
     Raises:
-        OutputError: a mesh is to be fused and no frame of the run is in the dataset, or the file can't be written.
+        OutputError: a mesh is to be fused or textured and no frame of the run is in the dataset, or the file can't be
+            written.
         SpslamError: the surface does not fit into `mesh.max_memory_mb` at any voxel size.
     """
     started = time.perf_counter()
+    if job.texture is not None:
+        check_textured_format(path)
     trajectories = [*(each.trajectory for each in job.earlier), job.trajectory]
     tracked = np.concatenate([each.poses[~each.lost] for each in trajectories])
     figures: dict[str, Any] = {"mesh_source": "neural" if dataset is None else job.options.source}
@@ -95,14 +113,48 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
         resolution_m = job.options.resolution_m
         mesh = extract_mesh(job.scene, resolution_m, job.camera, None if job.camera is None else tracked)
     else:
-        frames = [*_earlier_frames(job.earlier), posed_frames(dataset, job.trajectory)]
+        frames = frames_of(job, dataset)
         fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, job.noise or DEFAULT_NOISE)
         volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
         mesh = extract_fused_mesh(volume, job.scene, dataset.camera, tracked)
         resolution_m = volume.voxel_size
         figures |= {"mesh_frames": sum(len(part) for part in frames), "mesh_mb": volume.nbytes / 2**20}
-    save_mesh(mesh, path)
+    if job.texture is None:
+        save_mesh(mesh, path)
+    else:
+        figures |= _write_textured(path, mesh, job, dataset, job.texture.texel_m)
     return mesh, {**figures, "mesh_resolution_m": resolution_m, "mesh_s": time.perf_counter() - started}
+
+
+def _write_textured(
+    path: Path, mesh: TriangleMesh, job: MeshJob, dataset: RgbdDataset | None, texel_m: float | None
+) -> dict[str, Any]:
+    """Bakes the texture of a mesh, writes both, and says how large it is."""
+    from spslam.meshing.texture import TextureOptions, texture_mesh
+
+    if dataset is None:
+        raise OutputError(f"{path}: a texture is made of frames, and none can be read again")
+    if not len(mesh.faces):
+        raise OutputError(f"{path}: a mesh without faces can't have a texture")
+    options = TextureOptions(job.noise or DEFAULT_NOISE, texel_m)
+    textured = texture_mesh(mesh, frames_of(job, dataset), options)
+    textured.save(path)
+    pages, height, width = textured.pages.shape[:3]
+    return {
+        "texel_m": textured.texel_m,
+        "wanted_texel_m": textured.wanted_texel_m,
+        "texture_size": (pages, width, height),
+        "most_pages": options.most_pages,
+    }
+
+
+def frames_of(job: MeshJob, dataset: RgbdDataset) -> list[PosedFrames]:
+    """All frames of a job that can be read: of recordings before, and of the run.
+
+    Raises:
+        OutputError: there is none of the run.
+    """
+    return [*_earlier_frames(job.earlier), posed_frames(dataset, job.trajectory)]
 
 
 def _earlier_frames(earlier: Sequence[EarlierFrames]) -> list[PosedFrames]:

@@ -13,7 +13,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import SpslamError
 from spslam.meshing import TriangleMesh
 from spslam.options import DatasetOptions, MeshOptions
-from spslam.run.mesh import EarlierFrames, MeshJob, noise_of_model, write_mesh
+from spslam.run.mesh import EarlierFrames, MeshJob, TextureWish, noise_of_model, write_mesh
 from spslam.run.request import RunRequest
 from spslam.scene import Scene
 from spslam.slam.graph.archive import KeyframeArchive, Recording
@@ -47,7 +47,11 @@ def read_again(archive: KeyframeArchive, recordings: Sequence[Recording]) -> tup
 
 
 def write_map_mesh(
-    path: Path, scene: Scene, archive: KeyframeArchive, options: MeshOptions
+    path: Path,
+    scene: Scene,
+    archive: KeyframeArchive,
+    options: MeshOptions,
+    texture: TextureWish | None = None,
 ) -> tuple[TriangleMesh, dict[str, Any], list[str]]:
     """Makes the mesh of a map of any recordings and writes it.
 
@@ -56,6 +60,7 @@ def write_map_mesh(
         scene: the map.
         archive: its keyframes and trajectories.
         options: of the mesh.
+        texture: as of `MeshJob`.
 
     Returns:
         The mesh, what metrics.json says of it, and in words which frames can't be read again.
@@ -63,14 +68,14 @@ def write_map_mesh(
     Raises:
         OutputError, SpslamError: as `write_mesh`.
     """
-    frames, missing = read_again(archive, archive.recordings) if options.source == "tsdf" else ([], [])
+    frames, missing = read_again(archive, archive.recordings) if options.source == "tsdf" or texture else ([], [])
     readable = [i for i, each in enumerate(frames) if each.dataset is not None and not each.trajectory.lost.all()]
     own = readable[0] if readable else 0
     earlier = frames or [EarlierFrames(each.trajectory, None) for each in archive.recordings]
     dataset, noise = earlier[own].dataset, earlier[own].noise
     camera = archive.recordings[own].camera
     rest = [each for i, each in enumerate(earlier) if i != own]
-    job = MeshJob(scene, earlier[own].trajectory, camera, options, noise, rest)
+    job = MeshJob(scene, earlier[own].trajectory, camera, options, noise, rest, texture)
     return (*write_mesh(path, job, dataset), missing)
 
 

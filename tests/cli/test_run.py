@@ -18,6 +18,7 @@ from spslam.config import load_config
 from spslam.datasets import export_folder
 from spslam.datasets.generated import GeneratedDataset
 from spslam.evaluation import finished_run
+from spslam.run_folder import RunFolder
 from spslam.slam.fit import Fit
 from tests.cli.command import ROOT, assert_refused, spslam, spslam_process
 
@@ -242,3 +243,32 @@ def test_mesh_command_extracts_the_map_alone(finished):
     result = spslam("mesh", "out", "--source", "neural", "--resolution", "0.05", "--format", "obj", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert "neural at 0.05 m" in result.stdout
+
+
+def test_mesh_command_bakes_a_texture(finished):
+    folder, _ = finished
+    result = spslam("mesh", "out", "--resolution", "0.05", "--texture", "--texel", "0.02", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert "out/mesh.glb: " in result.stdout and "; texels of 20.0 mm, 1 x " in result.stdout
+    content = (folder / "out" / "mesh.glb").read_bytes()
+    assert content[:4] == b"glTF" and b"image/png" in content
+    arguments = ["--texture", "--source", "neural", "--resolution", "0.08", "--format", "obj"]
+    result = spslam("mesh", "out", *arguments, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert "neural at 0.08 m; texels of " in result.stdout
+    assert (folder / "out" / "mesh.obj").read_text().startswith("mtllib mesh.mtl\n")
+    assert [path.name for path in RunFolder(folder / "out").texture_files()] == ["mesh-0.png", "mesh.mtl"]
+
+
+def test_a_texture_that_cannot_be_is_refused(finished, tmp_path):
+    folder, _ = finished
+    refused = spslam("mesh", "out", "--texture", "--format", "ply", cwd=folder)
+    assert_refused(refused, "--format ply can't have a texture: --texture needs glb or obj")
+    assert_refused(spslam("mesh", "out", "--texel", "0.01", cwd=folder), "--texel is the size of what --texture makes")
+    shutil.copytree(folder / "out", tmp_path / "moved", ignore=shutil.ignore_patterns("*.glb"))
+    config = tmp_path / "moved" / "config.yaml"
+    text = re.sub("type: generated", "type: tum", config.read_text())
+    config.write_text(re.sub("path: null", f"path: {tmp_path / 'absent'}", text))
+    gone = spslam("mesh", "moved", "--texture", cwd=tmp_path)
+    assert_refused(gone, "moved: a texture is made of the run's frames, which can't be read again")
+    assert not (tmp_path / "moved" / "mesh.glb").exists()

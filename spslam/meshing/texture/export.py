@@ -1,0 +1,153 @@
+"""Writes textured meshes as GLB, or as OBJ with its materials and images."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from spslam.errors import OutputError
+from spslam.io import atomic_write, atomic_write_all
+from spslam.meshing.texture.textured_mesh import TexturedMesh
+
+TEXTURED_FORMATS = (".glb", ".obj")
+# Of PNG, 0 to 9: the first gives nearly the size of the last at a third of the time.
+_COMPRESSION = 3
+# Numbers of the glTF 2.0 specification.
+_FLOAT, _UINT, _VERTEX_DATA, _INDICES = 5126, 5125, 34962, 34963
+_LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
+_GLB_MAGIC, _GLB_VERSION, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
+
+
+def check_textured_format(path: Path) -> None:
+    """Raises OutputError where a file of this name can't have a texture."""
+    if path.suffix.lower() not in TEXTURED_FORMATS:
+        known = " or ".join(TEXTURED_FORMATS)
+        raise OutputError(f"{path}: a mesh with a texture must be written as {known}, got {path.suffix or 'no suffix'}")
+
+
+def save_textured_mesh(mesh: TexturedMesh, path: str | os.PathLike) -> None:
+    """Writes a textured mesh; the same mesh gives the same bytes.
+
+    Args:
+        mesh: with at least one face.
+        path: `.glb` (glTF 2.0, one file; axes are not changed, and colors are shown without light by programs that know
+            KHR_materials_unlit), or `.obj`. For NAME.obj also NAME.mtl and NAME-0.png, NAME-1.png, ... are written. All
+            are complete before the first is renamed, and a NAME.obj from before is removed before that, so it never
+            goes with images of another.
+
+    Raises:
+        OutputError: another suffix, a mesh without faces, or the operating system refuses.
+    """
+    path = Path(path)
+    check_textured_format(path)
+    if not len(mesh.faces):
+        raise OutputError(f"{path}: a mesh without faces can't have a texture")
+    images = [_png(page) for page in mesh.pages]
+    if path.suffix.lower() == ".glb":
+        atomic_write(path, _glb(mesh, images))
+        return
+    names = [f"{path.stem}-{page}.png" for page in range(len(images))]
+    materials = path.with_suffix(".mtl")
+    files: dict[Path, bytes] = {path.with_name(name): image for name, image in zip(names, images, strict=True)}
+    files[materials] = _mtl(names).encode()
+    files[path] = _obj(mesh, materials.name).encode()
+    atomic_write_all(files)
+
+
+def _png(page: np.ndarray) -> bytes:
+    done, content = cv2.imencode(".png", page[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, _COMPRESSION])
+    if not done:
+        raise OutputError(f"a texture of {page.shape[1]}x{page.shape[0]} px can't be encoded as PNG")
+    return content.tobytes()
+
+
+def _mtl(names: list[str]) -> str:
+    parts = (
+        f"newmtl page{page}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {name}\n" for page, name in enumerate(names)
+    )
+    return "\n".join(parts)
+
+
+def _obj(mesh: TexturedMesh, materials: str) -> str:
+    """Lines of an OBJ file, whose texture coordinates begin at the lower left and whose indices at 1."""
+    places = np.stack([mesh.places[:, 0], 1 - mesh.places[:, 1]], axis=1)
+    lines = [f"mtllib {materials}\n"]
+    for name, rows, digits in (("v", mesh.vertices, 5), ("vt", places, 6), ("vn", mesh.normals, 3)):
+        row = f"{name} " + " ".join([f"%.{digits}f"] * rows.shape[1]) + "\n"
+        lines.append((row * len(rows)) % tuple(rows.ravel().tolist()))
+    for page in range(len(mesh.pages)):
+        faces = mesh.faces[mesh.page_of == page] + 1
+        lines.append(f"usemtl page{page}\n")
+        lines.append(("f %d/%d/%d %d/%d/%d %d/%d/%d\n" * len(faces)) % tuple(np.repeat(faces.ravel(), 3).tolist()))
+    return "".join(lines)
+
+
+def _glb(mesh: TexturedMesh, images: list[bytes]) -> bytes:
+    """A binary glTF 2.0: all pages share the vertices, each has its material and its faces."""
+    binary = _Binary()
+    attributes = {
+        "POSITION": binary.accessor(mesh.vertices.astype("<f4"), _FLOAT, "VEC3", _VERTEX_DATA),
+        "NORMAL": binary.accessor(mesh.normals.astype("<f4"), _FLOAT, "VEC3", _VERTEX_DATA),
+        "TEXCOORD_0": binary.accessor(mesh.places.astype("<f4"), _FLOAT, "VEC2", _VERTEX_DATA),
+    }
+    binary.accessors[0] |= {"min": mesh.vertices.min(0).tolist(), "max": mesh.vertices.max(0).tolist()}
+    primitives = []
+    for page in range(len(images)):
+        faces = mesh.faces[mesh.page_of == page].astype("<u4").reshape(-1, 1)
+        if len(faces):
+            indices = binary.accessor(faces, _UINT, "SCALAR", _INDICES)
+            primitives.append({"attributes": attributes, "indices": indices, "material": page})
+    document = {
+        "asset": {"version": "2.0", "generator": "spslam"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": primitives}],
+        "materials": [_material(page) for page in range(len(images))],
+        "textures": [{"sampler": 0, "source": page} for page in range(len(images))],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+        "images": [{"mimeType": "image/png", "bufferView": binary.view(image)} for image in images],
+        "accessors": binary.accessors,
+        "bufferViews": binary.views,
+        "buffers": [{"byteLength": binary.size}],
+        "extensionsUsed": ["KHR_materials_unlit"],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    chunks = [(_JSON_CHUNK, text + b" " * (-len(text) % 4)), (_BINARY_CHUNK, b"".join(binary.parts))]
+    body = b"".join(struct.pack("<I", len(content)) + kind + content for kind, content in chunks)
+    return _GLB_MAGIC + struct.pack("<II", _GLB_VERSION, 12 + len(body)) + body
+
+
+def _material(page: int) -> dict[str, Any]:
+    surface = {"baseColorTexture": {"index": page}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {"name": f"page{page}", "pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}}
+
+
+class _Binary:
+    """The binary part of a GLB as it grows, and what says where its arrays are."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, content: bytes, target: int | None = None) -> int:
+        """The number of the view of new content."""
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
+        self.views.append(view if target is None else view | {"target": target})
+        self.parts.append(content + b"\0" * (-len(content) % 4))
+        self.size += len(self.parts[-1])
+        return len(self.views) - 1
+
+    def accessor(self, array: np.ndarray, component: int, kind: str, target: int) -> int:
+        """The number of the accessor of a new array."""
+        view = self.view(np.ascontiguousarray(array).tobytes(), target)
+        self.accessors.append({"bufferView": view, "componentType": component, "count": len(array), "type": kind})
+        return len(self.accessors) - 1
