@@ -73,7 +73,7 @@ test-numpy: dev ## install bindings/numpy and test it against the torch ops
 	  --force-reinstall ./bindings/numpy
 	$(PYTHON) -m pytest bindings/numpy/tests
 
-test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined-behavior sanitizers
+test-asan: $(ENVIRONMENT) ## the tests of compiled functions on the CPU with address and undefined-behavior sanitizers
 	$(RUN) cmake -S . -B build/asan -G Ninja -DCMAKE_BUILD_TYPE=RelWithDebInfo -DSPSLAM_SANITIZE=ON -DSPSLAM_CUDA=OFF \
 	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
 	$(RUN) cmake --build build/asan -j $(JOBS)
@@ -81,7 +81,8 @@ test-asan: $(ENVIRONMENT) ## the tests of the CPU ops with address and undefined
 	cp -r spslam tests configs pyproject.toml build/asan-site && rm -f build/asan-site/spslam/*.so
 	$(RUN) cmake --install build/asan --component python --prefix build/asan-site > /dev/null
 	cd build/asan-site && LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
-	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops \
+	  tests/datasets/test_image_kernels.py
 
 fuzz: dev ## read corrupted files of every format for MINUTES (60), in JOBS processes; see docs/reliability.md
 	$(PYTHON) -m tests.fuzz --minutes $(or $(MINUTES),60) --jobs $(JOBS)

@@ -33,7 +33,7 @@ class CMakeBuild(build_ext):
         return fullname.replace(".", os.sep) + ".so"
 
     def get_outputs(self):
-        return [str(path) for path in (pathlib.Path(self.build_lib) / "spslam").glob("_ops_*.so")]
+        return [str(path) for path in (pathlib.Path(self.build_lib) / "spslam").glob("_*.so")]
 
     def run(self):
         if self.inplace and os.environ.get("SPSLAM_BUILD") == "OFF":

@@ -1,4 +1,5 @@
-# The libraries: torch-free kernels for each instruction set and for CUDA, and a torch op library over each.
+# The libraries: torch-free kernels for each instruction set and for CUDA, a torch op library over each, and for each
+# instruction set one of plain functions for the reading of images.
 include(CheckLanguage)
 include(GNUInstallDirs)
 
@@ -43,6 +44,7 @@ include(SpslamHeaders)
 file(GLOB SPSLAM_CPU_SOURCES CONFIGURE_DEPENDS csrc/core/*.cpp csrc/cpu/*.cpp)
 file(GLOB SPSLAM_CUDA_SOURCES CONFIGURE_DEPENDS csrc/cuda/*.cu)
 file(GLOB SPSLAM_BINDING_SOURCES CONFIGURE_DEPENDS csrc/bindings/*.cpp)
+file(GLOB SPSLAM_PLAIN_SOURCES CONFIGURE_DEPENDS csrc/bindings/plain/*.cpp)
 
 # From here the sources are included, by those who link a library what is installed.
 function(spslam_source_includes target)
@@ -85,12 +87,23 @@ function(spslam_op_library name)
   install(TARGETS ${name} LIBRARY DESTINATION spslam COMPONENT python)
 endfunction()
 
+# Links `name` as a library of plain C functions, for Python without torch.
+function(spslam_plain_library name)
+  add_library(${name} MODULE ${SPSLAM_PLAIN_SOURCES})
+  spslam_source_includes(${name})
+  target_link_options(${name} PRIVATE -Wl,--exclude-libs,ALL)
+  set_target_properties(${name} PROPERTIES PREFIX "" SKIP_BUILD_RPATH ON)
+  install(TARGETS ${name} LIBRARY DESTINATION spslam COMPONENT python)
+endfunction()
+
 if(SPSLAM_SANITIZE)
   add_compile_options(-fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1)
   add_link_options(-fsanitize=address,undefined)
 endif()
 
 set(_isa_flags_baseline "")
+set(_isa_needs_avx2 SPSLAM_NEEDS_AVX2)
+set(_isa_needs_avx512 SPSLAM_NEEDS_AVX512)
 set(_isa_flags_avx2 -march=x86-64-v3)
 set(_isa_flags_avx512 -march=x86-64-v4 -mprefer-vector-width=512)
 foreach(isa IN LISTS SPSLAM_CPU_ISAS)
@@ -105,12 +118,15 @@ foreach(isa IN LISTS SPSLAM_CPU_ISAS)
     -ffp-contract=fast ${_isa_flags_${isa}})
   if(SPSLAM_TORCH_DIR)
     if(isa STREQUAL "baseline")
-      set(ops _ops_cpu)
+      set(suffix cpu)
     else()
-      set(ops _ops_cpu_${isa})
+      set(suffix cpu_${isa})
     endif()
-    spslam_op_library(${ops})
-    target_link_libraries(${ops} PRIVATE ${kernels})
+    spslam_op_library(_ops_${suffix})
+    target_link_libraries(_ops_${suffix} PRIVATE ${kernels})
+    spslam_plain_library(_images_${suffix})
+    target_link_libraries(_images_${suffix} PRIVATE ${kernels})
+    target_compile_definitions(_images_${suffix} PRIVATE ${_isa_needs_${isa}})
   endif()
 endforeach()
 

@@ -10,7 +10,8 @@ std::int32_t image_side(const char* name, std::int64_t size) {
   return static_cast<std::int32_t>(size);
 }
 
-Tensor measure_planes(Tensor depth, std::vector<double> intrinsics, double noise_floor, double noise_growth) {
+Tensor measure_planes(Tensor depth, std::vector<double> intrinsics, double noise_floor, double noise_growth,
+                      bool shared_noise) {
   constexpr char kName[] = "measure_planes";
   SPS_CHECK(depth.dim() == 2, kName, ": depth must have shape [H, W]");
   DeviceScope scope(depth);
@@ -18,7 +19,7 @@ Tensor measure_planes(Tensor depth, std::vector<double> intrinsics, double noise
   const DepthImage image{data<float>(depth), image_side(kName, depth.size(1)), image_side(kName, depth.size(0)),
                          load_intrinsics(kName, intrinsics)};
   const Tensor planes = empty(depth, {depth.size(0), depth.size(1), kPlaneSize}, ScalarType::Float);
-  const DepthNoise noise{static_cast<float>(noise_floor), static_cast<float>(noise_growth)};
+  const PlaneNoise noise{{static_cast<float>(noise_floor), static_cast<float>(noise_growth)}, shared_noise};
   spslam::measure_planes(scope.context, image, noise, mutable_data<float>(planes));
   return planes;
 }
@@ -164,7 +165,9 @@ std::tuple<Tensor, Tensor, Tensor> tsdf_ray_cast(Tensor hash_keys, Tensor hash_v
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
-  m.def("measure_planes(Tensor depth, float[] intrinsics, float noise_floor, float noise_growth) -> Tensor");
+  m.def(
+      "measure_planes(Tensor depth, float[] intrinsics, float noise_floor, float noise_growth, bool shared_noise) -> "
+      "Tensor");
   m.def(
       "tsdf_touched_blocks(Tensor planes, Tensor pose, float[] intrinsics, float voxel_size, float truncation, "
       "float[] noise, int step) -> Tensor");

@@ -50,7 +50,7 @@ SPS_INLINE void add_plane_row(const float* q, const PlaneMiddle& middle, PlaneSu
 }
 
 // Planes of the pixels [first, first + kPixelLanes) of a row that lie in the image.
-void planes_of_batch(const DepthImage& image, const InverseDepth& inverse, const DepthNoise& noise, std::int64_t v,
+void planes_of_batch(const DepthImage& image, const InverseDepth& inverse, const PlaneNoise& noise, std::int64_t v,
                      std::int32_t first, float* planes) {
   alignas(64) float by_u[kPixelLanes], by_v[kPixelLanes], gates[kPixelLanes];
   alignas(64) float sums[kPlaneSums][kPixelLanes], out[kPlaneSize][kPixelLanes];
@@ -101,7 +101,7 @@ void planes_of_batch(const DepthImage& image, const InverseDepth& inverse, const
 }  // namespace
 
 template <>
-void measure_planes<Cpu>(Cpu, const DepthImage& image, const DepthNoise& noise, float* planes) {
+void measure_planes<Cpu>(Cpu, const DepthImage& image, const PlaneNoise& noise, float* planes) {
   if (image.width == 0 || image.height == 0) return;
   ScratchBuffer<float> buffer;
   const InverseDepth inverse(buffer, image);

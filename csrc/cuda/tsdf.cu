@@ -94,7 +94,7 @@ __global__ void __launch_bounds__(kIntegrateThreads)
 }  // namespace
 
 template <>
-void measure_planes<Cuda>(Cuda device, const DepthImage& image, const DepthNoise& noise, float* planes) {
+void measure_planes<Cuda>(Cuda device, const DepthImage& image, const PlaneNoise& noise, float* planes) {
   const std::int64_t pixels = static_cast<std::int64_t>(image.width) * image.height;
   for_each(device, pixels, [=] __device__(std::int64_t i) {
     const std::int32_t u = static_cast<std::int32_t>(i % image.width), v = static_cast<std::int32_t>(i / image.width);

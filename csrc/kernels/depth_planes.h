@@ -60,6 +60,11 @@ SPS_INLINE float whole_plane_window() {
   return whole;
 }
 
+// The noise that differs from neighbor to neighbor, of which a fit has less.
+SPS_INLINE DepthNoise own_noise(const PlaneNoise& noise) {
+  return noise.is_shared ? DepthNoise{0.0f, 0.0f} : noise.depth;
+}
+
 // 1/m; 0 where depth is unknown.
 SPS_INLINE float inverse_depth(float depth) {
   constexpr float kNearest = 1e-3f, kFarthest = 1e6f;
@@ -73,10 +78,10 @@ SPS_INLINE float one_sided_slope(float before, float middle, float after) {
   return take_backward ? backward : after > 0.0f ? forward : 0.0f;
 }
 
-SPS_INLINE PlaneMiddle plane_middle(const DepthNoise& noise, const Intrinsics& camera, float q, float by_u,
+SPS_INLINE PlaneMiddle plane_middle(const PlaneNoise& noise, const Intrinsics& camera, float q, float by_u,
                                     float by_v) {
   const float safe = q > 0.0f ? q : 1.0f;
-  const float deviation = std::sqrt(depth_variance(noise, 1.0f / safe)) * safe;
+  const float deviation = std::sqrt(depth_variance(own_noise(noise), 1.0f / safe)) * safe;
   const float wide = kPlaneGateDeviations * deviation;
   const float steepest_u = kSteepest * safe / camera.fx, steepest_v = kSteepest * safe / camera.fy;
   const bool surface_u = std::fabs(by_u) < steepest_u, surface_v = std::fabs(by_v) < steepest_v;
@@ -109,7 +114,7 @@ struct MeasuredPlane {
 };
 
 // The plane of a pixel (u, v) from its window's sums; all 0 where there is none.
-SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera, const DepthNoise& noise, float u,
+SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera, const PlaneNoise& noise, float u,
                                    float v, float center, float whole_window) {
   const float scale = s.one > 0.0f ? 1.0f / s.one : 0.0f;
   const float mu = s.u * scale, mv = s.v * scale, mq = s.q * scale;
@@ -121,7 +126,7 @@ SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera,
   const float over = (support - kLeastSupport) / (kFullSupport - kLeastSupport);
   // How far the window is from flat, and the pixel from the plane, in variances of inverse depth.
   const float safe = center > 0.0f ? center : 1.0f;
-  const float noise_variance = depth_variance(noise, 1.0f / safe) * (safe * safe) * (safe * safe);
+  const float noise_variance = depth_variance(own_noise(noise), 1.0f / safe) * (safe * safe) * (safe * safe);
   const float moved = mq - by_u * mu - by_v * mv;
   const float spread = s.qq * scale - mq * mq - by_u * qu - by_v * qv;
   const float own = 0.5f * moved * moved;
@@ -135,7 +140,7 @@ SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera,
   const float distance = 1.0f / std::sqrt(mx * mx + my * my + mz * mz);
   const float cosine = q * distance / std::sqrt(x * x + y * y + 1.0f);
   const bool known = (center > 0.0f) & (q > 0.0f) & (support > kLeastSupport) & (cosine > kLeastCosine);
-  const float variance = depth_variance(noise, 1.0f / (known ? q : 1.0f));
+  const float variance = depth_variance(noise.depth, 1.0f / (known ? q : 1.0f));
   const float certainty = kPoseVariance / (kPoseVariance + variance);
   const float body = support * (1.0f / kFullWeightSupport);
   const float weight = certainty * cosine * (body < 1.0f ? body : 1.0f);

@@ -22,7 +22,7 @@ def execute(args: argparse.Namespace) -> None:
     import torch
 
     _row("torch", f"{torch.__version__}, " + (f"CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"))
-    _row("libraries", ", ".join(sorted(path.name for path in Path(spslam.__file__).parent.glob("_ops_*.so"))) or "none")
+    _row("libraries", ", ".join(sorted(path.name for path in Path(spslam.__file__).parent.glob("_*.so"))) or "none")
     try:
         from spslam import ops
     except ImportError as error:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.datasets.image_kernels import ColorView, register_color
 from spslam.datasets.images import resized_color
 from spslam.datasets.lens import sample_depth
 from spslam.geometry import inverse
@@ -22,6 +23,8 @@ from spslam.geometry import inverse
 _HIDDEN_SHARE = 0.05
 # Farther depth is none that a sensor measures, and would overflow.
 _FARTHEST_M = 1e6
+# Of a depth image so many rows and columns, or up to twice as many, tell its typical depth.
+_SAMPLE_SIDE = 64
 _NEIGHBORS = np.ones((3, 3), dtype=np.uint8)
 _SAME_VIEW_PX = 0.5
 
@@ -80,9 +83,7 @@ class _DepthBuffer:
     """Nearest depth of the color camera's view, in cells about as large as the depth camera's pixels."""
 
     def __init__(self, color: Camera, depth: Camera) -> None:
-        share = min(1.0, depth.fx / color.fx)
-        self.width = max(round(share * color.width), 1)
-        self.height = max(round(share * color.height), 1)
+        self.width, self.height = _buffer_size(color, depth)
         self._scale = np.float32(self.width / color.width), np.float32(self.height / color.height)
 
     def fill(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +109,8 @@ class ColorToDepth:
     """Gives each pixel of the depth image its color; depth stays as it was measured.
 
     Depth that the color camera does not see, because something nearer hides it or because it lies outside its image,
-    comes as 0: it has no color. Pixels without depth get the color of what lies there at the image's median depth.
+    comes as 0: it has no color. Pixels without depth get the color of what lies there at the image's median depth, or
+    at 1 m where there is none.
 
     Args:
         color: the color camera.
@@ -124,12 +126,15 @@ class ColorToDepth:
         # Of a finer color image several pixels are averaged to one of the depth image.
         ratio = max(int(min(color.fx / depth.fx, color.fy / depth.fy) + 0.5), 1)
         self._size = max(color.width // ratio, 1), max(color.height // ratio, 1)
-        self._projection = _Projection(depth, color.resized(*self._size), color_from_depth)
+        color = color.resized(*self._size)
         self._unseen: np.ndarray | None = None
         if unseen is not None:
             self._unseen = cv2.resize(unseen.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
         is_elsewhere = bool(color_from_depth[:3, 3].any())
-        self._buffer = _DepthBuffer(color.resized(*self._size), depth) if is_elsewhere else None
+        cells = _buffer_size(color, depth) if is_elsewhere else (0, 0)
+        self._view = ColorView(
+            self._size, (depth.width, depth.height), cells, _pixel_map(color, depth, color_from_depth)
+        )
 
     def __call__(self, color: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Both images in the depth camera's view.
@@ -141,25 +146,28 @@ class ColorToDepth:
         Returns:
             uint8 [H, W, 3], and float32 [H, W].
         """
-        width, height = self._size
-        measured = depth.reshape(-1) > 0
-        typical = np.float32(np.median(depth[depth > 0])) if measured.any() else np.float32(1)
-        z = np.where(measured, depth.reshape(-1), typical)
-        seen = self._projection.depth(z)
-        u, v = self._projection.pixels(z, seen)
-        shows = measured & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-        if self._buffer is not None:
-            nearest, cell = self._buffer.fill(u, v, np.where(measured, seen, np.float32(0)))
-            # A surface of the cells beside counts too: its own may be a gap between its points.
-            front = cv2.erode(nearest, _NEIGHBORS).reshape(-1)
-            shows &= seen * np.float32(1 - _HIDDEN_SHARE) <= front[cell]
-        shape = depth.shape
-        u, v, shows = u.reshape(shape), v.reshape(shape), shows.reshape(shape)
-        if self._unseen is not None:
-            shows &= cv2.remap(self._unseen, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) == 0
-        image = resized_color(color, width, height)
-        image = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return image, np.where(shows, depth, np.float32(0))
+        image = resized_color(color, *self._size)
+        return register_color(self._view, image, depth, self._unseen, typical_depth(depth), _HIDDEN_SHARE)
+
+
+def typical_depth(depth: np.ndarray) -> float:
+    """Median, m, of a depth image [H, W], or of a sample of a large one; 1 where nothing was measured."""
+    sample = depth[:: max(depth.shape[0] // _SAMPLE_SIDE, 1), :: max(depth.shape[1] // _SAMPLE_SIDE, 1)]
+    measured = sample[sample > 0]
+    return float(np.median(measured)) if measured.size else 1.0
+
+
+def _buffer_size(color: Camera, depth: Camera) -> tuple[int, int]:
+    """Width and height of the depth buffer of the color camera's view: cells about as large as depth's pixels."""
+    share = min(1.0, depth.fx / color.fx)
+    return max(round(share * color.width), 1), max(round(share * color.height), 1)
+
+
+def _pixel_map(color: Camera, depth: Camera, color_from_depth: np.ndarray) -> np.ndarray:
+    """float64 [3, 4]: times (z u, z v, z, 1) of a pixel (u, v) of depth z it gives (w x, w y, w) of the color image."""
+    matrix = color.matrix() @ color_from_depth[:3]
+    matrix[:, :3] = matrix[:, :3] @ np.linalg.inv(depth.matrix())
+    return matrix
 
 
 class DepthToColor:

@@ -17,7 +17,6 @@ from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.sdf_sampling import near_surface
-from spslam.ops.depth_planes import SURFACE_VARIANCE_M2
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
 
@@ -179,7 +178,9 @@ def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, fl
         depth = _on(frame.depth, device)
         if smooth:
             kept = _on(without_blurred_edges(frame.depth, noise), device)
-            planes = _smoothed_planes(kept, intrinsics, noise) + _ramps(depth, kept, intrinsics, noise)
+            # Smoothed depth: neighbors have the same noise.
+            planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
+            planes += _ramps(depth, kept, intrinsics, noise)
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
         volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
@@ -189,19 +190,10 @@ def _ramps(
     depth: torch.Tensor, kept: torch.Tensor, intrinsics: ops.Intrinsics, noise: tuple[float, float]
 ) -> torch.Tensor:
     """Planes float32 [H, W, 5] of the pixels of a depth image [H, W] (m) that are not `kept`, with little weight."""
-    ramps = _smoothed_planes(depth, intrinsics, noise)
+    ramps = ops.measure_planes(depth, intrinsics, noise, shared_noise=True)
     ramps[kept > 0] = 0
     ramps[..., 4] *= RAMP_WEIGHT
     return ramps
-
-
-def _smoothed_planes(depth: torch.Tensor, intrinsics: ops.Intrinsics, noise: tuple[float, float]) -> torch.Tensor:
-    """Planes of depth that a sensor smoothed: neighbors have the same noise, of which a mean over them would take
-    nothing but would blur once more. So they are measured as if there were none; weights count it."""
-    planes = ops.measure_planes(depth, intrinsics, (0.0, 0.0))
-    weighted = SURFACE_VARIANCE_M2 / (SURFACE_VARIANCE_M2 + noise[0] + noise[1] * depth**4) * planes[..., 4]
-    planes[..., 4] = torch.where(planes[..., 4] > 0, weighted, 0.0)  # depth may be NaN
-    return planes
 
 
 def _on(image: np.ndarray, device: torch.device) -> torch.Tensor:

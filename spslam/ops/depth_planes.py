@@ -10,14 +10,16 @@ from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 PLANE_SIZE = 5  # kPlaneSize of csrc/include/spslam/tsdf.h
-SURFACE_VARIANCE_M2 = 0.003**2  # kPoseVariance of csrc/kernels/depth_planes.h: of poses and surface, added to the noise
 # The unknown sensor's of `SensorNoise.unknown`: 3 mm, and 1.3 mm at 1 m that grow with the square of depth.
 DEFAULT_NOISE = (9e-6, 1.69e-6)
 
 
 @public_op()
 def measure_planes(
-    depth: torch.Tensor, intrinsics: Intrinsics, noise: tuple[float, float] = DEFAULT_NOISE
+    depth: torch.Tensor,
+    intrinsics: Intrinsics,
+    noise: tuple[float, float] = DEFAULT_NOISE,
+    shared_noise: bool = False,
 ) -> torch.Tensor:
     """Fits a plane to the surface around each pixel of a depth image.
 
@@ -36,6 +38,9 @@ def measure_planes(
         intrinsics: of the image, px.
         noise: floor (m^2) and growth (1/m^2) of the variance of a depth z, floor + growth z^4; the first two numbers of
             `SensorNoise.model`.
+        shared_noise: whether neighbors share their noise, as where a sensor smoothed depth. A mean over them takes
+            nothing from it and would blur once more, so planes are fitted as if there were none: depth is the pixel's
+            own unless the window is flat to rounding. The weight counts the noise.
 
     Returns:
         float32 [H, W, 5]: unit normal away from the camera in camera axes (x right, y down, z forward), distance of the
@@ -56,7 +61,7 @@ def measure_planes(
     check_tensor(name, "depth", depth, ("H", "W"), torch.float32)
     check_intrinsics(name, intrinsics)
     check_noise(name, noise)
-    return torch.ops.spslam.measure_planes(depth, list(intrinsics), *noise)
+    return torch.ops.spslam.measure_planes(depth, list(intrinsics), *noise, shared_noise)
 
 
 def check_noise(name: str, noise: tuple[float, float]) -> None:

@@ -50,8 +50,8 @@ def scene_depth(seed=0):
     return depth
 
 
-def planes_of(depth, device="cpu", noise=NOISE, camera=CAMERA):
-    return ops.measure_planes(torch.from_numpy(depth).to(device), camera, noise)
+def planes_of(depth, device="cpu", noise=NOISE, camera=CAMERA, shared_noise=False):
+    return ops.measure_planes(torch.from_numpy(depth).to(device), camera, noise, shared_noise)
 
 
 def fused(depths, device="cpu", poses=None, voxel=VOXEL, colors=None, **options):
@@ -63,10 +63,11 @@ def fused(depths, device="cpu", poses=None, voxel=VOXEL, colors=None, **options)
     return volume
 
 
-def test_planes_are_those_of_numpy(device):
+@pytest.mark.parametrize("shared", [False, True])
+def test_planes_are_those_of_numpy(device, shared):
     depth = scene_depth()
-    got = planes_of(depth, device).cpu().double().numpy()
-    want = reference.planes(np.nan_to_num(depth).astype(np.float64), CAMERA, NOISE)
+    got = planes_of(depth, device, shared_noise=shared).cpu().double().numpy()
+    want = reference.planes(np.nan_to_num(depth).astype(np.float64), CAMERA, NOISE, shared)
     assert (want[..., 4] > 0).mean() > 0.7
     assert ((got[..., 4] > 0) != (want[..., 4] > 0)).mean() < 0.01  # where a share is a hair's breadth from a limit
     both = (got[..., 4] > 0) & (want[..., 4] > 0)
@@ -92,6 +93,22 @@ def test_planes_lower_the_noise_of_a_flat_surface_and_keep_edges():
     error = np.abs(z - depth)[known]
     assert np.sqrt((error**2).mean()) < 0.5 * 0.004
     assert error.max() < 0.02  # none lies between the two surfaces
+
+
+def test_noise_that_neighbors_share_counts_in_the_weight_alone(device):
+    depth = scene_depth()
+    got, without = planes_of(depth, device, shared_noise=True), planes_of(depth, device, noise=(0.0, 0.0))
+    known = without[..., 4] > 0
+    assert known.float().mean() > 0.7 and torch.equal(got[..., 4] > 0, known)
+    torch.testing.assert_close(got[..., :4], without[..., :4])
+    z = torch.from_numpy(depth).to(device)
+    surface = 0.003**2
+    weights = without[..., 4] * surface / (surface + NOISE[0] + NOISE[1] * z**4)
+    torch.testing.assert_close(got[..., 4][known], weights[known], rtol=1e-4, atol=0)
+    # The pixel's own depth is kept, where a fit that counts the noise takes the mean.
+    own = (z * got[..., 3] / without[..., 3])[known]
+    torch.testing.assert_close(own, z[known], rtol=1e-6, atol=0)
+    assert (planes_of(depth, device)[..., 3][known] - got[..., 3][known]).abs().max() > 1e-3
 
 
 def test_planes_are_unknown_without_depth(device):

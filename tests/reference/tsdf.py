@@ -17,14 +17,14 @@ def window_weight(du, dv):
 WHOLE = sum(window_weight(du, dv) for du in range(-2, 3) for dv in range(-2, 3))
 
 
-def planes(depth, camera, noise):
-    """float64 [H, W, 5] of a depth image [H, W]; camera is (fx, fy, cx, cy)."""
+def planes(depth, camera, noise, shared=False):
+    """float64 [H, W, 5] of a depth image [H, W]; camera is (fx, fy, cx, cy). Neighbors may share their noise."""
     height, width = depth.shape
     out = np.zeros((height, width, 5))
     for v in range(height):
         for u in range(width):
             if 0 < depth[v, u] < np.inf:
-                out[v, u] = _plane(depth, camera, noise, u, v)
+                out[v, u] = _plane(depth, camera, noise, u, v, shared)
     return out
 
 
@@ -33,7 +33,7 @@ def _slope(before, middle, after):
     return min(near, key=abs) if near else 0.0
 
 
-def _plane(depth, camera, noise, u, v):
+def _plane(depth, camera, noise, u, v, shared):
     fx, fy, cx, cy = camera
     height, width = depth.shape
 
@@ -43,7 +43,7 @@ def _plane(depth, camera, noise, u, v):
         return 1 / z if 0 < z < np.inf else 0
 
     q = inverse(0, 0)
-    variance = noise[0] + noise[1] / q**4
+    variance = 0 if shared else noise[0] + noise[1] / q**4
     slopes = np.array(
         [_slope(inverse(-1, 0), q, inverse(1, 0)) * fx / q, _slope(inverse(0, -1), q, inverse(0, 1)) * fy / q]
     )

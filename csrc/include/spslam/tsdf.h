@@ -72,9 +72,16 @@ struct TsdfView {
   float voxel_size, min_weight;
 };
 
+// The noise of depth that planes are fitted to. Where a sensor smoothed depth, neighbors share theirs: a mean over them
+// takes nothing from it, so the fit goes by the depth as it is, and only the weight counts the noise.
+struct PlaneNoise {
+  DepthNoise depth;
+  bool is_shared;
+};
+
 // The plane around each pixel of a depth image.
 template <class Device>
-void measure_planes(Device device, const DepthImage& image, const DepthNoise& noise, float* planes);
+void measure_planes(Device device, const DepthImage& image, const PlaneNoise& noise, float* planes);
 
 // Coordinates [touched_rows(frame, step), 3] of the blocks within the truncation of the planes of every step-th pixel,
 // or within two deviations of the noise, see `TsdfOptions`; with repetitions; kNoBlock in rows without one. Returns how

@@ -1,0 +1,106 @@
+"""Compiled functions on images, which need no torch: data is opened and looked at while torch is loaded.
+
+There is a library for each instruction set, of which the best that this processor has is loaded at the first call;
+`SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, as it does for `spslam.ops`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+_FOLDER = Path(__file__).resolve().parent.parent
+# The best first.
+_LIBRARY_OF_ISA = {"avx512": "_images_cpu_avx512.so", "avx2": "_images_cpu_avx2.so", "baseline": "_images_cpu.so"}
+_CHANNELS = 3
+_MOST_BYTES = 2**31 - 1  # places in an image are 32-bit numbers
+
+
+@dataclass(frozen=True)
+class ColorView:
+    """How a color camera sees what a depth camera measures.
+
+    Attributes:
+        color_size: width and height of the color image, px, at least 1.
+        depth_size: those of the depth image.
+        cells: those of the depth buffer of the color camera's view; 0 and 0 where nothing can hide from it.
+        pixel_map: float64 [3, 4], times (z u, z v, z, 1) of a depth pixel (u, v) of depth z (m) it gives (w x, w y, w):
+            the pixel (x, y) of the color image and the depth w (m) from there.
+    """
+
+    color_size: tuple[int, int]
+    depth_size: tuple[int, int]
+    cells: tuple[int, int]
+    pixel_map: np.ndarray
+
+
+def register_color(
+    view: ColorView,
+    color: np.ndarray,
+    depth: np.ndarray,
+    unseen: np.ndarray | None,
+    typical_depth: float,
+    hidden_share: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gives each pixel of a depth image its color; releases Python's lock meanwhile.
+
+    Args:
+        view: the cameras.
+        color: uint8 [Hc, Wc, 3].
+        depth: float32 [H, W], m; what is not above 0 is unknown.
+        unseen: uint8 [Hc, Wc], not 0 where the color image has no content; None for none.
+        typical_depth: of pixels without depth, m: their color is looked for there.
+        hidden_share: a point is hidden if another one falls into its cell of the depth buffer, or one beside, and is
+            nearer by this share.
+
+    Returns:
+        uint8 [H, W, 3] colors, interpolated linearly, those of the border beyond it; and float32 [H, W] depth, 0 where
+        the color camera does not see the point. Deterministic; instruction sets differ by rounding.
+
+    Raises:
+        ValueError: an image of another shape or dtype, or a color image of 2 GB or more.
+        ImportError: there is no compiled library for this processor.
+        MemoryError: there is not enough of it.
+    """
+    color = _checked("color", color, np.uint8, (*view.color_size[::-1], _CHANNELS))
+    if color.nbytes > _MOST_BYTES:
+        raise ValueError(f"register_color: color must have at most {_MOST_BYTES} bytes, got {color.nbytes}")
+    depth = _checked("depth", depth, np.float32, view.depth_size[::-1])
+    if unseen is not None:
+        unseen = _checked("unseen", unseen, np.uint8, view.color_size[::-1])
+    colors, kept = np.empty((*depth.shape, _CHANNELS), np.uint8), np.empty_like(depth)
+    sizes = np.array([*view.color_size, *view.depth_size, *view.cells], np.int32)
+    numbers = np.array([*view.pixel_map.T.ravel(), typical_depth, hidden_share], np.float32)
+    pointers = (None if array is None else array.ctypes.data for array in (color, unseen, depth, sizes, numbers))
+    if _library().spslam_register_color(*pointers, colors.ctypes.data, kept.ctypes.data):
+        raise MemoryError("register_color: not enough memory for images of this size")
+    return colors, kept
+
+
+def _checked(name: str, image: np.ndarray, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
+    if image.dtype != dtype or image.shape != shape:
+        wanted = f"{np.dtype(dtype).name} {list(shape)}"
+        raise ValueError(f"register_color: {name} must be {wanted}, got {image.dtype} {list(image.shape)}")
+    return np.ascontiguousarray(image)
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    chosen = os.environ.get("SPSLAM_CPU_ISA")
+    names = list(_LIBRARY_OF_ISA) if not chosen else [chosen]
+    for name in names:
+        path = _FOLDER / _LIBRARY_OF_ISA.get(name, f"no instruction set {name}")
+        if path.exists():
+            library = ctypes.CDLL(str(path))
+            if chosen or library.spslam_runs_here():
+                library.spslam_register_color.argtypes = [ctypes.c_void_p] * 7
+                return library
+    raise ImportError(
+        f"spslam: no compiled image functions for {' or '.join(names)} in {_FOLDER}; install the wheel, "
+        "or build in place with `make dev`"
+    )
