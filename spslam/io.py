@@ -51,7 +51,7 @@ def atomic_write_all(files: Mapping[Path, bytes]) -> None:
         OutputError: the operating system refuses. Temporary files are removed.
     """
     temporaries = {path: path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}") for path in files}
-    last = next(reversed(files))
+    *_, last = files
     try:
         for path, content in files.items():
             with writing(path):

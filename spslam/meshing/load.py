@@ -134,6 +134,7 @@ def _check(vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def _vertex_colors(mesh: trimesh.Trimesh) -> np.ndarray:
-    if mesh.visual.kind == "texture":  # which is left alone
+    # Textures are left alone.
+    if mesh.visual.kind == "texture":  # type: ignore[union-attr]
         return np.full((len(mesh.vertices), 3), _GRAY, np.uint8)
     return np.array(mesh.visual.vertex_colors, np.uint8).reshape(-1, 4)[:, :3]  # type: ignore[union-attr]

@@ -16,6 +16,8 @@ MOST_PAGE_PX = 4096
 GUTTER_PX = 3
 # Edge of the squares that charts are cut into, px.
 TILE_PX = 256
+# How far a face is thought to go on: barycentric coordinates of its gutter. A steep face would lead far off its chart.
+_LEAST_WEIGHT, _MOST_WEIGHT = -1.0, 2.0
 # Texels that faces are looked for in at once; some 100 bytes each.
 _FRAGMENTS = 2_000_000
 _SPARE, _STEP_PX, _ATTEMPTS = 1.05, 64, 8
@@ -98,7 +100,8 @@ class Texels:
     Attributes:
         places: int64 [N], where they are in the flattened pages [pages, height, width].
         faces: int32 [N], the face that each is of.
-        weights: float32 [N, 2], barycentric coordinates of the second and third corner; beyond [0, 1] outside the face.
+        weights: float32 [N, 2], barycentric coordinates of the second and third corner; beyond [0, 1], up to one face
+            off, outside the face.
         starts: int64 [L + 1], the first texel of each face.
     """
 
@@ -128,7 +131,7 @@ def find_texels(atlas: Atlas) -> Texels:
     for first in range(0, len(places), _FRAGMENTS):
         part = slice(first, first + _FRAGMENTS)
         weights[part] = _barycentric(corners[faces[part]], x[part] + 0.5, y[part] + 0.5)
-    return Texels(places, faces, weights, starts)
+    return Texels(places, faces, weights.clip(_LEAST_WEIGHT, _MOST_WEIGHT), starts)
 
 
 def _chunks(corners: np.ndarray) -> list[slice]:

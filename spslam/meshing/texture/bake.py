@@ -178,8 +178,8 @@ def warped(places: np.ndarray, warp: np.ndarray) -> np.ndarray:
 def sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Bilinear colors [N, C] of an image [H, W, C] at float32 pixel coordinates [N]."""
     short = -len(u) % _ROW
-    places = (np.pad(each, (0, short)).reshape(-1, _ROW) for each in (u, v))
-    return cv2.remap(image, *places, cv2.INTER_LINEAR).reshape(-1, image.shape[2])[: len(u)]
+    columns, rows = (np.pad(each, (0, short)).reshape(-1, _ROW) for each in (u, v))
+    return cv2.remap(image, columns, rows, cv2.INTER_LINEAR).reshape(-1, image.shape[2])[: len(u)]
 
 
 def _corner_weights(weights: np.ndarray) -> np.ndarray:

@@ -27,6 +27,8 @@ VIEWS = 12
 _SHARPNESS_POWER = 4.0
 # Of the finest pixels that saw each vertex, this quantile counts; so many texels per axis are taken for one of them.
 _FINEST_SHARE, _TEXELS_PER_PIXEL = 0.25, 1.5
+# A texel is at most this share of the mean edge of a face.
+_EDGE_SHARE = 0.7
 # Pages of 4096 x 4096 texels at most, in three quarters of which texels are: some 0.8 GB beside them while baking.
 MOST_PAGES = 2
 
@@ -117,23 +119,23 @@ def _survey(mesh: TriangleMesh, parts: Sequence[PosedFrames], noise: tuple[float
 
 
 def _fine_enough(finest: np.ndarray, mesh: TriangleMesh) -> float:
-    """Edge of a texel, m, that shows what the images saw."""
+    """Edge of a texel, m, that shows what the images saw, and no less than colors of the mesh's vertices do."""
+    edges = np.linalg.norm(mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]], axis=1)
+    texel_m = _EDGE_SHARE * float(edges.mean())
     seen = finest[np.isfinite(finest)]
-    if len(seen):
-        return float(np.quantile(seen, _FINEST_SHARE)) / _TEXELS_PER_PIXEL
-    # Nothing was seen: a texel per edge of a face has all there is.
-    return float(np.linalg.norm(mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]], axis=1).mean())
+    return min(texel_m, float(np.quantile(seen, _FINEST_SHARE)) / _TEXELS_PER_PIXEL) if len(seen) else texel_m
 
 
 def _pages(atlas: Atlas, texels: Texels, colors: np.ndarray) -> np.ndarray:
     """uint8 [P, H, W, 3]; where no chart is, the color of the nearest texel, for small copies of the pages."""
     width, height = atlas.size
-    pages = np.zeros((atlas.pages * height * width, 3), np.uint8)
-    pages[texels.places] = colors
-    empty = np.ones(len(pages), np.uint8)
-    empty[texels.places] = 0
-    pages, empty = pages.reshape(atlas.pages, height, width, 3), empty.reshape(atlas.pages, height, width)
-    for page, holes in zip(pages, empty, strict=True):
+    flat, unfilled = (
+        np.zeros((atlas.pages * height * width, 3), np.uint8),
+        np.ones(atlas.pages * height * width, np.uint8),
+    )
+    flat[texels.places], unfilled[texels.places] = colors, 0
+    pages, empty = flat.reshape(atlas.pages, height, width, 3), unfilled.reshape(atlas.pages, height, width)
+    for page, holes in zip(list(pages), list(empty), strict=True):
         _, nearest = cv2.distanceTransformWithLabels(holes, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
         color_of = np.zeros((int(nearest.max()) + 1, 3), np.uint8)
         color_of[nearest[holes == 0]] = page[holes == 0]

@@ -135,9 +135,9 @@ def _coarse_depth(u: np.ndarray, v: np.ndarray, z: np.ndarray, camera: Camera) -
     """Smallest depth float32 [h, w] of points in cells of an image; holes are filled by their neighbors."""
     width, height = camera.width // _CELL_PX + 1, camera.height // _CELL_PX + 1
     cells = (np.rint(v).astype(np.int32) // _CELL_PX) * width + np.rint(u).astype(np.int32) // _CELL_PX
-    nearest = np.full(width * height, np.float32(np.inf))
-    np.minimum.at(nearest, cells, z)
-    nearest = nearest.reshape(height, width)
+    flat = np.full(width * height, np.float32(np.inf))
+    np.minimum.at(flat, cells, z)
+    nearest: np.ndarray = flat.reshape(height, width)
     for _ in range(2):
         nearest = np.where(np.isinf(nearest), cv2.erode(nearest, np.ones((3, 3), np.uint8)), nearest)
     return nearest
