@@ -48,6 +48,7 @@ dev: $(ENVIRONMENT) ## build the kernels in place for this machine; SPSLAM_CUDA=
 	  -DSPSLAM_CPU_ISAS=$(NATIVE_ISA) -DSPSLAM_TORCH_DIR=$$($(PYTHON) cmake/spslam_build.py)
 	$(RUN) cmake --build build/dev-$(SPSLAM_CUDA) -j $(JOBS)
 	$(RUN) cmake --install build/dev-$(SPSLAM_CUDA) --component python > /dev/null
+	$(RUN) cmake --install build/dev-$(SPSLAM_CUDA) --component images > /dev/null
 
 example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, without torch, and run examples/cpp on them
 	$(RUN) cmake -S . -B build/cxx -G Ninja -DSPSLAM_CUDA=OFF -DSPSLAM_CPU_ISAS=baseline -DSPSLAM_TORCH_DIR= \
@@ -80,6 +81,7 @@ test-asan: $(ENVIRONMENT) ## the tests of compiled functions on the CPU with add
 	rm -rf build/asan-site && mkdir build/asan-site
 	cp -r spslam tests configs pyproject.toml build/asan-site && rm -f build/asan-site/spslam/*.so
 	$(RUN) cmake --install build/asan --component python --prefix build/asan-site > /dev/null
+	$(RUN) cmake --install build/asan --component images --prefix build/asan-site > /dev/null
 	cd build/asan-site && LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops \
 	  tests/datasets/test_image_kernels.py

@@ -55,7 +55,8 @@ class CMakeBuild(build_ext):
         subprocess.check_call(["cmake", "--fresh", "-S", str(ROOT), "-B", str(build), "-G", "Ninja", *arguments])
         jobs = os.environ.get("MAX_JOBS") or os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL")
         subprocess.check_call(["cmake", "--build", str(build), *(["-j", jobs] if jobs else [])])
-        subprocess.check_call(["cmake", "--install", str(build), "--component", "python"])
+        for component in ("python", "images"):
+            subprocess.check_call(["cmake", "--install", str(build), "--component", component])
 
 
 class PlatformWheel(bdist_wheel):

@@ -87,13 +87,13 @@ function(spslam_op_library name)
   install(TARGETS ${name} LIBRARY DESTINATION spslam COMPONENT python)
 endfunction()
 
-# Links `name` as a library of plain C functions, for Python without torch.
+# Links `name` as a library of plain C functions, for Python without torch; `spslam.ops` alone has no use for it.
 function(spslam_plain_library name)
   add_library(${name} MODULE ${SPSLAM_PLAIN_SOURCES})
   spslam_source_includes(${name})
   target_link_options(${name} PRIVATE -Wl,--exclude-libs,ALL)
   set_target_properties(${name} PROPERTIES PREFIX "" SKIP_BUILD_RPATH ON)
-  install(TARGETS ${name} LIBRARY DESTINATION spslam COMPONENT python)
+  install(TARGETS ${name} LIBRARY DESTINATION spslam COMPONENT images)
 endfunction()
 
 if(SPSLAM_SANITIZE)

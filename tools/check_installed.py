@@ -16,6 +16,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 ISAS = {"AVX512": ("baseline", "avx2", "avx512"), "AVX2": ("baseline", "avx2")}
 DRAW = "from spslam import ops; print(ops.CPU_ISA, ops.philox_uniform(0, 0, 0, 0, 3).tolist())"
+# Color that another camera took, by the library of plain functions that reading uses.
+REGISTER = """
+import numpy as np
+from spslam.camera import Camera
+from spslam.datasets.registration import ColorToDepth
+
+camera, place = Camera(8, 6, 9.0, 9.0, 3.5, 2.5), np.eye(4)
+place[0, 3] = 0.02
+colors, depth = ColorToDepth(camera, camera, place)(np.full((6, 8, 3), 9, np.uint8), np.ones((6, 8), np.float32))
+assert (colors == 9).all() and depth.any()
+"""
 
 
 def spslam(*arguments: str) -> str:
@@ -63,7 +74,7 @@ def check_doctor() -> None:
 
 
 def check_instruction_sets() -> None:
-    """The same draws from every library that this processor can run."""
+    """The same draws and colors from every library that this processor can run."""
     import torch
 
     import spslam
@@ -72,6 +83,7 @@ def check_instruction_sets() -> None:
     for isa in ISAS.get(torch.backends.cpu.get_cpu_capability(), ("baseline",)):
         if isa == "baseline" or (folder / f"_ops_cpu_{isa}.so").exists():
             print(python("-c", DRAW, SPSLAM_CPU_ISA=isa), end="")
+            python("-c", REGISTER, SPSLAM_CPU_ISA=isa)
 
 
 def check_examples() -> None:

@@ -14,6 +14,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.images import read_color, read_depth, resized_color
 from spslam.datasets.lens import Rectification
+from spslam.datasets.registration import ColorToDepth
 from spslam.datasets.text import read_pose, read_pose_table
 from spslam.errors import DatasetError
 
@@ -50,6 +51,7 @@ class FileDataset(RgbdDataset):
         invalid_depth: see `spslam.datasets.images.read_depth`.
         undistortion: of the color lens, applied to both images: depth that is registered to color lies in its pixels.
         resize_color: bring each color image, of whatever size, to its depth image's size.
+        registration: brings the color image, which another camera took, to the depth camera's view.
         is_registered: see `RgbdDataset`.
     """
 
@@ -61,6 +63,7 @@ class FileDataset(RgbdDataset):
     invalid_depth: Sequence[int] = ()
     undistortion: Rectification | None = None
     resize_color: bool = False
+    registration: ColorToDepth | None = None
     depth_range: tuple[float, float] = field(default=(0.0, float("inf")))
     border_px: int = 0
     is_registered: bool = True
@@ -89,6 +92,8 @@ class FileDataset(RgbdDataset):
             color, depth = self.undistortion.color(color), self.undistortion.depth(depth)
         if self.resize_color:
             color = resized_color(color, depth.shape[1], depth.shape[0])
+        if self.registration is not None:
+            color, depth = self.registration(color, depth, in_place=True)
         return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index), paths.offsets)
 
     def describe(self, index: int) -> str:

@@ -46,6 +46,7 @@ def register_color(
     unseen: np.ndarray | None,
     typical_depth: float,
     hidden_share: float,
+    in_place: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gives each pixel of a depth image its color; releases Python's lock meanwhile.
 
@@ -57,6 +58,8 @@ def register_color(
         typical_depth: of pixels without depth, m: their color is looked for there.
         hidden_share: a point is hidden if another one falls into its cell of the depth buffer, or one beside, and is
             nearer by this share.
+        in_place: write depth into `depth`, if that is contiguous: the fresh memory of one more image costs nearly as
+            much as all of this, where the heap has to grow for it.
 
     Returns:
         uint8 [H, W, 3] colors, interpolated linearly, those of the border beyond it; and float32 [H, W] depth, 0 where
@@ -73,7 +76,8 @@ def register_color(
     depth = _checked("depth", depth, np.float32, view.depth_size[::-1])
     if unseen is not None:
         unseen = _checked("unseen", unseen, np.uint8, view.color_size[::-1])
-    colors, kept = np.empty((*depth.shape, _CHANNELS), np.uint8), np.empty_like(depth)
+    colors = np.empty((*depth.shape, _CHANNELS), np.uint8)
+    kept = depth if in_place else np.empty_like(depth)
     sizes = np.array([*view.color_size, *view.depth_size, *view.cells], np.int32)
     numbers = np.array([*view.pixel_map.T.ravel(), typical_depth, hidden_share], np.float32)
     pointers = (None if array is None else array.ctypes.data for array in (color, unseen, depth, sizes, numbers))

@@ -136,18 +136,22 @@ class ColorToDepth:
             self._size, (depth.width, depth.height), cells, _pixel_map(color, depth, color_from_depth)
         )
 
-    def __call__(self, color: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(
+        self, color: np.ndarray, depth: np.ndarray, *, in_place: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Both images in the depth camera's view.
 
         Args:
             color: uint8 [Hc, Wc, 3].
             depth: float32 [H, W], m, 0 where nothing was measured.
+            in_place: whether `depth` may be written to.
 
         Returns:
             uint8 [H, W, 3], and float32 [H, W].
         """
         image = resized_color(color, *self._size)
-        return register_color(self._view, image, depth, self._unseen, typical_depth(depth), _HIDDEN_SHARE)
+        typical_m = typical_depth(depth)
+        return register_color(self._view, image, depth, self._unseen, typical_m, _HIDDEN_SHARE, in_place)
 
 
 def typical_depth(depth: np.ndarray) -> float:

@@ -23,10 +23,10 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
     Args:
         config: any object with the attribute `type` (one of `dataset_types()`) and, each optional or None: `path`,
             `stride` (every n-th frame), `min_depth_m`, `max_depth_m` (depth outside comes as 0), `border_px` (so does
-            depth this close to the image's border), and the options of the kind: `sequence` (7scenes), `depth_variant`
-            (synthetic_rgbd), `depth_scale`, `min_confidence`, `pair_tolerance_s` and `register_to` (recordings of one's
-            own), the fields of `RosOptions` (rosbag), `frames`, `width`, `height`, `noise`, `seed` (generated), and
-            the arguments of `PlacesDataset` and its `Capture` (places).
+            depth this close to the image's border), and the options of the kind: `sequence` and `registered` (7scenes),
+            `depth_variant` (synthetic_rgbd), `depth_scale`, `min_confidence`, `pair_tolerance_s` and `register_to`
+            (recordings of one's own), the fields of `RosOptions` (rosbag), `frames`, `width`, `height`, `noise`, `seed`
+            (generated), and the arguments of `PlacesDataset` and its `Capture` (places).
         data_dir: the data's folder or file; overrides `config.path`. Not needed by `generated` and `places`.
 
     Raises:
@@ -136,7 +136,7 @@ def _load(module: str, name: str) -> Any:
 
 _Opener = Callable[[Any, Path], RgbdDataset]
 _OPENERS: dict[str, _Opener] = {
-    "7scenes": _open_with("seven_scenes", "open_seven_scenes", "sequence"),
+    "7scenes": _open_with("seven_scenes", "open_seven_scenes", "sequence", "registered"),
     "synthetic_rgbd": _open_with("synthetic_rgbd", "open_synthetic_rgbd", "depth_variant"),
     "tum": _open_with("tum", "open_tum"),
     "replica": _open_with("replica", "open_replica"),

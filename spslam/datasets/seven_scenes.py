@@ -2,8 +2,9 @@
 
 A scene folder holds `seq-01`, `seq-02`, ..., each with `frame-NNNNNN.color.png` (or jpg), `.depth.png`
 (16-bit millimeters; 0 and 65535 are invalid) and `.pose.txt` (4x4 camera to world, OpenCV axes). The poses are
-KinectFusion's; their rotations aren't quite orthonormal and are projected to SO(3). Color and depth were not
-registered to each other by the dataset's authors; both are taken as one camera's, as everybody does.
+KinectFusion's, of the depth camera; their rotations aren't quite orthonormal and are projected to SO(3). The dataset's
+authors did not register color and depth to each other, nor do they say where the color camera is. Here color is brought
+to the depth camera's view by a calibration of a Kinect v1 that is published elsewhere (below); depth stays as measured.
 """
 
 from __future__ import annotations
@@ -11,9 +12,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
 from spslam.camera import Camera
 from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import first_size
+from spslam.datasets.registration import ColorToDepth
 from spslam.datasets.text import read_intrinsics_matrix, read_rows
 from spslam.errors import DatasetError
 
@@ -22,12 +26,23 @@ INTRINSICS_FILE = "camera-intrinsics.txt"
 FRAMES_PER_SECOND = 30.0
 # "The default intrinsics for this sensor", as the dataset's page gives them for 640x480.
 _DEFAULT_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+# The color camera, and where it is: points of the depth camera to points of the color camera, m. Used for 7-Scenes by
+# ACE (Brachmann et al. 2023), datasets/setup_7scenes.py, which takes the place from the LIRIS human activities dataset (Wolf et al. 2014, "Kinect calibration"), whose Kinect was another of this kind.
+_COLOR_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+_COLOR_FROM_DEPTH = np.array(
+    [
+        [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03, -2.5558943178152542e-02],
+        [-2.7409311281316700e-03, 9.9996302803027592e-01, -8.1504520778013286e-03, 1.0109636268061706e-04],
+        [7.8819942130445332e-03, 8.1718328771890631e-03, 9.9993554558014031e-01, 2.0318321729487039e-03],
+        [0, 0, 0, 1],
+    ]
+)
 _MOST_DIGITS = 9  # of a sequence's number
 _COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
 _DEPTH_NAME = r"frame-(\d+)\.depth\.png"
 
 
-def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDataset:
+def open_seven_scenes(folder: Path, sequence: str | int | None = None, registered: bool | None = None) -> FileDataset:
     """Opens one sequence of a scene.
 
     The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the dataset's default
@@ -38,6 +53,8 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
         folder: the scene (with `seq-XX` in it) or a sequence itself.
         sequence: `seq-03` or its number; `train` or `test` is the first of TrainSplit.txt or TestSplit.txt. None is the
             first that is there.
+        registered: whether the images are one camera's already and are left as they are. None: they are not if the
+            camera is the dataset's default one, and are of any other.
 
     Raises:
         DatasetError: a missing folder, another layout, an absent sequence, unreadable intrinsics.
@@ -55,8 +72,17 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None) -> FileDa
         pair_numbered(colors, depths, FRAMES_PER_SECOND),
         lambda number: sequence_folder / f"frame-{number:06d}.pose.txt",
     )
-    name = f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}"
-    return FileDataset(name, camera, frames, poses, units_per_meter=1000.0, invalid_depth=(65535,), is_registered=False)
+    registration = None if _is_registered(camera, registered) else _registration(camera)
+    return FileDataset(
+        f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}",
+        camera,
+        frames,
+        poses,
+        units_per_meter=1000.0,
+        invalid_depth=(65535,),
+        registration=registration,
+        is_registered=registration is not None,  # what is taken as one camera's need not be
+    )
 
 
 def list_sequences(scene: Path, split: str | None = None) -> list[str]:
@@ -111,3 +137,14 @@ def _find_camera(sequence_folder: Path, colors: list[Path]) -> Camera:
         if (folder / INTRINSICS_FILE).is_file():
             return read_intrinsics_matrix(folder / INTRINSICS_FILE, width, height)
     return _DEFAULT_CAMERA.resized(width, height)
+
+
+def _is_registered(camera: Camera, registered: bool | None) -> bool:
+    if registered is not None:
+        return registered
+    return camera != _DEFAULT_CAMERA.resized(camera.width, camera.height)
+
+
+def _registration(camera: Camera) -> ColorToDepth:
+    color = _COLOR_CAMERA.resized(camera.width, camera.height)
+    return ColorToDepth(color, camera, _COLOR_FROM_DEPTH)

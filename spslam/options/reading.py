@@ -82,8 +82,9 @@ class DatasetOptions(Section):
         needs=_of("folder", *get_args(TwoCameras)),
     )
     registered: bool | None = option(
-        "whether depth is in the color camera's view already; null finds out by the recording's frames",
-        needs=_of("rosbag", "realsense"),
+        "whether depth is in the color camera's view already; null finds out by the recording's frames, for `7scenes` "
+        "by the camera: images of its Kinect are registered by a published calibration, others left as they are",
+        needs=_of("rosbag", "realsense", "7scenes"),
     )
     pair_tolerance_s: float = option(
         "color and depth images are one frame if they are less apart in time; the nearest are paired first",

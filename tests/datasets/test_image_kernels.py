@@ -95,6 +95,16 @@ def test_depth_that_is_no_number():
     np.testing.assert_array_equal(found, expected)
 
 
+def test_depth_may_be_written_where_it_was():
+    both = cameras((160, 120), (160, 120))
+    color, depth = images((160, 120), (160, 120))
+    expected = ColorToDepth(*both, BESIDE)(color, depth)
+    found = ColorToDepth(*both, BESIDE)(color, depth, in_place=True)
+    assert found[1] is depth
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_camera_that_looks_the_other_way_sees_nothing():
     both = cameras((160, 120), (160, 120))
     around = pose_from(np.diag([-1.0, 1.0, -1.0]), np.array([0.1, 0, 0]))
