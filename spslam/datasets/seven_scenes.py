@@ -27,7 +27,8 @@ FRAMES_PER_SECOND = 30.0
 # "The default intrinsics for this sensor", as the dataset's page gives them for 640x480.
 _DEFAULT_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 # The color camera, and where it is: points of the depth camera to points of the color camera, m. Used for 7-Scenes by
-# ACE (Brachmann et al. 2023), datasets/setup_7scenes.py, which takes the place from the LIRIS human activities dataset (Wolf et al. 2014, "Kinect calibration"), whose Kinect was another of this kind.
+# ACE (Brachmann et al. 2023), datasets/setup_7scenes.py, which takes the place from the LIRIS human activities dataset
+# (Wolf et al. 2014, "Kinect calibration"), whose Kinect was another of this kind.
 _COLOR_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 _COLOR_FROM_DEPTH = np.array(
     [
