@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -41,11 +40,6 @@ class TrackingProblem:
     predicted: torch.Tensor
     frame: int
     constraints: Constraints = Constraints()
-
-    @cached_property
-    def predicted_numbers(self) -> list[float]:
-        """The seven numbers of `predicted`; waits for the device."""
-        return self.predicted.tolist()
 
 
 @dataclass(frozen=True)
@@ -165,11 +159,12 @@ class Tracker:
         )
         if meanwhile is not None:
             meanwhile()
-        # Waits for the device: whether the pose is trusted decides what is done next.
-        numbers = found.tolist()
+        # Waits for the device, once: whether the pose is trusted decides what is done next.
+        is_predicted = start is problem.predicted
+        numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
         start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], numbers[14:50]
-        mean_square, inlier_share, _, _, mean_robust_weight = numbers[-5:]
-        predicted = start_numbers if start is problem.predicted else problem.predicted_numbers
+        mean_square, inlier_share, _, _, mean_robust_weight = numbers[len(found) - 5 : len(found)]
+        predicted = start_numbers if is_predicted else numbers[len(found) :]
         error_cm, error_deg = prediction_error(predicted, pose_numbers)
         fit = Fit(
             residual_cm=100 * math.sqrt(max(mean_square, 0.0)),

