@@ -106,6 +106,8 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
     started = time.perf_counter()
     if job.texture is not None:
         check_textured_format(path)
+        if dataset is None:
+            raise OutputError(f"{path}: a texture is made of frames, and none can be read again")
     trajectories = [*(each.trajectory for each in job.earlier), job.trajectory]
     tracked = np.concatenate([each.poses[~each.lost] for each in trajectories])
     figures: dict[str, Any] = {"mesh_source": "neural" if dataset is None else job.options.source}
@@ -119,7 +121,7 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
         mesh = extract_fused_mesh(volume, job.scene, dataset.camera, tracked)
         resolution_m = volume.voxel_size
         figures |= {"mesh_frames": sum(len(part) for part in frames), "mesh_mb": volume.nbytes / 2**20}
-    if job.texture is None:
+    if job.texture is None or dataset is None:
         save_mesh(mesh, path)
     else:
         figures |= _write_textured(path, mesh, job, dataset, job.texture.texel_m)
@@ -127,13 +129,11 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
 
 
 def _write_textured(
-    path: Path, mesh: TriangleMesh, job: MeshJob, dataset: RgbdDataset | None, texel_m: float | None
+    path: Path, mesh: TriangleMesh, job: MeshJob, dataset: RgbdDataset, texel_m: float | None
 ) -> dict[str, Any]:
     """Bakes the texture of a mesh, writes both, and says how large it is."""
     from spslam.meshing.texture import TextureOptions, texture_mesh
 
-    if dataset is None:
-        raise OutputError(f"{path}: a texture is made of frames, and none can be read again")
     if not len(mesh.faces):
         raise OutputError(f"{path}: a mesh without faces can't have a texture")
     options = TextureOptions(job.noise or DEFAULT_NOISE, texel_m)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, SpslamError
 from spslam.meshing import TriangleMesh
 from spslam.meshing.texture import TextureOptions, atlas, texture_mesh, texturing
 from spslam.meshing.texture.registration import register
@@ -133,6 +133,12 @@ def test_larger_texels_where_pages_are_full(monkeypatch):
     assert textured.pages.shape[0] == 2 and max(textured.pages.shape[1:3]) <= 128
     points, colors = surface_colors(textured)
     assert rms(colors, points) < 6
+
+
+def test_more_charts_than_pages_have_room_for_are_refused(monkeypatch):
+    monkeypatch.setattr(atlas, "MOST_PAGE_PX", 8)
+    with pytest.raises(SpslamError, match="more than 1 pages .* charts; a coarser mesh"):
+        atlas.make_atlas(mesh_of(*CORNER), 0.004, 1)
 
 
 def test_layers_over_each_other_have_their_own_texels():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from spslam.errors import SpslamError
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.texture.charts import Charts, make_charts
 
@@ -58,6 +59,9 @@ def make_atlas(mesh: TriangleMesh, texel_m: float, most_pages: int) -> Atlas:
 
     Returns:
         The atlas. Deterministic.
+
+    Raises:
+        SpslamError: even large texels need more pages, as of a mesh in very many pieces.
     """
     for _ in range(_ATTEMPTS):
         charts = make_charts(mesh, texel_m * TILE_PX)
@@ -68,6 +72,11 @@ def make_atlas(mesh: TriangleMesh, texel_m: float, most_pages: int) -> Atlas:
             break
         full = (pages - 1) * MOST_PAGE_PX**2 + size[0] * size[1]
         texel_m *= max(float(np.sqrt(full / (most_pages * MOST_PAGE_PX**2))), 1.02)
+    else:
+        raise SpslamError(
+            f"a texture of this mesh needs more than {most_pages} pages of {MOST_PAGE_PX} x {MOST_PAGE_PX} texels of "
+            f"any size, as it has {len(charts.sizes_m)} charts; a coarser mesh (--resolution) has fewer"
+        )
     corner_chart = np.zeros(len(charts.vertices), np.int64)
     corner_chart[charts.faces] = charts.of_faces[:, None]
     corners = charts.places_m / np.float32(texel_m) + offsets[corner_chart] + np.float32(GUTTER_PX + 0.5)

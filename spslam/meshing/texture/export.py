@@ -14,8 +14,9 @@ import numpy as np
 from spslam.errors import OutputError
 from spslam.io import atomic_write, atomic_write_all
 from spslam.meshing.texture.textured_mesh import TexturedMesh
+from spslam.run_folder import TEXTURED_FORMATS
 
-TEXTURED_FORMATS = (".glb", ".obj")
+_SUFFIXES = tuple(f".{name}" for name in TEXTURED_FORMATS)
 # Of PNG, 0 to 9: the first gives nearly the size of the last at a third of the time.
 _COMPRESSION = 3
 # Numbers of the glTF 2.0 specification.
@@ -26,8 +27,8 @@ _GLB_MAGIC, _GLB_VERSION, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 2, b"JSON", b"BI
 
 def check_textured_format(path: Path) -> None:
     """Raises OutputError where a file of this name can't have a texture."""
-    if path.suffix.lower() not in TEXTURED_FORMATS:
-        known = " or ".join(TEXTURED_FORMATS)
+    if path.suffix.lower() not in _SUFFIXES:
+        known = " or ".join(_SUFFIXES)
         raise OutputError(f"{path}: a mesh with a texture must be written as {known}, got {path.suffix or 'no suffix'}")
 
 
