@@ -88,6 +88,28 @@ def test_a_frame_near_the_map_is_found(dataset, preset):
     assert np.linalg.norm(result.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
 
 
+@pytest.mark.parametrize(("shift_m", "goes_on"), [(0.0, False), (0.2, True)])
+def test_tracking_goes_on_where_the_prediction_was_far_off(dataset, monkeypatch, shift_m, goes_on):
+    system = processed(dataset, 1)
+    tracker, truth = system.tracker, dataset.poses()[1]
+    pixels = sample_frame(dataset[1], dataset.camera, system.config)
+    start = pose_tensor(truth, CPU)
+    start[4:] += shift_m / 3**0.5
+    problem = TrackingProblem(system.state.scene, pixels.records, start, system.config.tracking.first_frames + 1)
+
+    def tracked():
+        found = tracker.track(problem)
+        return found, np.linalg.norm(found.pose[4:].numpy() - truth[:3, 3])
+
+    (found, error_m), once = tracked(), system.config.tracking.iterations
+    assert found.iterations == (2 * once if goes_on else once)
+    monkeypatch.setattr("spslam.slam.tracker.FAR_CM", np.inf)
+    monkeypatch.setattr("spslam.slam.tracker.FAR_DEG", np.inf)
+    at_once, error_at_once_m = tracked()
+    assert at_once.iterations == once
+    assert error_m < 0.5 * error_at_once_m if goes_on else torch.equal(found.pose, at_once.pose)
+
+
 def test_the_host_may_work_while_a_frame_is_tracked(dataset):
     system, states = processed(dataset, 1), []
     system.while_tracking = lambda: states.append(len(system.state.frames))

@@ -19,7 +19,7 @@ REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones fea
 LATE_S = 0.02
 # Of the features that agree with the earlier frame seen best: those of a frame that shares fewer contradict no pose, as
 # where the camera has turned away from it they lie at the edge of both images.
-FEW_FEATURES = 0.1
+FEW_FEATURES = 0.3
 MAX_TURN_DEG_S = 300.0  # of a camera; what moves faster in the image has jumped
 
 

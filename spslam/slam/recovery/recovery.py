@@ -27,7 +27,7 @@ LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
 LIKELY_MIN_EIGENVALUE = 0.004  # of each of them at least: poses that slide along a plane are consistent too
 OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
 ANCHORS = 2  # stored frames that hold a pose beside the last one
-WEAK_EIGENVALUE = 0.0015  # below it surface leaves a direction almost free
+WEAK_EIGENVALUE = 0.003  # below it surface leaves a direction almost free
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight; smaller differences come from the random choice of pixels
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
@@ -135,13 +135,17 @@ class Recovery:
         frame = frame.with_speed(row, matches)
         matches += frame.matched(self._anchors(history, row))
         pose = image.held(tracked.pose, tracked.information, matches, frame.late_px)
+        if pose is None and sum(map(len, matches)) >= MIN_DECIDING:
+            return self._recover(problem, tracked, pixels, history, image)  # it has slid too far to be held
         if pose is None:
             return replace(tracked, features=image.read)
         estimate = self._tracker.measure(problem, pose)
         frame = replace(frame, matches=tuple(image.counted(one, pose) for one in matches))
         held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.read)
         held = self._judged(held)
-        return held if held.weight > tracked.weight - MAX_LOSS else self._recover(problem, tracked, pixels, history)
+        if held.weight > tracked.weight - MAX_LOSS:
+            return held
+        return self._recover(problem, tracked, pixels, history, image)
 
     def _check_occlusion(
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
@@ -157,12 +161,24 @@ class Recovery:
         return self._judged(replace(tracked, fit=frame.with_features(fit, tracked.pose)))
 
     def _recover(
-        self, problem: TrackingProblem, first: TrackedFrame, pixels: FramePixels, history: FrameHistory
+        self,
+        problem: TrackingProblem,
+        first: TrackedFrame,
+        pixels: FramePixels,
+        history: FrameHistory,
+        image: FeatureAlignment | None = None,
     ) -> TrackedFrame:
-        """The best result from the prediction and the last trusted frame; if that is lost, also from similar frames."""
-        frame = DoubtfulFrame(
-            problem, pixels, history, IcpAlignment(pixels, self._camera), self._features(problem, pixels, history)
-        )
+        """The best result from the prediction and the last trusted frame; if that is lost, also from similar frames.
+
+        Args:
+            problem: the frame.
+            first: the result from the prediction.
+            pixels: of the frame.
+            history: the frames before.
+            image: its image features; None extracts them.
+        """
+        image = self._features(problem, pixels, history) if image is None else image
+        frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
         frame, starts = self._starts_at_last(frame, first)
         candidates, iterations = self._track_from(frame, first, starts), 0
         seen = self._seen(frame, starts)
