@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+FAR_CM, FAR_DEG = 2.0, 1.5  # from the prediction
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -41,6 +43,11 @@ class Fit:
     brightness_correlation: float = math.nan
     feature_inliers: float = math.nan
     feature_share: float = math.nan
+
+    @property
+    def is_far_from_prediction(self) -> bool:
+        """Whether the motion model was wrong by so much that tracking may have stopped half-way, or slid."""
+        return self.prediction_error_cm > FAR_CM or self.prediction_error_deg > FAR_DEG
 
 
 def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:

@@ -18,10 +18,9 @@ from spslam.slam.render_options import render_options
 
 INDEPENDENT_PIXELS = 300  # as many a frame's pixels are worth: the map's errors are alike for neighbors
 LEAST_DEVIATION_M = 0.003  # of a pixel
-FAR_CM, FAR_DEG = 2.0, 1.5  # from the prediction: there Gauss-Newton may not have converged, and goes on
 # A plain wall's map moves the camera along it by its own noise, by centimeters a frame, before the brightness of depth
 # keyframes has a say: directions of less information than this, per pixel and m^2, wait for them.
-HELD_INFORMATION = 0.01
+HELD_INFORMATION = 0.1
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ class Tracker:
         if tracking.optimizer == "adam":
             return self._track_adam(problem, iterations)
         found = self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
-        if found.fit.prediction_error_cm > FAR_CM or found.fit.prediction_error_deg > FAR_DEG:
+        if found.fit.is_far_from_prediction:
             return replace(self.track_from(problem, found.pose), iterations=iterations + tracking.iterations)
         return found
 

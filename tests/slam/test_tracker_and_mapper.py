@@ -103,8 +103,8 @@ def test_tracking_goes_on_where_the_prediction_was_far_off(dataset, monkeypatch,
 
     (found, error_m), once = tracked(), system.config.tracking.iterations
     assert found.iterations == (2 * once if goes_on else once)
-    monkeypatch.setattr("spslam.slam.tracker.FAR_CM", np.inf)
-    monkeypatch.setattr("spslam.slam.tracker.FAR_DEG", np.inf)
+    monkeypatch.setattr("spslam.slam.fit.FAR_CM", np.inf)
+    monkeypatch.setattr("spslam.slam.fit.FAR_DEG", np.inf)
     at_once, error_at_once_m = tracked()
     assert at_once.iterations == once
     assert error_m < 0.5 * error_at_once_m if goes_on else torch.equal(found.pose, at_once.pose)

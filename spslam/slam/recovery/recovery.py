@@ -24,10 +24,10 @@ from spslam.slam.tracker import PoseEstimate, Tracker, TrackingProblem
 CONSISTENT_FRAMES = 4  # lost frames in a row whose likely poses are consistent are found
 CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one of them to the next
 LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
-LIKELY_MIN_EIGENVALUE = 0.004  # of each of them at least: poses that slide along a plane are consistent too
 OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
 ANCHORS = 2  # stored frames that hold a pose beside the last one
-WEAK_EIGENVALUE = 0.003  # below it surface leaves a direction almost free
+WEAK_EIGENVALUE = 0.004  # below it surface leaves a direction almost free: poses that slide fit, and are consistent
+UNSURE_EIGENVALUE = 0.01  # below it so may a pose that is far from its prediction
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight; smaller differences come from the random choice of pixels
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
@@ -121,7 +121,8 @@ class Recovery:
     def _may_have_slid(self, tracked: TrackedFrame) -> bool:
         """Whether surface leaves a direction so free that image features are asked."""
         tracking = self._config.tracking
-        return tracking.features and tracking.recovery and tracked.fit.min_eigenvalue < WEAK_EIGENVALUE
+        least = UNSURE_EIGENVALUE if tracked.fit.is_far_from_prediction else WEAK_EIGENVALUE
+        return tracking.features and tracking.recovery and tracked.fit.min_eigenvalue < least
 
     def _held(
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
@@ -324,7 +325,7 @@ class Recovery:
         if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
             return replace(tracked, consistent_frames=0)
         is_likely = (
-            tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= LIKELY_MIN_EIGENVALUE
+            tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
         )
         frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(is_consistent))
         if frames >= CONSISTENT_FRAMES:
