@@ -116,11 +116,12 @@ class FrameHistory:
         state = self._state
         if state.depth_keyframes is None:
             return None
-        selected = state.depth_keyframes.select(len(state.frames), state.frames.lost.numpy(), state.frames.poses)
+        frames = state.frames
+        selected = state.depth_keyframes.select(len(frames), frames.is_lost, frames.pose_rows)
         if selected is None:
             return None
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
-        motion = self.motion(len(state.frames), depth_time, color_offset)
+        motion = self.motion(len(frames), depth_time, color_offset)
         timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
         return selected._replace(timing=timing)
 

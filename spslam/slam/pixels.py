@@ -19,6 +19,7 @@ from spslam.datasets.base import RgbdFrame
 from spslam.slam.depth_keyframes import depth_image_step, depth_unit
 
 THUMBNAIL_STEP_PX = 16
+WORD_BYTES = 4  # of the buffer
 
 
 @dataclass(frozen=True)
@@ -48,32 +49,33 @@ class FramePixels:
     @cached_property
     def records(self) -> torch.Tensor:
         """int32 [P, 3] packed pixels in random order, so that any prefix is an even sample; a view of the buffer."""
-        return self.buffer[: 3 * self.count].view(-1, 3)
+        return self._view(torch.int32, 0, (self.count, 3))
 
     @cached_property
     def normals(self) -> torch.Tensor:
         """float32 [P, 3] unit normals in camera axes, turned to the camera, 0 where unknown; a view of the buffer."""
-        return self.buffer[3 * self.capacity :][: 3 * self.count].view(torch.float32).view(-1, 3)
+        return self._view(torch.float32, 3 * self.capacity, (self.count, 3))
 
     @cached_property
     def depth_thumbnail(self) -> torch.Tensor:
         """float16 [h, w] depth (m) at every `THUMBNAIL_STEP_PX`-th pixel, 0 where invalid; a view of the buffer."""
-        rows, columns = self.thumbnail_shape
-        return self.buffer[6 * self.capacity :].view(torch.float16)[: rows * columns].view(rows, columns)
+        return self._view(torch.float16, 6 * self.capacity, self.thumbnail_shape)
 
     @cached_property
     def depth_image(self) -> torch.Tensor:
         """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown; a view of the buffer."""
-        rows, columns = self.depth_image_shape
-        words = self.buffer[len(self.buffer) - sum(self._image_words) :][: self._image_words[0]]
-        return words.view(torch.uint16)[: rows * columns].view(rows, columns)
+        return self._view(torch.uint16, self.buffer.numel() - sum(self._image_words), self.depth_image_shape)
 
     @cached_property
     def intensity_image(self) -> torch.Tensor:
         """uint8 [h', w'] intensity in 1/255 of the same pixels; a view of the buffer."""
-        rows, columns = self.depth_image_shape
-        words = self.buffer[len(self.buffer) - self._image_words[1] :]
-        return words.view(torch.uint8)[: rows * columns].view(rows, columns)
+        return self._view(torch.uint8, self.buffer.numel() - self._image_words[1], self.depth_image_shape)
+
+    def _view(self, dtype: torch.dtype, word: int, shape: tuple[int, int]) -> torch.Tensor:
+        """What the buffer holds from a word on, [rows, columns]; a frame asks for several, so in few operations."""
+        content = self.buffer if dtype == torch.int32 else self.buffer.view(dtype)
+        first = content.storage_offset() + word * WORD_BYTES // content.element_size()
+        return content.as_strided(shape, (shape[1], 1), first)
 
     @property
     def _image_words(self) -> tuple[int, int]:

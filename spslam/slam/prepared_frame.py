@@ -30,6 +30,8 @@ class PreparedFrame:
         signature: what tells frozen depth; None where nobody asks.
         features: of its image, where they are kept in any case and were extracted ahead; else this is done once the
             pose is known.
+        features_ahead: of its image, where those of as many processed frames are kept; None if they were not extracted
+            ahead, or are in `features`.
         offsets: as of `RgbdFrame`.
     """
 
@@ -41,6 +43,7 @@ class PreparedFrame:
     requested: DeviceEvent | None = None
     signature: FrameSignature | None = None
     features: ImageFeatures | None = None
+    features_ahead: ImageFeatures | None = None
     offsets: CaptureOffsets = AT_ONCE
 
     @property
@@ -74,10 +77,21 @@ class FramePreparation:
         frame, config = self._dataset[i + self._start], self._config
         prepared = PreparedFrame.of(frame, self._dataset.camera, config)
         if keeps_features(config, i + self._start):
-            pixels = cast(FramePixels, prepared.pixels)
-            prepared.features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
+            prepared.features = self._features(prepared)
         prepared.signature = FrameSignature.of(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         if self._uploader:
             prepared.pixels = self._uploader.send(cast(FramePixels, prepared.pixels))
         return prepared
+
+    def extract_ahead(self, frame: PreparedFrame, number: int) -> None:
+        """Extracts image features of a frame of this that is on the CPU, if they are kept of frame `number` of the run.
+
+        It differs from the frame's position where frames could not be read.
+        """
+        if frame.features is None and keeps_features(self._config, number):
+            frame.features_ahead = self._features(frame)
+
+    def _features(self, frame: PreparedFrame) -> ImageFeatures:
+        pixels = cast(FramePixels, frame.pixels)
+        return extract_features(pixels, self._dataset.camera, self._config.dataset.max_depth_m)
