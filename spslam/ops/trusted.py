@@ -189,6 +189,13 @@ def copy_rows_(tables: Sequence[torch.Tensor], rows: Sequence[int], values: Sequ
     torch.ops.spslam.copy_rows_(tables, rows, values)
 
 
+def unproject_pixels(
+    records: torch.Tensor, normals: torch.Tensor, pose: torch.Tensor, intrinsics: Intrinsics
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """See `spslam.ops.unproject_pixels`."""
+    return torch.ops.spslam.unproject_pixels(records, normals, pose, *intrinsics)
+
+
 def optimize_map_(
     scene: SceneView,
     records: torch.Tensor,

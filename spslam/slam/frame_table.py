@@ -91,6 +91,11 @@ class FrameTable:
         return self._columns["lost"][: self._count]
 
     @property
+    def lost_flags(self) -> np.ndarray:
+        """bool [F], `lost` for NumPy: the same memory."""
+        return self._numbers["lost"][: self._count]
+
+    @property
     def consistent_frames(self) -> torch.Tensor:
         """int64 [F] how many lost frames up to this one had a pose that is likely, and agree with one another."""
         return self._columns["consistent_frames"][: self._count]

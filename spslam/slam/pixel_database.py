@@ -70,7 +70,12 @@ class PixelDatabase:
     @property
     def has_pixels(self) -> torch.Tensor:
         """bool [F] on the CPU: whether the frame had valid depth, and is still kept."""
-        return torch.from_numpy(self._has_pixels)[: self.num_frames]
+        return torch.from_numpy(self.pixel_flags)
+
+    @property
+    def pixel_flags(self) -> np.ndarray:
+        """bool [F], `has_pixels` for NumPy: the same memory."""
+        return self._has_pixels[: self.num_frames]
 
     @property
     def nbytes(self) -> int:
