@@ -82,11 +82,11 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
     def __next__(self) -> PreparedFrame | DatasetError:
         reader = self.prepare()
-        requested, started = self._record(), time.perf_counter()
+        requested, started, was_there = self._record(), time.perf_counter(), self._ahead is not None
         item = self._frozen.checked(self._taken_ahead() or next(reader))  # the process has checked its frames already
         if isinstance(item, DatasetError):
             return item
-        item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
+        item.requested, item.wait_ms = requested, 0.0 if was_there else 1e3 * (time.perf_counter() - started)
         return item
 
     def look_ahead(self) -> None:

@@ -174,16 +174,17 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             return message.error
         if message.slot is None:
             raise StopIteration
-        pixels = self._take(message.slot, message.valid_depth_share)
+        pixels = self._take(message.slot, message)
         prepared = PreparedFrame(message.dataset_index, message.timestamp, pixels, message.decode_ms)
-        prepared.features, prepared.features_ahead = message.features, message.features_ahead
+        prepared.features = message.features if message.keeps_features else None
         if message.offsets is not None:
             prepared.offsets = CaptureOffsets(*message.offsets)
         return prepared
 
-    def _take(self, slot: int, valid_depth_share: float) -> FramePixels | Upload:
+    def _take(self, slot: int, message: Message) -> FramePixels | Upload:
         """A copy of the pixels in a slot, or their upload."""
-        pixels = replace(self._blank, buffer=self._memory[slot], valid_depth_share=valid_depth_share)
+        share, features = message.valid_depth_share, message.features
+        pixels = replace(self._blank, buffer=self._memory[slot], valid_depth_share=share, features=features)
         if self._uploader is None:
             copy = pixels.holding(pixels.buffer.clone())
             self._connection.send_bytes(slot_message(slot))

@@ -62,8 +62,9 @@ class Message(NamedTuple):
         read_ms: time that a reading thread spent on the frame.
         slot: slot that holds the frame's pixels; None where there is no frame.
         dataset_index: `PreparedFrame.index`.
-        timestamp, decode_ms, features, features_ahead: as in `PreparedFrame`.
-        valid_depth_share: as in `FramePixels`.
+        timestamp, decode_ms: as in `PreparedFrame`.
+        valid_depth_share, features: as in `FramePixels`.
+        keeps_features: whether the features are those of `PreparedFrame` too.
         offsets: as in `PreparedFrame`, in the order of its fields; None for those of images taken at once.
         error: of a frame that can't be read.
         failure: traceback of an exception that is not the data's fault; the process then ends.
@@ -76,7 +77,7 @@ class Message(NamedTuple):
     decode_ms: float = 0.0
     valid_depth_share: float = 0.0
     features: ImageFeatures | None = None
-    features_ahead: ImageFeatures | None = None
+    keeps_features: bool = False
     offsets: tuple[float, float] | None = None
     error: DatasetError | None = None
     failure: str | None = None
@@ -130,6 +131,10 @@ def serve(socket: int, shared: int) -> None:
             raise
         except Exception:
             _send(connection, Message(failure=traceback.format_exc()))
+        # Stay until the loop closes the connection: it still returns slots, and what was sent to it is lost where this
+        # end is closed before it has read them.
+        while True:
+            connection.recv_bytes()
 
 
 def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
@@ -147,14 +152,10 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
             number += 1
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
-            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
+            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, pixels.features)
             offsets = None if frame.offsets == AT_ONCE else (frame.offsets.depth, frame.offsets.color)
-            _send(connection, Message(read_ms, slot, *described, frame.features, frame.features_ahead, offsets))
+            _send(connection, Message(read_ms, slot, *described, frame.features is not None, offsets))
     _send(connection, Message())
-    # Stay until the loop closes the connection: it still returns slots.
-    with contextlib.suppress(*DISCONNECTED):
-        while True:
-            connection.recv_bytes()
 
 
 def _send(connection: Connection, message: Message) -> None:

@@ -57,5 +57,6 @@ class FeatureKeeper:
             return None
         if state.has_enough_features(len(state.frames) - 1):
             return None
-        ahead = frame.features_ahead if frame.features is None else frame.features
-        return extract_features(read, self._camera, self._config.dataset.max_depth_m) if ahead is None else ahead
+        if frame.features is not None:
+            return frame.features
+        return extract_features(read, self._camera, self._config.dataset.max_depth_m)

@@ -141,7 +141,7 @@ class FramePipeline:
                 as many iterations as the first frame has.
         """
         self._record = event_recorder(self.device)
-        started = self._record()
+        started = frame.requested if frame.requested is not None and frame.wait_ms == 0 else self._record()
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)

@@ -5,9 +5,12 @@ c is the foreshortening n . d times 128 (n the surface normal, d the ray directi
 turns a depth difference along the ray into a distance to the surface's tangent plane.
 """
 
+from __future__ import annotations
+
 import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +20,9 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.slam.depth_keyframes import depth_image_step, depth_unit
+
+if TYPE_CHECKING:
+    from spslam.slam.image_features import ImageFeatures
 
 THUMBNAIL_STEP_PX = 16
 WORD_BYTES = 4  # of the buffer
@@ -33,6 +39,7 @@ class FramePixels:
         thumbnail_shape: rows and columns of the depth thumbnail.
         depth_image_shape: rows and columns of the depth and intensity images; 0 and 0 without.
         valid_depth_share: share of the image's pixels with usable depth.
+        features: of the images, where they were extracted ahead; on the CPU, and no part of the buffer.
     """
 
     buffer: torch.Tensor
@@ -40,6 +47,7 @@ class FramePixels:
     thumbnail_shape: tuple[int, int]
     depth_image_shape: tuple[int, int]
     valid_depth_share: float
+    features: ImageFeatures | None = None
 
     @property
     def count(self) -> int:
@@ -81,15 +89,15 @@ class FramePixels:
     def _image_words(self) -> tuple[int, int]:
         return _image_words(self.depth_image_shape)
 
-    def to(self, device: torch.device, non_blocking: bool = False) -> "FramePixels":
+    def to(self, device: torch.device, non_blocking: bool = False) -> FramePixels:
         """The same on another device; one copy."""
         return self.holding(self.buffer.to(device, non_blocking=non_blocking))
 
-    def holding(self, buffer: torch.Tensor) -> "FramePixels":
+    def holding(self, buffer: torch.Tensor) -> FramePixels:
         """The same in another buffer, to which the words were copied."""
         return replace(self, buffer=buffer)
 
-    def having(self, **views: torch.Tensor) -> "FramePixels":
+    def having(self, **views: torch.Tensor) -> FramePixels:
         """The same, but for views by their names, which are tensors of their own; the buffer is as it was read."""
         other = copy.copy(self)
         other.__dict__.update(views)

@@ -1,7 +1,7 @@
 """A frame sampled from its images, as the system takes it."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 from spslam.camera import Camera
@@ -10,7 +10,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.slam.device_events import DeviceEvent
-from spslam.slam.feature_store import keeps_features
+from spslam.slam.feature_store import keeps_features, needs_features
 from spslam.slam.image_features import ImageFeatures, extract_features
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.upload import Upload, Uploader
@@ -25,13 +25,11 @@ class PreparedFrame:
         timestamp: s.
         pixels: on the CPU, or on their way to the device.
         decode_ms: reading, decoding and sampling, on the thread that did it.
-        wait_ms: how long the host waited for the frame.
+        wait_ms: how long the host waited for the frame; 0 where it was there already.
         requested: when it was requested; None where nobody kept the time.
         signature: what tells frozen depth; None where nobody asks.
         features: of its image, where they are kept in any case and were extracted ahead; else this is done once the
             pose is known.
-        features_ahead: of its image, where those of as many processed frames are kept; None if they were not extracted
-            ahead, or are in `features`.
         offsets: as of `RgbdFrame`.
     """
 
@@ -43,7 +41,6 @@ class PreparedFrame:
     requested: DeviceEvent | None = None
     signature: FrameSignature | None = None
     features: ImageFeatures | None = None
-    features_ahead: ImageFeatures | None = None
     offsets: CaptureOffsets = AT_ONCE
 
     @property
@@ -77,7 +74,9 @@ class FramePreparation:
         frame, config = self._dataset[i + self._start], self._config
         prepared = PreparedFrame.of(frame, self._dataset.camera, config)
         if keeps_features(config, i + self._start):
-            prepared.features = self._features(prepared)
+            pixels = cast(FramePixels, prepared.pixels)
+            prepared.features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
+            prepared.pixels = replace(pixels, features=prepared.features)
         prepared.signature = FrameSignature.of(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         if self._uploader:
@@ -85,13 +84,11 @@ class FramePreparation:
         return prepared
 
     def extract_ahead(self, frame: PreparedFrame, number: int) -> None:
-        """Extracts image features of a frame of this that is on the CPU, if they are kept of frame `number` of the run.
+        """Extracts image features of a frame of this that is on the CPU, if frame `number` of the run needs them.
 
-        It differs from the frame's position where frames could not be read.
+        That number differs from the frame's position where frames could not be read.
         """
-        if frame.features is None and keeps_features(self._config, number):
-            frame.features_ahead = self._features(frame)
-
-    def _features(self, frame: PreparedFrame) -> ImageFeatures:
-        pixels = cast(FramePixels, frame.pixels)
-        return extract_features(pixels, self._dataset.camera, self._config.dataset.max_depth_m)
+        config, pixels = self._config, cast(FramePixels, frame.pixels)
+        if needs_features(config, number):
+            features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
+            frame.pixels = replace(pixels, features=features)

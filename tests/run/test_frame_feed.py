@@ -67,11 +67,11 @@ def test_what_is_frozen_is_no_frame_and_features_are_of_those_processed(reader):
     frames = [item for item in items if isinstance(item, PreparedFrame)]
     assert [item.index for item in frames] == [1, 3, 5, 6, 7, 8]
     assert all(item.features is None for item in frames)
-    assert [item.index for item in frames if item.features_ahead is not None] == [5] * (reader == "process")
+    assert [item.index for item in frames if item.pixels.features is not None] == [5] * (reader == "process")
     if reader == "process":
         read = sample_frame(Recorded(FRAMES)[5], dataset.camera, config)
         wanted = extract_features(read, dataset.camera, config.dataset.max_depth_m)
-        assert np.array_equal(frames[2].features_ahead.descriptors, wanted.descriptors)
+        assert np.array_equal(frames[2].pixels.features.descriptors, wanted.descriptors)
 
 
 @pytest.mark.cuda
