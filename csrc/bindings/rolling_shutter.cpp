@@ -80,22 +80,21 @@ std::tuple<Tensor, Tensor, Tensor> rectify_shutter_frame(Tensor records, Tensor 
   Tensor out_depth = empty(depth, {rows, columns}, ScalarType::UInt16);
   Tensor out_intensity = empty(depth, {rows, columns}, ScalarType::Byte);
   const ShutterMotion motion = load_shutter_motion(kName, before, pose, readout, scalars[FrameScalar::kSeconds]);
-  const Intrinsics image_camera{
-      scalars.as<float>(FrameScalar::kImageFx), scalars.as<float>(FrameScalar::kImageFy),
-      scalars.as<float>(FrameScalar::kImageCx), scalars.as<float>(FrameScalar::kImageCy)};
+  const Intrinsics image_camera{scalars.as<float>(FrameScalar::kImageFx), scalars.as<float>(FrameScalar::kImageFy),
+                                scalars.as<float>(FrameScalar::kImageCx), scalars.as<float>(FrameScalar::kImageCy)};
   spslam::rectify_shutter_frame(
       scope.context, data<std::int32_t>(records), records.size(0),
       {data<std::uint16_t>(depth), data<std::uint8_t>(intensity), scalars.as<float>(FrameScalar::kUnit)}, motion,
       {load_intrinsics(scalars), height, width}, {image_camera, rows, columns},
-      {mutable_data<std::int32_t>(out), mutable_data<std::uint16_t>(out_depth), mutable_data<std::uint8_t>(out_intensity)});
+      {mutable_data<std::int32_t>(out), mutable_data<std::uint16_t>(out_depth),
+       mutable_data<std::uint8_t>(out_intensity)});
   return {out, out_depth, out_intensity};
 }
 
 // The pose after rows `last` - 1 and `last` of a table of poses, the readout, and the records as that motion rectifies
 // them: all of them new.
 std::tuple<Tensor, Tensor, Tensor> predict_frame(Tensor poses, std::int64_t last, Tensor readout, Tensor records,
-                                                 std::vector<double> numbers, std::int64_t height,
-                                                 std::int64_t width) {
+                                                 std::vector<double> numbers, std::int64_t height, std::int64_t width) {
   constexpr char kName[] = "predict_frame";
   const Scalars<RecordScalar> scalars(kName, "scalars", numbers);
   check_records(kName, records, height, width);

@@ -1,10 +1,9 @@
 // One kernel for all copies: each would be a launch of its own, which takes the host longer than the device copies.
-#include "spslam/row_copies.h"
-
 #include <algorithm>
 #include <cstdint>
 
 #include "core/cuda_check.cuh"
+#include "spslam/row_copies.h"
 
 namespace spslam {
 namespace {
@@ -17,11 +16,12 @@ struct RowCopies {
   RowCopy copies[kMaxRowCopies];
 };
 
-// A block of row y of the grid takes part in copy y: in steps of 16 bytes where both places are aligned so, then byte by
-// byte.
+// A block of row y of the grid takes part in copy y: in steps of 16 bytes where both places are aligned so, then byte
+// by byte.
 __global__ void __launch_bounds__(kThreads) copy_kernel(const __grid_constant__ RowCopies all) {
   const RowCopy& copy = all.copies[blockIdx.y];
-  const std::size_t first = blockIdx.x * std::size_t{kThreads} + threadIdx.x, stride = gridDim.x * std::size_t{kThreads};
+  const std::size_t first = blockIdx.x * std::size_t{kThreads} + threadIdx.x,
+                    stride = gridDim.x * std::size_t{kThreads};
   const bool is_aligned =
       (reinterpret_cast<std::uintptr_t>(copy.to) | reinterpret_cast<std::uintptr_t>(copy.from)) % kWide == 0;
   const std::size_t wide = is_aligned ? copy.bytes / kWide : 0;

@@ -7,7 +7,6 @@ turns a depth difference along the ray into a distance to the surface's tangent 
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -99,8 +98,8 @@ class FramePixels:
 
     def having(self, **views: torch.Tensor) -> FramePixels:
         """The same, but for views by their names, which are tensors of their own; the buffer is as it was read."""
-        other = copy.copy(self)
-        other.__dict__.update(views)
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__, **views)
         return other
 
 

@@ -50,14 +50,15 @@ void rectify_shutter_frame(Device device, const std::int32_t* records, std::int6
                            const FrameImages& images, const ShutterMotion& motion, const ShutterCamera& camera,
                            const ShutterCamera& image_camera, const ShutterFrame& out);
 
-// What is predicted of a frame: its pose [7], the readout [1] that counts for it, and its records as they are rectified.
+// What is predicted of a frame: its pose [7], the readout [1] that counts for it, and its records as they are
+// rectified.
 struct PredictedFrame {
   float *pose, *readout;
   std::int32_t* records;
 };
 
-// predict_pose after the poses `before` and `last`, and the records of a frame `seconds` after `last` as the motion from
-// there to the predicted pose rectifies them.
+// predict_pose after the poses `before` and `last`, and the records of a frame `seconds` after `last` as the motion
+// from there to the predicted pose rectifies them.
 template <class Device>
 void predict_frame(Device device, const float* before, const float* last, const float* readout, float seconds,
                    const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,
