@@ -154,7 +154,7 @@ class FrameTable:
         copies: RowCopies | None = None,
     ) -> None:
         """Adds a row; with `copies`, what is on the device is written when these are made."""
-        if self._count == len(self._columns["poses"]):
+        if self._count == self._columns["poses"].shape[0]:
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._set_columns({name: _with_capacity(column, capacity) for name, column in self._columns.items()})
         tables = [self._columns["poses"], self._columns["depth_thumbnails"]]

@@ -131,7 +131,7 @@ class PixelDatabase:
             flags[: self.num_frames] = self._has_pixels[: self.num_frames]
             self._has_pixels = flags
         pixels = self._affordable_pixels(frames)
-        if pixels == self.pixels_per_frame and frames * self._words_per_frame <= len(self._words):
+        if pixels == self.pixels_per_frame and frames * self._words_per_frame <= self._words.numel():
             return
         if pixels < self.pixels_per_frame and self._memory is not None:
             self._thin_in_place(pixels, self._memory)
