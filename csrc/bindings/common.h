@@ -15,7 +15,6 @@
 #include <torch/headeronly/util/Exception.h>
 
 #include <cstdint>
-#include <cstring>
 #include <exception>
 #include <initializer_list>
 #include <optional>
@@ -76,6 +75,12 @@ inline Tensor as_contiguous(const Tensor& tensor) {
   return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
 }
 
+inline std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
+  std::vector<Tensor> result;
+  for (const Tensor& tensor : tensors) result.push_back(as_contiguous(tensor));
+  return result;
+}
+
 // A number that kernels hold in 32 bits.
 inline std::int32_t to_int32(const char* function, const char* argument, std::int64_t value) {
   SPS_CHECK(value >= INT32_MIN && value <= INT32_MAX, function, ": ", argument, " must fit 32 bits, got ", value);
@@ -107,18 +112,9 @@ class DeviceScope {
   torch::stable::accelerator::DeviceGuard guard_;
 };
 
-// Copies memory of the device to other memory of it, in the order of its stream.
-inline void copy_bytes(const Context& context, void* to, const void* from, std::size_t bytes) {
-  if (bytes == 0) return;
-  STD_CUDA_CHECK(cudaMemcpyAsync(to, from, bytes, cudaMemcpyDeviceToDevice, static_cast<cudaStream_t>(context.stream)));
-}
 #else
 #define SPS_DISPATCH_KEY CPU
 using Context = Cpu;
-
-inline void copy_bytes(const Context&, void* to, const void* from, std::size_t bytes) {
-  if (bytes != 0) std::memcpy(to, from, bytes);
-}
 
 class DeviceScope {
  public:

@@ -24,12 +24,6 @@ inline FrameMotion load_motion(const char* name, const std::int64_t* integers, s
   return {integers[0], 1e-9f * static_cast<float>(integers[1]), 1e-9f * static_cast<float>(integers[2])};
 }
 
-inline std::vector<Tensor> all_contiguous(const std::vector<Tensor>& tensors) {
-  std::vector<Tensor> result;
-  for (const Tensor& tensor : tensors) result.push_back(as_contiguous(tensor));
-  return result;
-}
-
 // Of the images, the poses and, if any, the intensities and after them the delay of colors; none without tensors. They
 // must outlive the launch.
 inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<Tensor>& tensors,

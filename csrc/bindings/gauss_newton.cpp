@@ -2,6 +2,7 @@
 
 #include "bindings/depth_keyframes.h"
 #include "bindings/scene.h"
+#include "spslam/row_copies.h"
 
 namespace spslam::bindings {
 namespace {
@@ -86,9 +87,9 @@ Tensor track_gauss_newton(std::vector<Tensor> scene_tensors, std::vector<double>
   float* const result = start + kPoseSize;
   float* const hessian = result + kPoseSize;
   float* const stats = hessian + 36;
-  for (float* place : {start, result}) {
-    copy_bytes(scope.context, place, data<float>(pose), kPoseSize * sizeof(float));
-  }
+  const RowCopy copies[] = {{start, data<float>(pose), kPoseSize * sizeof(float)},
+                            {result, data<float>(pose), kPoseSize * sizeof(float)}};
+  copy_rows(scope.context, copies, 2);
   Tensor workspace =
       empty(pixels, {gauss_newton_workspace_size(scope.context, 1, options.num_pixels)}, ScalarType::Byte);
   spslam::track_gauss_newton(scope.context, scene.view, data<std::int32_t>(pixels), pixels.size(0), options,

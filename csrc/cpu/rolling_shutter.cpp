@@ -3,6 +3,7 @@
 #include <cstring>
 
 #include "core/for_each.h"
+#include "kernels/gauss_newton.h"
 
 namespace spslam {
 namespace {
@@ -66,6 +67,23 @@ void rectify_shutter_images<Cpu>(Cpu, const FrameImages& images, const ShutterMo
       }
     }
   });
+}
+
+template <>
+void rectify_shutter_frame<Cpu>(Cpu device, const std::int32_t* records, std::int64_t num_records,
+                                const FrameImages& images, const ShutterMotion& motion, const ShutterCamera& camera,
+                                const ShutterCamera& image_camera, const ShutterFrame& out) {
+  rectify_shutter_records(device, records, num_records, motion, camera, out.records);
+  rectify_shutter_images(device, images, motion, image_camera, out.depth, out.intensity);
+}
+
+template <>
+void predict_frame<Cpu>(Cpu device, const float* before, const float* last, const float* readout, float seconds,
+                        const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,
+                        const PredictedFrame& out) {
+  constant_speed_pose(before, last, out.pose);
+  *out.readout = *readout;
+  rectify_shutter_records(device, records, num_records, {last, out.pose, readout, seconds}, camera, out.records);
 }
 
 }  // namespace spslam

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import torch
 
-from spslam.ops import _library  # noqa: F401
+from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_tensor
 from spslam.ops._public import public_op
+from spslam.ops.scene_view import Intrinsics
 
 _MAX_SIDE = 2**16 - 1  # a record has 16 bits per coordinate
 _MAX_COUNT = 2**30
@@ -172,7 +173,7 @@ def unproject_pixels(
     check_tensor(name, "pose", pose, [7], torch.float32, like=records)
     check(fx > 0, name, "fx", "be positive", fx)
     check(fy > 0, name, "fy", "be positive", fy)
-    return torch.ops.spslam.unproject_pixels(records, normals, pose.detach(), fx, fy, cx, cy)
+    return trusted.unproject_pixels(records, normals, pose.detach(), Intrinsics(fx, fy, cx, cy))
 
 
 @torch.library.register_fake("spslam::unproject_pixels")

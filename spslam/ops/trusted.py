@@ -34,6 +34,33 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     return torch.ops.spslam.predict_pose(before, last)
 
 
+def predict_frame(
+    poses: torch.Tensor,
+    last: int,
+    readout: torch.Tensor,
+    seconds: float,
+    records: torch.Tensor,
+    intrinsics: Intrinsics,
+    size: tuple[int, int],
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What `predict_pose` and `rectify_shutter_records_` find of the next frame, in one call.
+
+    Args:
+        poses: float32 [F, 7], the last of them in row `last`, at least 1.
+        last: that row.
+        readout: float32 [1] s.
+        seconds: from the last frame to the next one.
+        records: int32 [P, 3] of the next frame, not changed.
+        intrinsics: of the images that the records are of.
+        size: rows and columns of these.
+
+    Returns:
+        float32 [7] the pose; float32 [1] the readout, a copy; int32 [P, 3] the records, rectified by the motion from
+        the last pose to this one.
+    """
+    return torch.ops.spslam.predict_frame(poses, last, readout, records, [*intrinsics, seconds], *size)
+
+
 def track_gauss_newton(
     scene: SceneView,
     pixels: torch.Tensor,
@@ -162,6 +189,13 @@ def copy_rows_(tables: Sequence[torch.Tensor], rows: Sequence[int], values: Sequ
     torch.ops.spslam.copy_rows_(tables, rows, values)
 
 
+def unproject_pixels(
+    records: torch.Tensor, normals: torch.Tensor, pose: torch.Tensor, intrinsics: Intrinsics
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """See `spslam.ops.unproject_pixels`."""
+    return torch.ops.spslam.unproject_pixels(records, normals, pose, *intrinsics)
+
+
 def optimize_map_(
     scene: SceneView,
     records: torch.Tensor,
@@ -198,6 +232,11 @@ def optimize_map_(
 @torch.library.register_fake("spslam::rectify_shutter_frame")
 def _(records, depth, intensity, *_):
     return torch.empty_like(records), torch.empty_like(depth), torch.empty_like(intensity)
+
+
+@torch.library.register_fake("spslam::predict_frame")
+def _(poses, last, readout, records, *_):
+    return poses.new_empty(7), torch.empty_like(readout), torch.empty_like(records)
 
 
 @torch.library.register_fake("spslam::measure_frame_")

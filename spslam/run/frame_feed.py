@@ -10,9 +10,9 @@ import torch
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.frozen_depth import FROZEN, FrozenDepth, frozen_depth_before
 from spslam.datasets.prefetch import Prefetcher, prefetch
 from spslam.errors import DatasetError
+from spslam.run.frozen_frames import FrozenFrames
 from spslam.run.reader_launch import has_standby
 from spslam.run.reader_process import ReaderProcess, ReaderUnavailableError
 from spslam.slam.device_events import event_recorder
@@ -39,17 +39,19 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         config: how they are read and sampled.
         device: receives the pixels.
         start: position of the first frame.
+        processed: number of frames before it that were processed; those that could not be read were not.
 
     Raises:
         ReaderUnavailableError: `run.reader` is `process`, and no other process can read the dataset: it can't be
             pickled, its class can't be imported there (raised by `prepare`), or no process can be started.
     """
 
-    def __init__(self, dataset: RgbdDataset, config: Config, device: torch.device, start: int = 0):
+    def __init__(
+        self, dataset: RgbdDataset, config: Config, device: torch.device, start: int = 0, processed: int | None = None
+    ):
         self._record = event_recorder(device)
-        self._dataset, self._start = dataset, start
-        self._frozen_depth: FrozenDepth | None = None
-        run = config.run
+        self._frozen = FrozenFrames(dataset, start)
+        run, processed = config.run, start if processed is None else processed
         workers = automatic_workers(device) if run.prefetch_workers is None else run.prefetch_workers
         ahead = max(2 * workers, MIN_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
         uploader = Uploader(device) if device.type == "cuda" else None
@@ -58,7 +60,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         self._process: ReaderProcess | None = None
         if uses_process(run.reader, device):
             with self._fallback():
-                self._process = ReaderProcess.start(dataset, config, start, workers, ahead, uploader)
+                self._process = ReaderProcess.start(dataset, config, (start, processed), workers, ahead, uploader)
         self._reader: Prefetcher[PreparedFrame] | ReaderProcess | None = None
         # The next frame, or what is to be raised instead, where it was taken ahead.
         self._ahead: tuple[PreparedFrame | DatasetError | None, Exception | None] | None = None
@@ -80,13 +82,11 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
     def __next__(self) -> PreparedFrame | DatasetError:
         reader = self.prepare()
-        requested, started = self._record(), time.perf_counter()
-        item = self._taken_ahead() or next(reader)
+        requested, started, was_there = self._record(), time.perf_counter(), self._ahead is not None
+        item = self._frozen.checked(self._taken_ahead() or next(reader))  # the process has checked its frames already
         if isinstance(item, DatasetError):
             return item
-        if self._is_frozen(item):
-            return DatasetError(f"{self._dataset.describe(item.index)}: {FROZEN}")
-        item.requested, item.wait_ms = requested, 1e3 * (time.perf_counter() - started)
+        item.requested, item.wait_ms = requested, 0.0 if was_there else 1e3 * (time.perf_counter() - started)
         return item
 
     def look_ahead(self) -> None:
@@ -108,11 +108,6 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         if error is not None:
             raise error
         return item
-
-    def _is_frozen(self, item: PreparedFrame) -> bool:
-        if self._frozen_depth is None:
-            self._frozen_depth = frozen_depth_before(self._dataset, self._start)
-        return item.signature is not None and self._frozen_depth.check(item.signature)
 
     @contextmanager
     def _fallback(self) -> Iterator[None]:

@@ -8,6 +8,7 @@ by the closed socket that the other has ended, for whatever reason; the system f
 import contextlib
 import os
 import pickle
+import select
 import signal
 import subprocess
 from collections import deque
@@ -19,9 +20,10 @@ import torch
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.clock import CaptureOffsets
 from spslam.errors import DatasetError, SpslamError, brief
 from spslam.run.reader_launch import launch, take_standby
-from spslam.run.reader_service import DISCONNECTED, Message, Work, mapped
+from spslam.run.reader_service import DISCONNECTED, Message, Work, mapped, slot_message
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload, Uploader
@@ -65,13 +67,16 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._memory, self._blank, self._uploader, self._kind = memory, blank, uploader, kind
         self._in_use: deque[tuple[int, Upload]] = deque()
         self._has_started = self._is_locked = False
+        # Each frame asks; `Connection.poll` would make another one each time.
+        self._poll = select.poll()
+        self._poll.register(connection.fileno(), select.POLLIN)
 
     @classmethod
     def start(
         cls,
         dataset: RgbdDataset,
         config: Config,
-        start: int,
+        begin: tuple[int, int],
         workers: int,
         ahead: int,
         uploader: Uploader | None,
@@ -81,7 +86,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         Args:
             dataset: the frames.
             config: how they are sampled.
-            start: position of the first frame.
+            begin: position of the first frame, and how many were processed before it.
             workers: number of reading threads.
             ahead: maximum number of frames that exist at the same time.
             uploader: copies the pixels to a device; None for the CPU.
@@ -92,7 +97,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         slots = max(ahead // 2, 1)
         blank = blank_pixels(dataset.camera, config)
         words = len(blank.buffer)
-        work = Work(dataset, config, start, workers, max(ahead - slots, 1), slots, words)
+        start, processed = begin
+        work = Work(dataset, config, start, workers, max(ahead - slots, 1), slots, words, processed)
         try:
             content = pickle.dumps(work)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -127,7 +133,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
 
     def is_ready(self) -> bool:
         """Whether the next frame, or what there is instead, is there; the first has to be requested."""
-        return self._has_started and not self._connection.closed and self._connection.poll()
+        return self._has_started and not self._connection.closed and bool(self._poll.poll(0))
 
     def __next__(self) -> PreparedFrame | DatasetError:
         try:
@@ -160,7 +166,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             self._connection.send(None)
             self._has_started = True
         self._return_slots()
-        message: Message = self._connection.recv()
+        message = Message(*self._connection.recv())
         if message.failure is not None:
             raise RuntimeError(f"reading frames failed:\n{message.failure}")
         self.read_seconds += message.read_ms / 1e3
@@ -168,17 +174,20 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             return message.error
         if message.slot is None:
             raise StopIteration
-        pixels = self._take(message.slot, message.valid_depth_share)
-        prepared = PreparedFrame(message.index, message.timestamp, pixels, message.decode_ms)
-        prepared.signature, prepared.features, prepared.offsets = message.signature, message.features, message.offsets
+        pixels = self._take(message.slot, message)
+        prepared = PreparedFrame(message.dataset_index, message.timestamp, pixels, message.decode_ms)
+        prepared.features = message.features if message.keeps_features else None
+        if message.offsets is not None:
+            prepared.offsets = CaptureOffsets(*message.offsets)
         return prepared
 
-    def _take(self, slot: int, valid_depth_share: float) -> FramePixels | Upload:
+    def _take(self, slot: int, message: Message) -> FramePixels | Upload:
         """A copy of the pixels in a slot, or their upload."""
-        pixels = replace(self._blank, buffer=self._memory[slot], valid_depth_share=valid_depth_share)
+        share, features = message.valid_depth_share, message.features
+        pixels = replace(self._blank, buffer=self._memory[slot], valid_depth_share=share, features=features)
         if self._uploader is None:
             copy = pixels.holding(pixels.buffer.clone())
-            self._connection.send(slot)
+            self._connection.send_bytes(slot_message(slot))
             return copy
         upload = self._uploader.send(pixels)
         self._in_use.append((slot, upload))
@@ -193,7 +202,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
                     return
                 upload.end.wait()
             self._in_use.popleft()
-            self._connection.send(slot)
+            self._connection.send_bytes(slot_message(slot))
 
 
 def _unavailable(reason: str) -> ReaderUnavailableError:

@@ -7,7 +7,7 @@ import traceback
 from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -16,13 +16,15 @@ import torch
 from spslam import ops
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.clock import AT_ONCE, CaptureOffsets
-from spslam.datasets.frozen_depth import FrameSignature
+from spslam.datasets.clock import AT_ONCE
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
+from spslam.run.frozen_frames import FrozenFrames
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import FramePreparation
+
+_SLOT_BYTES = 4  # of a slot's number
 
 # Raised by a connection whose other end is closed.
 DISCONNECTED = (EOFError, ConnectionError)
@@ -40,6 +42,7 @@ class Work:
         ahead: number of frames kept ready beyond those in the slots.
         slots: number of slots in the shared memory.
         words: size of a slot in 32-bit words.
+        processed: number of frames that the run has processed before.
     """
 
     dataset: RgbdDataset
@@ -49,30 +52,33 @@ class Work:
     ahead: int
     slots: int
     words: int
+    processed: int
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """From the process: a frame, a frame that can't be read, a failure, or the end of the dataset (all defaults).
 
     Attributes:
         read_ms: time that a reading thread spent on the frame.
         slot: slot that holds the frame's pixels; None where there is no frame.
-        index, timestamp, decode_ms, signature, features, offsets: as in `PreparedFrame`.
-        valid_depth_share: as in `FramePixels`.
+        dataset_index: `PreparedFrame.index`.
+        timestamp, decode_ms: as in `PreparedFrame`.
+        valid_depth_share, features: as in `FramePixels`.
+        keeps_features: whether the features are those of `PreparedFrame` too.
+        offsets: as in `PreparedFrame`, in the order of its fields; None for those of images taken at once.
         error: of a frame that can't be read.
         failure: traceback of an exception that is not the data's fault; the process then ends.
     """
 
     read_ms: float = 0.0
     slot: int | None = None
-    index: int = 0
+    dataset_index: int = 0
     timestamp: float = 0.0
     decode_ms: float = 0.0
     valid_depth_share: float = 0.0
-    signature: FrameSignature | None = None
     features: ImageFeatures | None = None
-    offsets: CaptureOffsets = AT_ONCE
+    keeps_features: bool = False
+    offsets: tuple[float, float] | None = None
     error: DatasetError | None = None
     failure: str | None = None
 
@@ -90,6 +96,15 @@ def mapped(shared: int, slots: int, words: int) -> torch.Tensor:
     """
     content = np.frombuffer(mmap.mmap(shared, 0), np.int32, slots * words)
     return torch.from_numpy(content).view(slots, words)
+
+
+def slot_message(slot: int) -> bytes:
+    """What the loop sends when a slot is free again; one per frame, so nothing that has to be pickled."""
+    return slot.to_bytes(_SLOT_BYTES, "little")
+
+
+def _sent_slot(connection: Connection) -> int:
+    return int.from_bytes(connection.recv_bytes(), "little")
 
 
 def serve(socket: int, shared: int) -> None:
@@ -115,30 +130,40 @@ def serve(socket: int, shared: int) -> None:
         except DISCONNECTED:
             raise
         except Exception:
-            connection.send(Message(failure=traceback.format_exc()))
+            _send(connection, Message(failure=traceback.format_exc()))
+        # Stay until the loop closes the connection: it still returns slots, and what was sent to it is lost where this
+        # end is closed before it has read them.
+        while True:
+            connection.recv_bytes()
 
 
 def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
     preparation = FramePreparation(work.dataset, work.config, work.start)
-    free, before = deque(range(work.slots)), 0.0
+    free, before, number = deque(range(work.slots)), 0.0, work.processed
+    frozen = FrozenFrames(work.dataset, work.start)
     with prefetch(preparation, work.workers, work.ahead) as frames:
-        for frame in frames:
+        for item in frames:
             read_ms, before = 1e3 * (frames.read_seconds - before), frames.read_seconds
+            frame = frozen.checked(item)
             if isinstance(frame, DatasetError):
-                connection.send(Message(read_ms, error=frame))
+                _send(connection, Message(read_ms, error=frame))
                 continue
+            preparation.extract_ahead(frame, number)
+            number += 1
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
-            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
-            connection.send(Message(read_ms, slot, *described, frame.signature, frame.features, frame.offsets))
-    connection.send(Message())
-    # Stay until the loop closes the connection: it still returns slots.
-    with contextlib.suppress(*DISCONNECTED):
-        while True:
-            connection.recv()
+            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, pixels.features)
+            offsets = None if frame.offsets == AT_ONCE else (frame.offsets.depth, frame.offsets.color)
+            _send(connection, Message(read_ms, slot, *described, frame.features is not None, offsets))
+    _send(connection, Message())
+
+
+def _send(connection: Connection, message: Message) -> None:
+    """As a plain tuple, which the loop takes less time to read."""
+    connection.send(tuple(message))
 
 
 def _free_slot(free: deque[int], connection: Connection) -> int:
     while not free or connection.poll():
-        free.append(connection.recv())
+        free.append(_sent_slot(connection))
     return free.popleft()

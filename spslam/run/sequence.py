@@ -86,7 +86,7 @@ def _run(
         session = open_session(request, dataset, system, warnings)
         earlier = session.folder.read_log() if session.start else []
         observer.begin(ObservedRun.of(request, dataset, earlier), system.state)
-        with FrameFeed(dataset, request.config, device, session.start) as feed:
+        with FrameFeed(dataset, request.config, device, session.start, system.state.frames.processed) as feed:
             _process(feed, system, session, progress, observer, started)
         frames = system.state.frames
         indices = frames.indices[frames.opened :].tolist()

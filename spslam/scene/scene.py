@@ -1,6 +1,7 @@
 """The map: sparse volume, tri-planes and the two decoders, saved to and loaded from one file."""
 
 import math
+import operator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,9 @@ class Scene:
         """
         self.settings = settings
         self.seed = seed
+        # Each frame asks for the view, and few change it: the last one, and the objects that it was made of.
+        self._view: ops.SceneView | None = None
+        self._view_parts: tuple[object, ...] = ()
         self.device = torch.device(device)
         self.origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin.to("cpu", torch.float64)
         self.volume = self._empty_volume()
@@ -107,6 +111,13 @@ class Scene:
 
     def view(self) -> ops.SceneView:
         """The tensors as input of the fused ops. Valid until the scene grows."""
+        planes = self.planes
+        parts = *self.volume.parts, planes.texels, planes.layout, self.geometry_decoder, self.color_decoder, self.origin
+        if self._view is None or any(map(operator.is_not, parts, self._view_parts)):
+            self._view, self._view_parts = self._new_view(), parts
+        return self._view
+
+    def _new_view(self) -> ops.SceneView:
         return ops.SceneView(
             hash_keys=self.volume.hash_keys,
             hash_values=self.volume.hash_values,

@@ -117,6 +117,12 @@ class SparseVolume:
             self._weights,
         )
 
+    @property
+    def parts(self) -> tuple[object, ...]:
+        """What the views of V rows are made of: where one of these is another object, they are others too."""
+        cells = self.cells
+        return cells.hash_keys, cells.hash_values, cells.corners_buffer, self._embeddings, cells.num_voxels
+
     def insert(self, voxel_coords: torch.Tensor) -> torch.Tensor:
         """Allocates missing vertices; their embeddings and weights are 0.
 

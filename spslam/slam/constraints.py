@@ -56,7 +56,12 @@ class ConstraintSource:
         self._mapping_every = config.mapping.every
 
     def gather(
-        self, history: FrameHistory, pixels: FramePixels, depth_time: float | None = None, color_offset: float = 0.0
+        self,
+        history: FrameHistory,
+        pixels: FramePixels,
+        depth_time: float | None = None,
+        color_offset: float = 0.0,
+        shutter: ops.ShutterMotion | None = None,
     ) -> Constraints:
         """The constraints of the next frame.
 
@@ -65,6 +70,7 @@ class ConstraintSource:
             pixels: of the frame.
             depth_time: when its depth image was taken, s; None where that is not known.
             color_offset: from there to its color image, s, as stamps say.
+            shutter: as of `Constraints`.
         """
         from_start = pixels.valid_depth_share < LITTLE_DEPTH_SHARE
         keyframes = history.depth_keyframes(depth_time, color_offset)
@@ -72,7 +78,7 @@ class ConstraintSource:
             keyframes = keyframes._replace(timing=None)
         if keyframes is not None and not self._color:
             keyframes = keyframes._replace(intensities=None, timing=None)
-        return Constraints(history.noise, self._reference(history), keyframes, from_start)
+        return Constraints(history.noise, self._reference(history), keyframes, from_start, shutter)
 
     def _reference(self, history: FrameHistory) -> ops.ReferenceImage | None:
         mapped = history.last_mapped(self._mapping_every) if self._references else None

@@ -1,5 +1,6 @@
 """Which frames a mapping call optimizes (section III.D)."""
 
+import numpy as np
 import torch
 
 from spslam import ops
@@ -34,20 +35,20 @@ def select_frames(
         int64 [n] ascending frame indices on the device of `poses`, n at most `mapping.frames`, the newest usable one
         always in. Drawn by Philox, keyed by the newest frame's number; the same on every device.
     """
-    usable_ids = usable.nonzero()[:, 0]
+    usable_ids = np.flatnonzero(usable.numpy())
     mapping, newest, device = config.mapping, len(poses) - 1, poses.device
     if len(usable_ids) <= mapping.frames:
-        return usable_ids.to(device, non_blocking=True)
+        return torch.from_numpy(usable_ids).to(device, non_blocking=True)
     recent, older = usable_ids[-mapping.recent :], usable_ids[: -mapping.recent]
-    order = ops.philox_uniform(config.seed, ops.RandomStream.FRAME_SELECTION, newest, 0, newest + 1)
-    shuffled = older[order[older].argsort(stable=True)]
+    order = ops.philox_uniform(config.seed, ops.RandomStream.FRAME_SELECTION, newest, 0, newest + 1).numpy()
+    shuffled = older[order[older].argsort(kind="stable")]
     current = int(usable_ids[-1])
     chosen = ops.select_covisible_frames(
         records[current],
         current,
         poses,
         depth_thumbnails,
-        shuffled.to(device, non_blocking=True),
+        torch.from_numpy(shuffled).to(device, non_blocking=True),
         ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
         thumbnail_step=THUMBNAIL_STEP_PX,
         num_points=POINTS,
@@ -58,4 +59,4 @@ def select_frames(
         frame=newest,
     )
     # Every recent frame comes after every older one.
-    return torch.cat([chosen, recent.to(device, non_blocking=True)])
+    return torch.cat([chosen, torch.from_numpy(recent).to(device, non_blocking=True)])

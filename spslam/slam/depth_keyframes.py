@@ -1,10 +1,12 @@
 """Depth and intensity images of earlier frames, with which tracking aligns a frame beside the map."""
 
-import numpy as np
+from collections.abc import Callable
+
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
+from spslam.slam.row_copies import RowCopies, write_rows
 
 INTERVAL = 10  # frames between the images that are kept
 AGES = (1, 4)  # of the kept images that are used, in intervals
@@ -42,20 +44,22 @@ class DepthKeyframeStore:
         self.frames = [-1] * slots
         self.intrinsics = depth_image_intrinsics(camera)
 
-    def add(self, frame: int, depth: torch.Tensor, intensity: torch.Tensor) -> None:
-        """Stores the images uint16 and uint8 [h, w] of frame number `frame`, asynchronously."""
-        slots = [0] if frame % INTERVAL else [0, self._slot(frame)]
-        for slot in slots:
-            ops.trusted.copy_rows_([self.images, self.intensities], [slot, slot], [depth, intensity])
+    def add(self, frame: int, depth: torch.Tensor, intensity: torch.Tensor, copies: RowCopies | None = None) -> None:
+        """Stores the images uint16 and uint8 [h, w] of frame number `frame`, asynchronously.
+
+        With `copies`, they are written when these are made.
+        """
+        for slot in (0,) if frame % INTERVAL else (0, self._slot(frame)):
+            write_rows(copies, [self.images, self.intensities], [slot, slot], [depth, intensity])
             self.frames[slot] = frame
 
-    def select(self, frame: int, lost: np.ndarray, poses: torch.Tensor) -> ops.DepthKeyframes | None:
+    def select(self, frame: int, is_lost: Callable[[int], bool], poses: torch.Tensor) -> ops.DepthKeyframes | None:
         """Images to align frame number `frame` with: the last frame, one 10 to 19 back and one 40 to 49 back.
 
         Args:
             frame: its number.
-            lost: bool [F], whether a frame's pose is not trusted.
-            poses: float32 [F, 7] of the frames before.
+            is_lost: whether the pose of an earlier frame is not trusted, by its number.
+            poses: float32 [F, 7] of the frames before; more rows may follow.
 
         Returns:
             The images of frames with a trusted pose; None if there is none.
@@ -65,7 +69,7 @@ class DepthKeyframeStore:
             kept = (frame // INTERVAL - age) * INTERVAL
             if kept != frame - 1:
                 wanted.append((self._slot(kept), kept))
-        rows = tuple((slot, of) for slot, of in wanted if of >= 0 and self.frames[slot] == of and not lost[of])
+        rows = tuple((slot, of) for slot, of in wanted if of >= 0 and self.frames[slot] == of and not is_lost(of))
         if not rows:
             return None
         return ops.DepthKeyframes(

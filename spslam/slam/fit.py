@@ -57,14 +57,13 @@ def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, 
     return 100 * math.dist(predicted[4:], pose[4:]), math.degrees(4 * math.asin(chord / 2))
 
 
-def min_eigenvalue(hessian: list[float], pixels: int) -> float:
+def min_eigenvalue(hessian: np.ndarray, pixels: int) -> float:
     """Smallest eigenvalue of the normal equations per pixel; NaN where the matrix is not finite.
 
     Args:
-        hessian: 36 numbers, symmetric.
+        hessian: float64 [6, 6], symmetric, of numbers that were float32.
         pixels: how many pixels it is a sum over.
     """
-    matrix = np.array(hessian).reshape(6, 6)
-    if not np.isfinite(matrix).all():
+    if not math.isfinite(hessian.sum()):  # sums of so few float32 numbers don't overflow a float64
         return math.nan
-    return max(float(np.linalg.eigvalsh(matrix)[0]), 0.0) / pixels
+    return max(float(np.linalg.eigvalsh(hessian)[0]), 0.0) / pixels

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from spslam import ops
@@ -95,12 +96,12 @@ class FrameHistory:
 
     def last_row(self) -> int | None:
         """Row of the last frame with pixels and a trusted pose; None where there is none."""
-        rows = self.usable_rows()
-        return int(rows[-1]) if len(rows) else None
+        usable = np.flatnonzero(self._state.usable.numpy())
+        return int(usable[-1]) if len(usable) else None
 
     def last_mapped(self, every: int) -> tuple[int, EarlierFrame] | None:
         """The newest frame with a trusted pose that mapping took, given that it takes every n-th, and its number."""
-        has_pixels, lost = self._state.pixels.has_pixels, self._state.frames.lost
+        has_pixels, lost = self._state.pixels.pixel_flags, self._state.frames.lost_flags
         for row in range((len(lost) - 1) // every * every, -1, -every):
             if has_pixels[row] and not lost[row]:
                 return row, self.frame(row)
@@ -116,11 +117,12 @@ class FrameHistory:
         state = self._state
         if state.depth_keyframes is None:
             return None
-        selected = state.depth_keyframes.select(len(state.frames), state.frames.lost.numpy(), state.frames.poses)
+        frames = state.frames
+        selected = state.depth_keyframes.select(len(frames), frames.is_lost, frames.pose_rows)
         if selected is None:
             return None
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
-        motion = self.motion(len(state.frames), depth_time, color_offset)
+        motion = self.motion(len(frames), depth_time, color_offset)
         timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
         return selected._replace(timing=timing)
 

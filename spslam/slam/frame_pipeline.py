@@ -15,12 +15,11 @@ from spslam.config import Config
 from spslam.prior import load_prior
 from spslam.slam.constraints import Constraints, ConstraintSource
 from spslam.slam.device_events import event_recorder, fetch
-from spslam.slam.feature_store import keeps_features
+from spslam.slam.feature_keeper import FeatureKeeper
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report, pose_matrix
 from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
-from spslam.slam.image_features import extract_features
 from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.mapper import Mapper, MappingTask
 from spslam.slam.multi_map import MultiMap
@@ -31,6 +30,7 @@ from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.recovery import Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier
+from spslam.slam.row_copies import RowCopies
 from spslam.slam.state import SlamState
 from spslam.slam.tracker import Tracker, TrackingProblem
 from spslam.slam.upload import Upload
@@ -81,6 +81,7 @@ class FramePipeline:
         prior = load_prior(config.prior.weights, config.prior.neighborhood)
         self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
+        self._features = FeatureKeeper(config, camera, self._rectifier)
         tracking = config.tracking
         self._measures_timing = tracking.depth_keyframes and tracking.color and tracking.capture_timing
         confidence = PoseConfidenceModel.load()
@@ -140,7 +141,7 @@ class FramePipeline:
                 as many iterations as the first frame has.
         """
         self._record = event_recorder(self.device)
-        started = self._record()
+        started = frame.requested if frame.requested is not None and frame.wait_ms == 0 else self._record()
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
@@ -149,13 +150,9 @@ class FramePipeline:
             self.global_mapping.before_tracking()
         pixels, constraints, predicted, shutter = read, Constraints(), None, None
         if not begins_map:
-            predicted = self.tracker.predict(self.state.frames)
-            if self._measures_timing:
-                shutter = self._rectifier.motion(self.state, self.history, frame.depth_time, predicted)
-            if shutter is not None and self.state.frames.knows_speed:
-                pixels = self._rectifier.records(read, shutter)
-            gathered = self.constraints.gather(self.history, pixels, frame.depth_time, frame.offsets.color)
-            constraints = replace(gathered, shutter=shutter)
+            predicted, shutter, pixels = self._predict(read, frame.depth_time)
+            times = frame.depth_time, frame.offsets.color
+            constraints = self.constraints.gather(self.history, pixels, *times, shutter)
         tracked = self._track(pixels, predicted, constraints, number, events)
         shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
         pixels = read if shutter is None else self._rectifier.frame(read, shutter)
@@ -165,7 +162,7 @@ class FramePipeline:
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
             self._tell(on_pose, tracked)
-        self._keep_features(frame, read, tracked, number, shutter)
+        self._features.keep(self.state, frame, read, tracked, shutter)
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
@@ -275,6 +272,17 @@ class FramePipeline:
         events.upload = (frame.pixels.begin, frame.pixels.end)
         return frame.pixels.received()
 
+    def _predict(
+        self, read: FramePixels, depth_time: float
+    ) -> tuple[torch.Tensor, ops.ShutterMotion | None, FramePixels]:
+        """The next pose, how the camera moves to it (None where that does not matter), and the frame as that has it."""
+        state = self.state
+        seconds = self._rectifier.seconds(state, self.history, depth_time) if self._measures_timing else None
+        if seconds is None:
+            return self.tracker.predict(state.frames), None, read
+        shutter, pixels = self._rectifier.predict(read, state, seconds)
+        return shutter.pose, shutter, pixels
+
     def _track(
         self,
         pixels: FramePixels,
@@ -300,7 +308,7 @@ class FramePipeline:
         self, frame: PreparedFrame, pixels: FramePixels, constraints: Constraints, tracked: TrackedFrame
     ) -> None:
         """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
-        state, number = self.state, len(self.state.frames)
+        state, number, copies = self.state, len(self.state.frames), RowCopies()
         state.frames.append(
             tracked.pose,
             frame.timestamp,
@@ -309,38 +317,14 @@ class FramePipeline:
             pixels.depth_thumbnail,
             tracked.consistent_frames,
             frame.offsets,
+            copies,
         )
-        state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records)
+        state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records, copies)
         if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:
             if constraints.depth_keyframes is not None:
                 state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes)
-            state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image)
-
-    def _keep_features(
-        self,
-        frame: PreparedFrame,
-        read: FramePixels,
-        tracked: TrackedFrame,
-        number: int,
-        shutter: ops.ShutterMotion | None,
-    ) -> None:
-        """Keeps image features of a doubtful frame, and of every 30th one unless there are enough of its view.
-
-        Those that are due and were not extracted ahead are extracted now.
-        """
-        if tracked.occluded or self.state.frames.is_lost(-1):
-            return
-        features, processed = tracked.features, self.state.frames.processed - 1
-        if features is None and (frame.features is not None or keeps_features(self.config, processed)):
-            if self.state.has_enough_features(number):
-                return
-            features = frame.features
-            if features is None:
-                features = extract_features(read, self.camera, self.config.dataset.max_depth_m)
-        if features is not None and shutter is not None:
-            features = self._rectifier.features(features, shutter)
-        if features is not None:
-            self.state.features.add(number, features)
+            state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image, copies)
+        copies.make()
 
     def _integrate(self, pixels: FramePixels, tracked: TrackedFrame, number: int, events: FrameEvents) -> bool:
         """Encodes the newest frame if it is its turn; returns whether the map is to be optimized next."""
@@ -385,7 +369,7 @@ class FramePipeline:
 
     def _has_too_little_depth(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to determine a pose."""
-        return len(pixels.records) == 0 or pixels.valid_depth_share < self.config.tracking.min_valid_depth_share
+        return pixels.count == 0 or pixels.valid_depth_share < self.config.tracking.min_valid_depth_share
 
     def _is_mapping_turn(self, number: int) -> bool:
         return number % self.config.mapping.every == 0

@@ -1,7 +1,7 @@
 """The report of a frame, which can be created before the device has finished the frame."""
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -156,7 +156,7 @@ class PendingReport:
         self.events.finished.wait()
         loss = None if self.loss is None else float(self.loss)
         times: dict[str, Any] = {**self.events.times_ms(self.host_wait_ms)}
-        return replace(self.report, loss=loss, pose=pose_matrix(self.pose), **times)
+        return FrameReport(**{**vars(self.report), "loss": loss, "pose": pose_matrix(self.pose), **times})
 
 
 def pose_matrix(pose: np.ndarray | torch.Tensor | None) -> np.ndarray | None:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from spslam import ops
 from spslam.camera import Camera
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.geometry import pose7_to_matrix
 from spslam.scene.sparse_volume import resize_rows
 from spslam.slam.pixels import THUMBNAIL_STEP_PX
+from spslam.slam.row_copies import RowCopies, write_rows
 
 _FIRST_CAPACITY = 64
 _ON_HOST = ("timestamps", "depth_times", "color_offsets", "indices", "lost", "consistent_frames")
@@ -61,6 +61,11 @@ class FrameTable:
         return self._columns["poses"][: self._count]
 
     @property
+    def pose_rows(self) -> torch.Tensor:
+        """float32 [F or more, 7] as `poses`, with the rows that are not in use yet: no view has to be made of them."""
+        return self._columns["poses"]
+
+    @property
     def timestamps(self) -> torch.Tensor:
         """float64 [F], s."""
         return self._columns["timestamps"][: self._count]
@@ -84,6 +89,11 @@ class FrameTable:
     def lost(self) -> torch.Tensor:
         """bool [F] whether the pose is not to be trusted."""
         return self._columns["lost"][: self._count]
+
+    @property
+    def lost_flags(self) -> np.ndarray:
+        """bool [F], `lost` for NumPy: the same memory."""
+        return self._numbers["lost"][: self._count]
 
     @property
     def consistent_frames(self) -> torch.Tensor:
@@ -122,7 +132,7 @@ class FrameTable:
 
     def any_lost(self, count: int) -> bool:
         """Whether any of the last `count` rows, or of all if they are fewer, is lost."""
-        return bool(self._numbers["lost"][max(self._count - count, 0) : self._count].any())
+        return True in self._numbers["lost"][max(self._count - count, 0) : self._count].tolist()
 
     def depth_time(self, row: int) -> float:
         """When the depth image of a row was taken, s, as far as stamps tell; the row counts from the first."""
@@ -141,15 +151,16 @@ class FrameTable:
         depth_thumbnail: torch.Tensor,
         consistent_frames: int = 0,
         offsets: CaptureOffsets = AT_ONCE,
+        copies: RowCopies | None = None,
     ) -> None:
-        """Adds a row."""
-        if self._count == len(self._columns["poses"]):
+        """Adds a row; with `copies`, what is on the device is written when these are made."""
+        if self._count == self._columns["poses"].shape[0]:
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._set_columns({name: _with_capacity(column, capacity) for name, column in self._columns.items()})
         tables = [self._columns["poses"], self._columns["depth_thumbnails"]]
-        rows = [pose.to(tables[0]), depth_thumbnail.to(tables[1])]
-        ops.trusted.copy_rows_(tables, [self._count] * 2, rows)
-        values: dict[str, Any] = {
+        values = [pose.to(tables[0]), depth_thumbnail.to(tables[1])]
+        write_rows(copies, tables, [self._count] * 2, values)
+        numbers: dict[str, Any] = {
             "timestamps": timestamp,
             "depth_times": timestamp + offsets.depth,
             "color_offsets": offsets.color,
@@ -157,8 +168,8 @@ class FrameTable:
             "lost": lost,
             "consistent_frames": consistent_frames,
         }
-        for name, value in values.items():
-            self._numbers[name][self._count] = value
+        for name, number in numbers.items():
+            self._numbers[name][self._count] = number
         self._count += 1
 
     def matrices(self, first: int = 0) -> np.ndarray:

@@ -46,11 +46,15 @@ class ImageFeatures:
 def extract_features(pixels: FramePixels, camera: Camera, max_depth_m: float) -> ImageFeatures:
     """Features of a frame, strongest of each part of the image first; deterministic, waits for the device.
 
+    Those that were extracted ahead are there at once.
+
     Args:
         pixels: of the frame, with images.
         camera: of all frames.
         max_depth_m: the largest depth that images hold.
     """
+    if pixels.features is not None:
+        return pixels.features
     return features_of_images(
         pixels.intensity_image.cpu().numpy(), pixels.depth_image.cpu().numpy(), camera, max_depth_m
     )

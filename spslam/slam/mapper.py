@@ -1,6 +1,6 @@
 """Grows the map from new frames and optimizes it together with the poses (sections III.A, III.C, III.D)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -52,10 +52,11 @@ class Mapper:
 
     def integrate(self, state: SlamState, pixels: FramePixels) -> None:
         """Allocates and encodes voxel vertices around the newest frame's surface; grows the tri-planes to cover it."""
-        if len(pixels.records) == 0:
+        if pixels.count == 0:
             return
         scene = state.scene
-        points, normals = ops.unproject_pixels(pixels.records, pixels.normals, state.frames.poses[-1], *self.intrinsics)
+        pose = state.frames.pose_rows[len(state.frames) - 1]
+        points, normals = ops.trusted.unproject_pixels(pixels.records, pixels.normals, pose, self.intrinsics)
         tf32 = self.config.precision == "tf32"
         encoded = encode_frame(
             scene.volume, points, normals, self._prior(scene), self.config.prior, self.config.seed, tf32
@@ -86,7 +87,7 @@ class Mapper:
         if iterations == 0 or state.scene.volume.num_voxels == 0:
             return None
         usable = state.usable
-        if not bool(usable.any()):
+        if True not in usable.numpy():
             return None
         return self.begin_on(state, self._select(state, usable), iterations)
 
@@ -110,10 +111,7 @@ class Mapper:
             float32 [5] losses of the last iteration, as `optimize`.
         """
         config = self.config
-        options = replace(
-            render_options(config, ops.RandomStream.MAPPING_RAYS, task.newest),
-            iteration=task.done,
-        )
+        options = render_options(config, ops.RandomStream.MAPPING_RAYS, task.newest, task.done)
         losses = ops.trusted.optimize_map_(
             state.scene.view(),
             state.pixels.records,

@@ -5,8 +5,8 @@ import mmap
 import numpy as np
 import torch
 
-from spslam import ops
 from spslam.errors import SpslamError
+from spslam.slam.row_copies import RowCopies, write_rows
 
 RECORD_BYTES = 12
 RECORD_WORDS = 3
@@ -70,7 +70,12 @@ class PixelDatabase:
     @property
     def has_pixels(self) -> torch.Tensor:
         """bool [F] on the CPU: whether the frame had valid depth, and is still kept."""
-        return torch.from_numpy(self._has_pixels)[: self.num_frames]
+        return torch.from_numpy(self.pixel_flags)
+
+    @property
+    def pixel_flags(self) -> np.ndarray:
+        """bool [F], `has_pixels` for NumPy: the same memory."""
+        return self._has_pixels[: self.num_frames]
 
     @property
     def nbytes(self) -> int:
@@ -85,26 +90,28 @@ class PixelDatabase:
         """What so many frames of so many pixels take of the budget."""
         return frames * (pixels * RECORD_BYTES + self._bytes_beside)
 
-    def add(self, records: torch.Tensor) -> None:
+    def add(self, records: torch.Tensor, copies: RowCopies | None = None) -> None:
         """Appends a frame.
 
         Args:
             records: int32 [N, 3] in random order; N = 0 marks a frame without depth. Other N than P are cut or
                 repeated. On the database's device this waits for nothing.
+            copies: the records are written when these are made; None writes them now.
         """
         self._reserve(self.num_frames + 1)
         newest = self.num_frames - 1
         if newest > 0 and newest % self.keyframe_every:
             self._has_pixels[newest] = False
-        count = self.pixels_per_frame
+        count, given = self.pixels_per_frame, records.shape[0]
         self.num_frames += 1
-        if len(records):
-            repeated = records.repeat(-(-count // len(records)), 1) if len(records) < count else records
-            kept = (repeated if len(repeated) == count else repeated[:count]).to(self._words.device, non_blocking=True)
-            ops.trusted.copy_rows_([self.records], [self.num_frames - 1], [kept])
+        if given:
+            repeated = records.repeat(-(-count // given), 1) if given < count else records
+            kept = repeated if given == count else repeated[:count]
+            kept = kept.to(self._words.device, non_blocking=True)
+            write_rows(copies, [self.records], [self.num_frames - 1], [kept])
         else:
             self.records[-1].zero_()
-        self._has_pixels[self.num_frames - 1] = len(records) > 0
+        self._has_pixels[self.num_frames - 1] = given > 0
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The content, on the CPU; views where it is there already."""
@@ -124,7 +131,7 @@ class PixelDatabase:
             flags[: self.num_frames] = self._has_pixels[: self.num_frames]
             self._has_pixels = flags
         pixels = self._affordable_pixels(frames)
-        if pixels == self.pixels_per_frame and frames * self._words_per_frame <= len(self._words):
+        if pixels == self.pixels_per_frame and frames * self._words_per_frame <= self._words.numel():
             return
         if pixels < self.pixels_per_frame and self._memory is not None:
             self._thin_in_place(pixels, self._memory)

@@ -5,9 +5,11 @@ c is the foreshortening n . d times 128 (n the surface normal, d the ray directi
 turns a depth difference along the ray into a distance to the surface's tangent plane.
 """
 
-import copy
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,7 +20,11 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.slam.depth_keyframes import depth_image_step, depth_unit
 
+if TYPE_CHECKING:
+    from spslam.slam.image_features import ImageFeatures
+
 THUMBNAIL_STEP_PX = 16
+WORD_BYTES = 4  # of the buffer
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,7 @@ class FramePixels:
         thumbnail_shape: rows and columns of the depth thumbnail.
         depth_image_shape: rows and columns of the depth and intensity images; 0 and 0 without.
         valid_depth_share: share of the image's pixels with usable depth.
+        features: of the images, where they were extracted ahead; on the CPU, and no part of the buffer.
     """
 
     buffer: torch.Tensor
@@ -39,6 +46,7 @@ class FramePixels:
     thumbnail_shape: tuple[int, int]
     depth_image_shape: tuple[int, int]
     valid_depth_share: float
+    features: ImageFeatures | None = None
 
     @property
     def count(self) -> int:
@@ -48,49 +56,50 @@ class FramePixels:
     @cached_property
     def records(self) -> torch.Tensor:
         """int32 [P, 3] packed pixels in random order, so that any prefix is an even sample; a view of the buffer."""
-        return self.buffer[: 3 * self.count].view(-1, 3)
+        return self._view(torch.int32, 0, (self.count, 3))
 
     @cached_property
     def normals(self) -> torch.Tensor:
         """float32 [P, 3] unit normals in camera axes, turned to the camera, 0 where unknown; a view of the buffer."""
-        return self.buffer[3 * self.capacity :][: 3 * self.count].view(torch.float32).view(-1, 3)
+        return self._view(torch.float32, 3 * self.capacity, (self.count, 3))
 
     @cached_property
     def depth_thumbnail(self) -> torch.Tensor:
         """float16 [h, w] depth (m) at every `THUMBNAIL_STEP_PX`-th pixel, 0 where invalid; a view of the buffer."""
-        rows, columns = self.thumbnail_shape
-        return self.buffer[6 * self.capacity :].view(torch.float16)[: rows * columns].view(rows, columns)
+        return self._view(torch.float16, 6 * self.capacity, self.thumbnail_shape)
 
     @cached_property
     def depth_image(self) -> torch.Tensor:
         """uint16 [h', w'] depth in 1/65535 of the largest that is used, 0 where unknown; a view of the buffer."""
-        rows, columns = self.depth_image_shape
-        words = self.buffer[len(self.buffer) - sum(self._image_words) :][: self._image_words[0]]
-        return words.view(torch.uint16)[: rows * columns].view(rows, columns)
+        return self._view(torch.uint16, self.buffer.numel() - sum(self._image_words), self.depth_image_shape)
 
     @cached_property
     def intensity_image(self) -> torch.Tensor:
         """uint8 [h', w'] intensity in 1/255 of the same pixels; a view of the buffer."""
-        rows, columns = self.depth_image_shape
-        words = self.buffer[len(self.buffer) - self._image_words[1] :]
-        return words.view(torch.uint8)[: rows * columns].view(rows, columns)
+        return self._view(torch.uint8, self.buffer.numel() - self._image_words[1], self.depth_image_shape)
+
+    def _view(self, dtype: torch.dtype, word: int, shape: tuple[int, int]) -> torch.Tensor:
+        """What the buffer holds from a word on, [rows, columns]; a frame asks for several, so in few operations."""
+        content = self.buffer if dtype == torch.int32 else self.buffer.view(dtype)
+        first = content.storage_offset() + word * WORD_BYTES // content.element_size()
+        return content.as_strided(shape, (shape[1], 1), first)
 
     @property
     def _image_words(self) -> tuple[int, int]:
         return _image_words(self.depth_image_shape)
 
-    def to(self, device: torch.device, non_blocking: bool = False) -> "FramePixels":
+    def to(self, device: torch.device, non_blocking: bool = False) -> FramePixels:
         """The same on another device; one copy."""
         return self.holding(self.buffer.to(device, non_blocking=non_blocking))
 
-    def holding(self, buffer: torch.Tensor) -> "FramePixels":
+    def holding(self, buffer: torch.Tensor) -> FramePixels:
         """The same in another buffer, to which the words were copied."""
         return replace(self, buffer=buffer)
 
-    def having(self, **views: torch.Tensor) -> "FramePixels":
+    def having(self, **views: torch.Tensor) -> FramePixels:
         """The same, but for views by their names, which are tensors of their own; the buffer is as it was read."""
-        other = copy.copy(self)
-        other.__dict__.update(views)
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__, **views)
         return other
 
 

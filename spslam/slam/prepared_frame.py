@@ -1,7 +1,7 @@
 """A frame sampled from its images, as the system takes it."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 from spslam.camera import Camera
@@ -10,7 +10,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.slam.device_events import DeviceEvent
-from spslam.slam.feature_store import keeps_features
+from spslam.slam.feature_store import keeps_features, needs_features
 from spslam.slam.image_features import ImageFeatures, extract_features
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.upload import Upload, Uploader
@@ -25,7 +25,7 @@ class PreparedFrame:
         timestamp: s.
         pixels: on the CPU, or on their way to the device.
         decode_ms: reading, decoding and sampling, on the thread that did it.
-        wait_ms: how long the host waited for the frame.
+        wait_ms: how long the host waited for the frame; 0 where it was there already.
         requested: when it was requested; None where nobody kept the time.
         signature: what tells frozen depth; None where nobody asks.
         features: of its image, where they are kept in any case and were extracted ahead; else this is done once the
@@ -76,8 +76,19 @@ class FramePreparation:
         if keeps_features(config, i + self._start):
             pixels = cast(FramePixels, prepared.pixels)
             prepared.features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
+            prepared.pixels = replace(pixels, features=prepared.features)
         prepared.signature = FrameSignature.of(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         if self._uploader:
             prepared.pixels = self._uploader.send(cast(FramePixels, prepared.pixels))
         return prepared
+
+    def extract_ahead(self, frame: PreparedFrame, number: int) -> None:
+        """Extracts image features of a frame of this that is on the CPU, if frame `number` of the run needs them.
+
+        That number differs from the frame's position where frames could not be read.
+        """
+        config, pixels = self._config, cast(FramePixels, frame.pixels)
+        if needs_features(config, number):
+            features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
+            frame.pixels = replace(pixels, features=features)

@@ -4,8 +4,8 @@ from spslam import ops
 from spslam.config import Config
 
 
-def render_options(config: Config, stream: ops.RandomStream, frame: int) -> ops.RenderOptions:
-    """Sampling, losses and random stream (Philox) of a call's first render step, from the configuration."""
+def render_options(config: Config, stream: ops.RandomStream, frame: int, iteration: int = 0) -> ops.RenderOptions:
+    """Sampling, losses and random stream (Philox) of the render steps of a call, from an iteration on."""
     return ops.RenderOptions(
         num_uniform=config.sampling.uniform,
         num_surface=config.sampling.surface,
@@ -20,6 +20,6 @@ def render_options(config: Config, stream: ops.RandomStream, frame: int) -> ops.
         seed=config.seed,
         stream=stream,
         frame=frame,
-        iteration=0,
+        iteration=iteration,
         precision=config.precision,
     )

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from spslam import ops
 from spslam.camera import Camera
@@ -29,52 +28,55 @@ class ShutterRectifier:
     """
 
     def __init__(self, camera: Camera, max_depth_m: float):
-        self._camera, self._unit = camera, depth_unit(max_depth_m)
+        self._unit = depth_unit(max_depth_m)
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self._image_intrinsics = depth_image_intrinsics(camera)
+        self._size = camera.height, camera.width
+        self._image_rows = -(-camera.height // depth_image_step(camera))
+        self._is_flat = min(self._image_rows, -(-camera.width // depth_image_step(camera))) < 2  # nothing between rows
 
-    @staticmethod
-    def motion(
-        state: SlamState,
-        history: FrameHistory,
-        depth_time: float,
-        predicted: torch.Tensor,
-    ) -> ops.ShutterMotion | None:
-        """How the camera is predicted to move while the next frame is read; None where that does not matter.
+    def seconds(self, state: SlamState, history: FrameHistory, depth_time: float) -> float | None:
+        """Since when the camera is known to move to the next frame, s; None where that does not matter.
 
         Args:
             state: before that frame.
             history: of the state.
             depth_time: when the frame's depth image was taken, s.
-            predicted: float32 [7], the next pose.
         """
-        frames, readout = state.frames, state.noise.readout
-        motion = history.motion(len(frames), depth_time)
-        if motion.row < 0 or (readout.device.type == "cpu" and float(readout) == 0):
+        readout, motion = state.noise.readout, history.motion(len(state.frames), depth_time)
+        if motion.row < 0 or self._is_flat or (readout.device.type == "cpu" and float(readout) == 0):
             return None
-        # A copy: the frame itself changes the estimate before its features are kept.
-        return ops.ShutterMotion(frames.poses[-1], predicted, motion.seconds, readout.clone())
+        return motion.seconds
 
-    def records(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
-        """The frame with its records rectified; images, normals and thumbnail are as they were read."""
-        height, width = self._camera.height, self._camera.width
-        if pixels.count == 0 or min(height, width) < 2:
-            return pixels
-        records = torch.empty_like(pixels.records)
-        ops.trusted.rectify_shutter_records_(records, pixels.records, motion, self._intrinsics, height, width)
-        return pixels.having(records=records)
+    def predict(self, pixels: FramePixels, state: SlamState, seconds: float) -> tuple[ops.ShutterMotion, FramePixels]:
+        """How the camera is predicted to move, at constant velocity, and the frame with its records rectified by that.
+
+        Without a speed it is predicted to stay, and the records too are as they were read.
+
+        Args:
+            pixels: of the frame; images, normals and thumbnail stay as they were read.
+            state: before the frame.
+            seconds: from the last frame to this one.
+        """
+        frames, readout, last = state.frames, state.noise.readout, len(state.frames) - 1
+        before = frames.pose_rows[last]
+        # A copy of the readout: the frame itself changes the estimate before its features are kept.
+        if not frames.knows_speed:
+            return ops.ShutterMotion(before, before.clone(), seconds, readout.clone()), pixels
+        predicted, readout, records = ops.trusted.predict_frame(
+            frames.pose_rows, last, readout, seconds, pixels.records, self._intrinsics, self._size
+        )
+        return ops.ShutterMotion(before, predicted, seconds, readout), pixels.having(records=records)
 
     def frame(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
         """The frame with its records and images rectified."""
-        if min(pixels.depth_image_shape) < 2:
-            return self.records(pixels, motion)
         records, depth, intensity = ops.trusted.rectify_shutter_frame(
             pixels.records,
             pixels.depth_image,
             pixels.intensity_image,
             motion,
             self._intrinsics,
-            (self._camera.height, self._camera.width),
+            self._size,
             self._image_intrinsics,
             self._unit,
         )
@@ -90,7 +92,7 @@ class ShutterRectifier:
         linear = pose[:3, :3].T @ (pose[:3, 3] - before[:3, 3]) / motion.seconds
         if max(np.linalg.norm(angular), np.linalg.norm(linear)) * abs(readout) > MAX_READOUT_MOTION:
             return features
-        k, height = self._image_intrinsics, -(-self._camera.height // depth_image_step(self._camera))
+        k, height = self._image_intrinsics, self._image_rows
         positions = features.positions.astype(np.float64)
         known = features.points[:, 2:] > 0
         rays = np.concatenate([(positions - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(positions), 1))], 1)

@@ -23,6 +23,7 @@ class SensorNoiseEstimate:
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self._noise = ops.SensorNoise.unknown(device)
         self._timing = ops.CaptureTiming.unknown(device)
+        self._color_delay, self._readout = self._timing.color_delay, self._timing.seconds[1:]  # views, for each frame
         self._depth_noise_m = depth_noise_m
         self._fix_depth()
 
@@ -34,12 +35,12 @@ class SensorNoiseEstimate:
     @property
     def color_delay(self) -> torch.Tensor:
         """float32 [1] from a frame's depth image to its color image, s, on the device; 0 where it does not matter."""
-        return self._timing.color_delay
+        return self._color_delay
 
     @property
     def readout(self) -> torch.Tensor:
         """float32 [1] from the first row of a frame that is read to the last, s; as `color_delay`."""
-        return self._timing.seconds[1:]
+        return self._readout
 
     def measure(self, pixels: FramePixels, pose: torch.Tensor, depth_keyframes: ops.DepthKeyframes) -> None:
         """Takes account of a frame at a trusted pose, float32 [7]; asynchronously."""

@@ -140,7 +140,7 @@ class SlamState:
     @property
     def usable(self) -> torch.Tensor:
         """bool [F] on the CPU: frames that mapping may draw from, as they have pixels and a pose to be trusted."""
-        return self.pixels.has_pixels & ~self.frames.lost
+        return torch.from_numpy(self.pixels.pixel_flags & ~self.frames.lost_flags)
 
     @classmethod
     def start(

@@ -165,9 +165,10 @@ class Tracker:
         # Waits for the device, once: whether the pose is trusted decides what is done next.
         is_predicted = start is problem.predicted
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
-        start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], numbers[14:50]
-        mean_square, inlier_share, _, _, mean_robust_weight = numbers[len(found) - 5 : len(found)]
-        predicted = start_numbers if is_predicted else numbers[len(found) :]
+        start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], np.array(numbers[14:50]).reshape(6, 6)
+        size = found.numel()
+        mean_square, inlier_share, _, _, mean_robust_weight = numbers[size - 5 : size]
+        predicted = start_numbers if is_predicted else numbers[size:]
         error_cm, error_deg = prediction_error(predicted, pose_numbers)
         fit = Fit(
             residual_cm=100 * math.sqrt(max(mean_square, 0.0)),
@@ -178,5 +179,4 @@ class Tracker:
             prediction_error_deg=error_deg,
         )
         variance = max(mean_square, LEAST_DEVIATION_M**2) * tracking.pixels / INDEPENDENT_PIXELS
-        information = np.array(hessian).reshape(6, 6) / variance
-        return PoseEstimate(found[7:14], iterations, fit, information, tuple(pose_numbers))
+        return PoseEstimate(found[7:14], iterations, fit, hessian / variance, tuple(pose_numbers))

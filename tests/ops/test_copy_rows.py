@@ -34,6 +34,28 @@ def test_as_single_assignments(device):
     ops.copy_rows_([], [], [])
 
 
+@pytest.mark.parametrize("count", [9, 20])
+def test_copies_that_need_earlier_ones_come_after_them(device, count):
+    """A row that is written twice, one that is read after it was written, and one that is written after it was read."""
+    generator = torch.Generator().manual_seed(count)
+    table = torch.rand(count, 5, generator=generator).to(device)
+    rows = torch.randint(count, (count,), generator=generator).tolist()
+    expected = table.clone()
+    for i, row in enumerate(rows):
+        expected[row] = expected[i].clone()
+    ops.copy_rows_([table] * count, rows, [table[i] for i in range(count)])
+    assert torch.equal(table, expected)
+
+
+@pytest.mark.parametrize("columns", [1, 15, 16, 17, 100_003])
+def test_rows_of_any_length_and_place(device, columns):
+    value = torch.arange(columns + 1, device=device).to(torch.uint8)
+    for first in (0, 1):  # bytes from where memory is aligned
+        table = torch.zeros(4, columns, dtype=torch.uint8, device=device)
+        ops.copy_rows_([table], [2], [value[first : first + columns]])
+        assert torch.equal(table[2], value[first : first + columns]) and not table[[0, 1, 3]].any()
+
+
 def test_a_view_of_a_table_is_the_table(device):
     table, value = torch.zeros(4, 3, device=device), torch.ones(3, device=device)
     ops.copy_rows_([table[1:]], [0], [value])

@@ -60,6 +60,22 @@ def test_rectifying_a_frame_is_rectifying_records_and_images(device):
     assert not torch.equal(got[0], records["records"])
 
 
+@pytest.mark.parametrize("rows", [200, 0])
+def test_predicting_a_frame_is_predicting_its_pose_and_rectifying_its_records(device, rows):
+    _, _, call, _ = frames(device, rows)
+    motion, size = call["motion"], (call["height"], call["width"])
+    unused = torch.full((7,), torch.nan, device=device)
+    table, readout = torch.stack([unused, motion.before, motion.pose, unused]), motion.readout + 0.01
+    pose = ops.predict_pose(motion.before, motion.pose)
+    onwards = ops.ShutterMotion(motion.pose, pose, motion.seconds, readout)
+    records = torch.empty_like(call["records"])
+    ops.rectify_shutter_records_(**{**call, "out": records, "motion": onwards})
+    got = ops.trusted.predict_frame(table, 2, readout, motion.seconds, call["records"], call["intrinsics"], size)
+    assert all(torch.equal(one, other) for one, other in zip(got, (pose, readout, records), strict=True))
+    assert got[1].data_ptr() != readout.data_ptr()
+    assert rows == 0 or not torch.equal(records, call["records"])
+
+
 def test_what_tracking_finds_is_one_tensor(device):
     call = track(torch.Generator().manual_seed(3), device, 60)
     pose, stats, hessian = ops.track_gauss_newton(**call)
@@ -80,9 +96,12 @@ def raw_calls(device):
     measured = [noise.counts, noise.model, timing.state, timing.seconds, pixels, timed["pose"], camera, list(COUNTS)]
     rectified = [records["records"], images["depth"], images["intensity"], motion.before, motion.pose, motion.readout]
     numbers = [*records["intrinsics"], *images["intrinsics"], motion.seconds, images["unit"]]
+    size, poses = [records["height"], records["width"]], torch.stack([motion.before, motion.pose])
+    predicted = [poses, 1, motion.readout, records["records"], [*records["intrinsics"], motion.seconds], *size]
     return (
         (torch.ops.spslam.measure_frame_.default, [*measured, *keyframes.arguments()]),
-        (torch.ops.spslam.rectify_shutter_frame.default, [*rectified, numbers, records["height"], records["width"]]),
+        (torch.ops.spslam.rectify_shutter_frame.default, [*rectified, numbers, *size]),
+        (torch.ops.spslam.predict_frame.default, predicted),
     )
 
 
@@ -104,10 +123,17 @@ def test_opcheck(device):
         (1, 2, lambda intensity: intensity[1:]),
         (1, 4, lambda pose: pose[:6]),
         (1, 6, lambda numbers: numbers[1:]),
+        (2, 0, lambda poses: poses[:, :6]),
+        (2, 1, lambda last: 0),
+        (2, 1, lambda last: 2),
+        (2, 2, lambda readout: readout[:0]),
+        (2, 3, lambda records: records[:, :2]),
+        (2, 4, lambda numbers: [*numbers[:4], 0.0]),
+        (2, 5, lambda height: 1),
     ],
 )
 def test_the_bindings_refuse_what_would_read_elsewhere(device, place, argument, bad):
     op, call = raw_calls(device)[place]
     call[argument] = bad(call[argument])
-    with pytest.raises(RuntimeError, match="(measure_frame_|rectify_shutter_[a-z_]*): "):
+    with pytest.raises(RuntimeError, match="(measure_frame_|rectify_shutter_[a-z_]*|predict_frame): "):
         op(*call)

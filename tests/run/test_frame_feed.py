@@ -1,12 +1,15 @@
 """Asynchronous reading of frames: order, content, times and upload."""
 
+import numpy as np
 import pytest
 import torch
 
 from spslam.datasets.base import RgbdFrame
+from spslam.datasets.frozen_depth import FROZEN
 from spslam.errors import DatasetError
 from spslam.run import frame_feed
 from spslam.run.frame_feed import FrameFeed, automatic_workers
+from spslam.slam.image_features import extract_features
 from spslam.slam.pixels import sample_frame
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload, Uploader
@@ -43,6 +46,32 @@ def test_frames_come_in_order_with_their_pixels(device, reader, workers, ahead):
         assert item.timestamp == frame.timestamp
         assert item.decode_ms > 0
         assert item.wait_ms >= 0
+
+
+def freeze_fourth(frame):
+    break_third(frame)
+    if frame.index == 4:
+        frame.depth[:] = Recorded(FRAMES).frames[3].depth
+        frame.color[:] = frame.color[:, ::-1]
+
+
+@pytest.mark.parametrize("reader", ["threads", "process"])
+def test_what_is_frozen_is_no_frame_and_features_are_of_those_processed(reader):
+    """Frame 1 is the 28th processed, 3 the 29th and, as 4 is frozen, 5 the 30th, whose features are kept."""
+    config = settings(f"run.reader={reader}", "run.prefetch_workers=2", "run.prefetch_ahead=8")
+    dataset = Recorded(FRAMES, freeze_fourth)
+    with FrameFeed(dataset, config, torch.device("cpu"), start=1, processed=28) as feed:
+        items = list(feed)
+    errors = [str(item) for item in items if isinstance(item, DatasetError)]
+    assert len(errors) == 2 and errors[1].endswith(FROZEN)
+    frames = [item for item in items if isinstance(item, PreparedFrame)]
+    assert [item.index for item in frames] == [1, 3, 5, 6, 7, 8]
+    assert all(item.features is None for item in frames)
+    assert [item.index for item in frames if item.pixels.features is not None] == [5] * (reader == "process")
+    if reader == "process":
+        read = sample_frame(Recorded(FRAMES)[5], dataset.camera, config)
+        wanted = extract_features(read, dataset.camera, config.dataset.max_depth_m)
+        assert np.array_equal(frames[2].pixels.features.descriptors, wanted.descriptors)
 
 
 @pytest.mark.cuda

@@ -148,7 +148,7 @@ class LateEvent(HostEvent):
 @pytest.mark.parametrize(("can_lock", "notes"), [(True, ["lock", "unlock"]), (False, ["lock"])])
 def test_slots_are_freed_when_their_uploads_are_complete(can_lock, notes):
     dataset, config, uploader = Recorded(FRAMES), settings(), LateUploader(can_lock)
-    reader = ReaderProcess.start(dataset, config, start=0, workers=1, ahead=4, uploader=uploader)
+    reader = ReaderProcess.start(dataset, config, begin=(0, 0), workers=1, ahead=4, uploader=uploader)
     reader.wait_until_ready()
     frames = list(reader)
     assert [frame.index for frame in frames] == list(range(FRAMES))

@@ -248,3 +248,29 @@ def test_a_file_that_is_not_a_map_gives_a_one_line_error(scene, tmp_path):
 def test_a_missing_folder_is_an_output_error(scene, tmp_path):
     with pytest.raises(OutputError, match="can't be written"):
         scene.save(tmp_path / "none" / "map.safetensors")
+
+
+def test_a_view_is_kept_until_the_scene_is_another(scene):
+    """Each frame asks for it: it must be that of the scene as it is, whatever was changed."""
+
+    def is_current(view):
+        tensors = {"texels": scene.planes.texels, "geometry_params": scene.geometry_decoder}
+        tensors |= {"color_params": scene.color_decoder, "embeddings": scene.volume.embeddings}
+        same = all(getattr(view, name).data_ptr() == tensor.data_ptr() for name, tensor in tensors.items())
+        return same and len(view.embeddings) == len(view.corner_ids) == scene.volume.num_voxels
+
+    first = scene.view()
+    assert scene.view() is first and is_current(first)
+    changes = (
+        lambda: scene.volume.insert(torch.tensor([[1000, 1000, 1000]], dtype=torch.int32)),
+        lambda: scene.volume.insert(torch.arange(3 * scene.volume.capacity, dtype=torch.int32).view(-1, 3)),
+        lambda: scene.planes.cover(torch.full((1, 3), 5.0)),
+        lambda: setattr(scene, "geometry_decoder", scene.geometry_decoder.clone()),
+        lambda: setattr(scene, "color_decoder", scene.color_decoder.clone()),
+        lambda: scene.load_state_dict({name: one.clone() for name, one in scene.state_dict().items()}),
+    )
+    for change in changes:
+        before = scene.view()
+        change()
+        assert scene.view() is not before and is_current(scene.view())
+    assert scene.view() is scene.view()

@@ -30,7 +30,7 @@ def used(store, frame, lost=()):
     """Numbers of the frames whose images are used for a frame, by what the images hold."""
     is_lost = np.zeros(frame, bool)
     is_lost[list(lost)] = True
-    views = store.select(frame, is_lost, torch.zeros(frame, 7))
+    views = store.select(frame, lambda row: bool(is_lost[row]), torch.zeros(frame, 7))
     if views is None:
         return []
     assert all(int(views.images[row][0, 0]) == of + 1 for row, of in views.rows)
@@ -63,7 +63,7 @@ def test_lost_frames_and_frames_without_an_image_are_left_out():
 
 def test_a_view_has_the_units_and_the_camera_of_its_pixels():
     store = filled(1)
-    views = store.select(1, torch.zeros(1, dtype=torch.bool), torch.zeros(1, 7))
+    views = store.select(1, lambda _: False, torch.zeros(1, 7))
     assert views.unit == pytest.approx(1e-4)
     assert views.kernel_end == 0.01
     assert views.intrinsics == (10.0, 10.0, 4.0, 3.0)

@@ -99,3 +99,15 @@ def test_one_buffer_holds_everything(dataset):
         assert storage.data_ptr() == copy.buffer.untyped_storage().data_ptr()
     assert copy.count == len(copy.records) == 15000
     assert pixels.to(torch.device("cpu")).valid_depth_share == pixels.valid_depth_share
+
+
+def test_a_buffer_may_be_part_of_larger_memory(dataset):
+    """As one frame's slot of those that the reading process shares."""
+    pixels = sample_frame(dataset[0], dataset.camera, settings())
+    words = len(pixels.buffer)
+    memory = torch.zeros(3 * words + 1, dtype=torch.int32)
+    memory[words + 1 : 2 * words + 1] = pixels.buffer
+    other = pixels.holding(memory[words + 1 : 2 * words + 1])
+    for name in ("records", "normals", "depth_thumbnail", "depth_image", "intensity_image"):
+        one, same = getattr(pixels, name), getattr(other, name)
+        assert one.dtype == same.dtype and torch.equal(one.float(), same.float()) and same.is_contiguous()

@@ -37,4 +37,31 @@ template <class Device>
 void rectify_shutter_images(Device device, const FrameImages& images, const ShutterMotion& motion,
                             const ShutterCamera& camera, std::uint16_t* depth, std::uint8_t* intensity);
 
+// Where a rectified frame is written to.
+struct ShutterFrame {
+  std::int32_t* records;
+  std::uint16_t* depth;
+  std::uint8_t* intensity;
+};
+
+// Records and images of a frame in one go, to other memory.
+template <class Device>
+void rectify_shutter_frame(Device device, const std::int32_t* records, std::int64_t num_records,
+                           const FrameImages& images, const ShutterMotion& motion, const ShutterCamera& camera,
+                           const ShutterCamera& image_camera, const ShutterFrame& out);
+
+// What is predicted of a frame: its pose [7], the readout [1] that counts for it, and its records as they are
+// rectified.
+struct PredictedFrame {
+  float *pose, *readout;
+  std::int32_t* records;
+};
+
+// predict_pose after the poses `before` and `last`, and the records of a frame `seconds` after `last` as the motion
+// from there to the predicted pose rectifies them.
+template <class Device>
+void predict_frame(Device device, const float* before, const float* last, const float* readout, float seconds,
+                   const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,
+                   const PredictedFrame& out);
+
 }  // namespace spslam

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from spslam.camera import Camera
 from spslam.config import Config
+from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import extract_features
 from spslam.slam.pixels import FramePixels
@@ -53,15 +55,14 @@ class Recovery:
 
     def judge(self, estimate: PoseEstimate) -> TrackedFrame:
         """The estimate, trusted or not by its fit alone."""
-        tracked = TrackedFrame.untracked(estimate.pose, lost=True)
-        return self._judged(
-            replace(
-                tracked,
-                iterations=estimate.iterations,
-                fit=estimate.fit,
-                information=estimate.information,
-                on_host=None if estimate.numbers is None else (estimate.pose, estimate.numbers),
-            )
+        fit, numbers = estimate.fit, estimate.numbers
+        return TrackedFrame(
+            estimate.pose,
+            estimate.iterations,
+            fit,
+            **self._judgement(fit),
+            information=estimate.information,
+            on_host=None if numbers is None else (estimate.pose, numbers),
         )
 
     def resolve(
@@ -97,14 +98,15 @@ class Recovery:
         return replace(tracked, pose=(problem.predicted if known is None else known.pose).clone())
 
     def _judged(self, tracked: TrackedFrame) -> TrackedFrame:
-        """The frame with what its fit says of its pose; one of NaN has no inliers."""
-        tracking, probability = self._config.tracking, self._confidence.error_probability(tracked.fit)
-        return replace(
-            tracked,
-            error_probability=probability,
-            lost=not (tracked.fit.inlier_share >= tracking.min_inlier_share and probability <= tracking.lost_threshold),
-            occluded=self._confidence.is_occluded(tracked.fit),
-        )
+        """The frame with what its fit says of its pose."""
+        return replace(tracked, **self._judgement(tracked.fit))
+
+    def _judgement(self, fit: Fit) -> dict[str, Any]:
+        """What a fit says of its pose, as fields of `TrackedFrame`; one of NaN has no inliers."""
+        tracking, probability = self._config.tracking, self._confidence.error_probability(fit)
+        is_trusted = fit.inlier_share >= tracking.min_inlier_share and probability <= tracking.lost_threshold
+        occluded = self._confidence.is_occluded(fit)
+        return {"error_probability": probability, "lost": not is_trusted, "occluded": occluded}
 
     def _is_unpredicted(self, history: FrameHistory) -> bool:
         """Whether nothing says how far the camera has moved; a pose that slid from the last one fits a young map."""
