@@ -108,6 +108,11 @@ SPS_INLINE void add_plane_sample(float q, const PlaneMiddle& middle, int du, int
   sums.qq += weight * difference * difference;
 }
 
+// How much a plane at a depth (m) counts, of 1 without noise.
+SPS_INLINE float plane_certainty(const DepthNoise& noise, float depth) {
+  return kPoseVariance / (kPoseVariance + depth_variance(noise, depth));
+}
+
 struct MeasuredPlane {
   Vec3<float> normal;
   float distance, weight;
@@ -140,8 +145,7 @@ SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera,
   const float distance = 1.0f / std::sqrt(mx * mx + my * my + mz * mz);
   const float cosine = q * distance / std::sqrt(x * x + y * y + 1.0f);
   const bool known = (center > 0.0f) & (q > 0.0f) & (support > kLeastSupport) & (cosine > kLeastCosine);
-  const float variance = depth_variance(noise.depth, 1.0f / (known ? q : 1.0f));
-  const float certainty = kPoseVariance / (kPoseVariance + variance);
+  const float certainty = plane_certainty(noise.depth, 1.0f / (known ? q : 1.0f));
   const float body = support * (1.0f / kFullWeightSupport);
   const float weight = certainty * cosine * (body < 1.0f ? body : 1.0f);
   return {{known ? mx * distance : 0.0f, known ? my * distance : 0.0f, known ? mz * distance : 0.0f},

@@ -169,6 +169,17 @@ SPS_INLINE float plane_distance(const MeasuredPlane& plane, const Vec3<float>& a
   return plane.distance - dot(plane.normal, at);
 }
 
+// The weight of a plane for a voxel, more than its own for one that lies farther before it than the truncation. That it
+// is free is no less certain where what is seen through it is far and noisy: it weighs what a plane that the truncation
+// just reaches would. Else a few pixels on an edge outvote any number that see past it to a far wall.
+SPS_INLINE float weight_before(const MeasuredPlane& plane, float along, float depth, float truncation,
+                               const TsdfOptions& options) {
+  const float met = depth * plane.distance / along, farthest = plane.distance / kTouchCosine;
+  const float seen = met < farthest ? met : farthest, nearest = depth + truncation;
+  const float ratio = plane_certainty(options.noise, nearest) / plane_certainty(options.noise, seen);
+  return plane.weight * ((along > 0.0f) & (seen > nearest) ? ratio : 1.0f);
+}
+
 // Of a voxel at a depth and a distance from a plane, of which only distance and weight are used.
 SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, float distance, float depth, float voxel_size,
                                          const TsdfOptions& options) {
@@ -182,7 +193,7 @@ SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, float dista
   const float noisy = kFullWeightDeviations * deviation / truncation;
   const float full = noisy < kMostFullWeight ? noisy : kMostFullWeight;
   const float fall = (1.0f + distance / truncation) / (1.0f - full);
-  const float weight = plane.weight * (fall < 1.0f ? fall : 1.0f);
+  const float weight = weight_before(plane, along, depth, truncation, options) * (fall < 1.0f ? fall : 1.0f);
   return {distance < truncation ? distance : truncation, (plane.weight > 0.0f) & near ? weight : 0.0f};
 }
 

@@ -14,13 +14,10 @@ import numpy as np
 
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import Readable
-from spslam.errors import DatasetError
+from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, some_depths, surface_steps
 
 # Half the width of the ramps that are looked for, and how far beyond it depth must be flat again, px.
 _REACH, _BEYOND = 3, 2
-# Inverse depth of one surface differs by less than this share of it and so many deviations of the noise, as in
-# `ops.measure_planes`; at an edge it differs by so many times as much.
-_SAME_SHARE, _SAME_DEVIATIONS, _EDGE = 0.015, 4.0, 4.0
 # Beyond an edge the slope is at most this share of the mean slope across it.
 _FLAT = 0.5
 # Two neighboring steps, with one mixed pixel between them, have this share of a sharp edge.
@@ -28,10 +25,8 @@ _SHARP = 0.8
 # The inner pixels, two to each side of the middle, have this share of the change across a ramp; of the tread of a stair
 # it is two thirds.
 _INNER, _INNER_SHARE = 2, 0.8
-# Frames that are looked at, edges that they must have, and the share of these that is blurred: at most 0.6 where a
-# sensor mixes single pixels (time of flight), 1 where it smooths.
-_FRAMES, _LEAST_EDGES, _BLURRED_SHARE = 8, 100, 0.8
-_NEAREST_M = 1e-3
+# The share of edges that is blurred: at most 0.6 where a sensor mixes single pixels (time of flight), 1 where it smooths.
+_BLURRED_SHARE = 0.8
 
 
 def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -> bool:
@@ -42,16 +37,12 @@ def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -
         noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
     """
     blurred = edges = 0
-    for position in np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]:
-        try:
-            depth = frames[int(position)].depth
-        except DatasetError:
-            continue
+    for depth in some_depths(frames):
         for profile in _profiles(depth, noise):
             found = profile.middles() & profile.whole()
             edges += int(found.sum())
             blurred += int((found & ~profile.sharp()).sum())
-    return edges >= _LEAST_EDGES and blurred > _BLURRED_SHARE * edges
+    return edges >= LEAST_EDGES and blurred > _BLURRED_SHARE * edges
 
 
 def without_blurred_edges(depth: np.ndarray, noise: tuple[float, float]) -> np.ndarray:
@@ -116,7 +107,7 @@ class _Profiles:
         before, after = self._sides()
         most = _FLAT * _BEYOND / (2 * _REACH) * self._change()
         rising = (np.abs(self.around[0] - before) > most) | (np.abs(self.around[-1] - after) > most)
-        return (self._change() > _EDGE * self.gate) & ~rising
+        return (self._change() > EDGE * self.gate) & ~rising
 
     def _change(self) -> np.ndarray:
         before, after = self._sides()
@@ -134,11 +125,7 @@ class _Profiles:
 
 def _profiles(depth: np.ndarray, noise: tuple[float, float]) -> tuple[_Profiles, _Profiles]:
     """Those along rows and along columns."""
-    known = np.isfinite(depth) & (depth > _NEAREST_M)
-    safe = np.where(known, depth, np.float32(1))
-    inverse = np.where(known, 1 / safe, np.float32(np.nan))
-    deviation = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * safe**4)
-    gate = (np.float32(_SAME_SHARE) + np.float32(_SAME_DEVIATIONS) * deviation / safe) * inverse
+    inverse, gate = surface_steps(depth, noise)
     margin = _REACH + _BEYOND
     height, width = depth.shape
     wide = np.pad(inverse, ((0, 0), (margin, margin)), constant_values=np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from spslam.errors import DatasetError, SpslamError
 from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
+from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
 from spslam.meshing.sdf_sampling import near_surface
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
@@ -25,10 +27,10 @@ COARSENING = 1.5
 _MOST_ATTEMPTS = 12
 # Truncation in deviations of the noise of near depth, and at most; a phone's LiDAR, smoothed at edges, needs so many.
 NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
-# Weight of a pixel on a ramp between two surfaces, where depth was smoothed over edges: what else was seen there counts
-# for more, and as `extract_fused_mesh` asks for as large a share of the weight nearby, little of a ramp stays beside
-# surface. What lies between may be the floor of a landing, of which a camera sees but its edge.
-RAMP_WEIGHT = 0.01
+# Weight of a pixel between two surfaces, on a ramp where depth was smoothed over edges or flying: what else was seen
+# there counts for more, and as `extract_fused_mesh` asks for as large a share of the weight nearby, little of it stays
+# beside surface. What lies between may be the floor of a landing, of which a camera sees but its edge.
+BETWEEN_WEIGHT = 0.01
 _WORKERS, _AHEAD = 2, 4
 
 
@@ -94,6 +96,19 @@ class PosedFrames:
                     yield frame, pose
 
 
+class _EdgeKind(enum.Enum):
+    """What lies between two surfaces in the depth images of a recording: nothing, flying pixels, or a ramp."""
+
+    SHARP, FLYING, BLURRED = range(3)
+
+    @staticmethod
+    def of(part: PosedFrames, noise: tuple[float, float]) -> _EdgeKind:
+        """Judged by a few frames."""
+        if edges_are_blurred(part, noise):
+            return _EdgeKind.BLURRED
+        return _EdgeKind.FLYING if has_flying_pixels(part, noise) else _EdgeKind.SHARP
+
+
 def fuse_frames(
     frames: PosedFrames | Sequence[PosedFrames],
     options: FusionOptions,
@@ -102,8 +117,9 @@ def fuse_frames(
 ) -> ops.TsdfVolume:
     """Fuses all frames into a new volume.
 
-    Where a sensor smooths depth over edges, the pixels between two surfaces have little weight. Such frames are read
-    twice: what frames saw before may be free of what a later one takes for surface there.
+    Where a sensor mixes near and far surface at edges, or smooths depth over them, the pixels between two surfaces have
+    little weight. Frames of smoothed depth are read twice: what frames saw before may be free of what a later one takes
+    for surface there.
 
     Args:
         frames: to be fused, in order; of one dataset or of several in one world.
@@ -120,7 +136,7 @@ def fuse_frames(
         SpslamError: voxels of over a hundred times the size would not fit either.
     """
     parts = [frames] if isinstance(frames, PosedFrames) else frames
-    blurred = [edges_are_blurred(part, part.noise or options.noise) for part in parts]
+    edges = [_EdgeKind.of(part, part.noise or options.noise) for part in parts]
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
         truncations = options.truncation_m(voxel_size_m), options.near_truncation_m(voxel_size_m)
@@ -128,8 +144,8 @@ def fuse_frames(
         try:
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
-            for part, smooth in zip(parts, blurred, strict=True):
-                _fuse_part(volume, part, part.noise or options.noise, smooth)
+            for part, kind in zip(parts, edges, strict=True):
+                _fuse_part(volume, part, part.noise or options.noise, kind)
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -166,23 +182,25 @@ def surface_cells(scene: Scene) -> torch.Tensor:
     return near_surface(cells, volume.voxel_size_m, sdf, MAX_SLOPE, CHUNK_POINTS)
 
 
-def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, float], smooth: bool) -> None:
-    """Fuses the frames of one dataset, whose depth is smoothed over edges or not."""
+def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, float], edges: _EdgeKind) -> None:
+    """Fuses the frames of one dataset, whose edges are of a kind."""
     camera, device = part.dataset.camera, volume.sdf.device
     intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
-    if smooth:
+    if edges is _EdgeKind.BLURRED:
         for frame, pose in part.read():
             depth, kept = (_on(image, device) for image in (frame.depth, without_blurred_edges(frame.depth, noise)))
             volume.make_room(_ramps(depth, kept, intrinsics, noise), _pose7(pose, device), intrinsics, noise)
     for frame, pose in part.read():
         depth = _on(frame.depth, device)
-        if smooth:
+        if edges is _EdgeKind.BLURRED:
             kept = _on(without_blurred_edges(frame.depth, noise), device)
             # Smoothed depth: neighbors have the same noise.
             planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
             planes += _ramps(depth, kept, intrinsics, noise)
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
+            if edges is _EdgeKind.FLYING:
+                planes[..., 4][_on(flying_pixels(frame.depth, noise), device)] *= BETWEEN_WEIGHT
         volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
 
 
@@ -192,7 +210,7 @@ def _ramps(
     """Planes float32 [H, W, 5] of the pixels of a depth image [H, W] (m) that are not `kept`, with little weight."""
     ramps = ops.measure_planes(depth, intrinsics, noise, shared_noise=True)
     ramps[kept > 0] = 0
-    ramps[..., 4] *= RAMP_WEIGHT
+    ramps[..., 4] *= BETWEEN_WEIGHT
     return ramps
 
 

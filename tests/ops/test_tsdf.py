@@ -208,6 +208,21 @@ def test_what_has_moved_away_is_carved():
     assert (vertices[:, 2] > 1.3).all()
 
 
+def test_seeing_through_counts_however_far_what_is_seen_is(device):
+    """A few frames have a box before a wall that is so far and noisy that its surface hardly counts."""
+    noise, far = (1e-6, 1e-5), 6.0
+    empty, box = wall((0, 0, 1), far), wall((0, 0, 1), far)
+    box[8:16, 10:20] = 1.0
+    volume = ops.TsdfVolume(VOXEL, device=device)
+    for depth in (box, *[empty] * 20):
+        volume.integrate(torch.from_numpy(depth).to(device), IDENTITY.to(device), CAMERA, noise=noise)
+    vertices, _ = volume.extract()
+    assert len(vertices) > 100 and (vertices[:, 2] > far - 1).all()
+    middle = torch.tensor([[0.0, 0.0, z] for z in (0.9, 1.0, far)], device=device)
+    near, on_box, on_wall = volume.query(middle)[0].tolist()
+    assert near > 0.05 and on_box > 0.05 and abs(on_wall) < VOXEL
+
+
 def test_a_wall_whose_noise_is_larger_than_voxels_is_one_surface(device):
     generator = np.random.default_rng(0)
     noise = 0.0, (0.05 / 16) ** 2  # 5 cm at 4 m

@@ -76,9 +76,12 @@ def _plane(depth, camera, noise, u, v, shared):
     cosine = q / np.linalg.norm(m) / np.linalg.norm((x, y, 1))
     if not (q > 0 and support > LEAST_SUPPORT and cosine > LEAST_COSINE):
         return np.zeros(5)
-    variance = noise[0] + noise[1] / q**4
-    weight = POSE_VARIANCE / (POSE_VARIANCE + variance) * cosine * min(support / FULL_WEIGHT, 1)
+    weight = _certainty(noise, 1 / q) * cosine * min(support / FULL_WEIGHT, 1)
     return np.array([*(m / np.linalg.norm(m)), 1 / np.linalg.norm(m), weight])
+
+
+def _certainty(noise, depth):
+    return POSE_VARIANCE / (POSE_VARIANCE + noise[0] + noise[1] * depth**4)
 
 
 def observe(point, plane_image, camera, pose, truncations, noise, voxel_size):
@@ -100,4 +103,7 @@ def observe(point, plane_image, camera, pose, truncations, noise, voxel_size):
     full = min(FULL_WEIGHT_DEVIATIONS * deviation, MOST_FULL_WEIGHT * truncation)
     if sdf <= -truncation or (behind >= truncation / TOUCH_COSINE and sdf <= -BESIDE_VOXELS * voxel_size):
         return 0.0, 0.0, None
-    return min(sdf, truncation), plane[4] * np.interp(sdf, [-truncation, -full], [0, 1]), (u, v)
+    weight, seen = plane[4], min(z - behind, plane[3] / TOUCH_COSINE)
+    if weight and seen > z + truncation:
+        weight *= _certainty(noise, z + truncation) / _certainty(noise, seen)
+    return min(sdf, truncation), weight * np.interp(sdf, [-truncation, -full], [0, 1]), (u, v)

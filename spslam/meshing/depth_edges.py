@@ -1,0 +1,44 @@
+"""Edges in depth images: what steps there are between pixels of one surface, and which frames show a recording's edges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from spslam.datasets.base import RgbdFrame
+from spslam.datasets.prefetch import Readable
+from spslam.errors import DatasetError
+
+# Inverse depth of one surface differs by less than this share of it and so many deviations of the noise, as in
+# `ops.measure_planes`; at an edge it differs by so many times as much.
+_SAME_SHARE, _SAME_DEVIATIONS, EDGE = 0.015, 4.0, 4.0
+# Frames that are looked at to judge a recording, and edges that they must have.
+_FRAMES, LEAST_EDGES = 8, 100
+_NEAREST_M = 1e-3
+
+
+def some_depths(frames: Readable[RgbdFrame]) -> Iterator[np.ndarray]:
+    """Depth images float32 [H, W], m, of a few frames spread over a recording; those that can't be read are left out."""
+    for position in np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]:
+        try:
+            yield frames[int(position)].depth
+        except DatasetError:
+            continue
+
+
+def surface_steps(depth: np.ndarray, noise: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth, and what that of two neighboring pixels of one surface differs by at most.
+
+    Args:
+        depth: float32 [H, W], m, 0 where unknown.
+        noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
+
+    Returns:
+        Two float32 [H, W], 1/m. Inverse depth is NaN where unknown.
+    """
+    known = np.isfinite(depth) & (depth > _NEAREST_M)
+    safe = np.where(known, depth, np.float32(1))
+    inverse = np.where(known, 1 / safe, np.float32(np.nan))
+    deviation = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * safe**4)
+    return inverse, (np.float32(_SAME_SHARE) + np.float32(_SAME_DEVIATIONS) * deviation / safe) * inverse
