@@ -10,13 +10,11 @@ import numpy as np
 from spslam.meshing.frame_fusion import PosedFrames
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.subdivision import MeshEdges, mesh_edges, midpoints, split_edges
-from spslam.meshing.texture.bake import sample
-from spslam.meshing.texture.views import read_views
-from spslam.meshing.visible_points import SurfacePoints
+from spslam.meshing.visible_points import SurfacePoints, read_seen
 
 # Every so many-th frame gives colors, and every so many-th of these is surveyed for detail, as frames next to each other
 # show the same; of short sequences more, up to all.
-_COLORED_EVERY, _SURVEYED_EVERY = 5, 3
+_COLORED_EVERY, _SURVEYED_EVERY = 5, 4
 _LEAST_COLORED, _LEAST_SURVEYED = 120, 40
 # An edge is divided where colors in its middle are so many levels from the mean of its ends, and so many times what
 # noise makes of that.
@@ -94,10 +92,8 @@ def _has_detail(
     points, normals = midpoints(mesh, ends)
     surface = SurfacePoints(np.concatenate([mesh.vertices, points]), np.concatenate([mesh.normals, normals]))
     sums, squares, counts = np.zeros((len(rows), 3), np.float32), *np.zeros((2, len(rows)), np.float32)
-    place = np.full(len(surface), -1, np.int32)
-    for view in read_views(parts, noise):
-        seen = surface.seen_by(view)
-        colors = sample(view.frame.color, seen.u, seen.v).astype(np.float32)
+    place = np.full(len(mesh.vertices) + len(rows), -1, np.int32)
+    for seen in read_seen(surface, parts, noise):
         place[seen.ids] = np.arange(len(seen.ids), dtype=np.int32)
         middle = np.flatnonzero(seen.ids >= len(mesh.vertices))
         seen_rows = seen.ids[middle] - len(mesh.vertices)
@@ -105,7 +101,8 @@ def _has_detail(
         whole = (first >= 0) & (second >= 0)
         middle, seen_rows, first, second = middle[whole], seen_rows[whole], first[whole], second[whole]
         place[seen.ids] = -1
-        off = colors[middle] - 0.5 * (colors[first] + colors[second])
+        ends_sum = seen.colors[first].astype(np.float32) + seen.colors[second]
+        off = seen.colors[middle] - np.float32(0.5) * ends_sum
         sums[seen_rows] += off
         squares[seen_rows] += np.einsum("ij,ij->i", off, off)
         counts[seen_rows] += 1
@@ -125,10 +122,9 @@ def _mean_colors(mesh: TriangleMesh, parts: Sequence[PosedFrames], noise: tuple[
     sums = np.empty((len(mesh.vertices), 4), np.float32)
     sums[:, :3], sums[:, 3] = mesh.colors, 1
     sums *= np.float32(_OWN_WEIGHT)
-    for view in read_views(parts, noise):
-        seen = surface.seen_by(view)
+    for seen in read_seen(surface, parts, noise):
         added = np.empty((len(seen.ids), 4), np.float32)
-        added[:, :3], added[:, 3] = sample(view.frame.color, seen.u, seen.v), 1
+        added[:, :3], added[:, 3] = seen.colors, 1
         added *= seen.weights[:, None]
         sums[seen.ids] += added
     return np.clip(np.rint(sums[:, :3] / sums[:, 3:]), 0, 255).astype(np.uint8)
