@@ -3,14 +3,14 @@
     python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxels 0.01 0.005 --subdivisions 0 1
 
 Of the tracked frames of a finished run every so many-th is held out; the others are fused at the run's poses, without
-the map's filling, by Open3D with the first size of voxels and by spslam with each, with colors of voxels, with colors of
-vertices from the frames (edges divided once is what a run writes) and with a texture. All meshes are rendered at the poses of the frames held out and compared with the images over the pixels that
-all of them show: PSNR in dB, mean over the views, and SSIM; PSNR over those of them where all have the frame's depth to
-3 cm, as elsewhere the surface is wrong, not its color; and PSNR ("corrected") after the mesh's image was given another
-gain per channel and moved by an affine warp so that it agrees best with the frame, each mesh by its own: what a
-camera with automatic exposure, or whose color is late, does to the image held out is no error of a mesh. Coverage is
-the share of all pixels that a mesh shows. Of Open3D's weight thresholds the one with the better PSNR counts. Needs
-`pip install 'spslam[open3d]'`.
+the map's filling, by Open3D with the first size of voxels and by spslam with each: with the voxels' colors, with the
+frames' at vertices (a run writes those of edges divided once) and with a texture. All meshes are rendered at the poses
+of the frames held out and compared with the images over the pixels that all of them show: PSNR in dB, mean over the
+views, and SSIM; PSNR over those of them where all have the frame's depth to 3 cm, as elsewhere the surface is wrong,
+not its color; and PSNR ("corrected") after the mesh's image was given another gain per channel and moved by an affine
+warp so that it agrees best with the frame, each mesh by its own: what a camera with automatic exposure, or whose color
+is late, does to the image held out is no error of a mesh. Coverage is the share of all pixels that a mesh shows. Of
+Open3D's weight thresholds the one with the better PSNR counts. Needs `pip install 'spslam[open3d]'`.
 """
 
 from __future__ import annotations

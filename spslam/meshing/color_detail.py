@@ -12,14 +12,14 @@ from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.subdivision import MeshEdges, mesh_edges, midpoints, split_edges
 from spslam.meshing.visible_points import SurfacePoints, read_seen
 
-# Every so many-th frame gives colors, and every so many-th of these is surveyed for detail, as frames next to each other
-# show the same; of short sequences more, up to all.
+# Every so many-th frame gives colors, and every so many-th of these is surveyed for detail, as frames next to each
+# other show the same; of short sequences more, up to all.
 _COLORED_EVERY, _SURVEYED_EVERY = 5, 4
 _LEAST_COLORED, _LEAST_SURVEYED = 120, 40
 # An edge is divided where colors in its middle are so many levels from the mean of its ends, and so many times what
 # noise makes of that.
 DETAIL_LEVELS, _DETAIL_DEVIATIONS = 4.0, 3.0
-# What the color that a vertex has counts, in pixels per m^2 of frames: all where none sees it, next to nothing elsewhere.
+# What the color that a vertex has counts, in pixels per m^2 of a frame: all where none sees it, else next to nothing.
 _OWN_WEIGHT = 100.0
 
 
@@ -41,9 +41,9 @@ def color_mesh(
 ) -> tuple[TriangleMesh, int]:
     """Gives a mesh the colors of frames, and vertices in the middle of edges where these vary in between.
 
-    A vertex has the mean of the colors with which frames see it, by the pixels that they have for its surface: those of
-    least mean squared error. The surface stays where it is, see `split_edges`. Frames are read once for each subdivision
-    and once for the colors, but not all of them.
+    A vertex has the mean of the colors with which frames see it, weighted by the pixels that they have for its surface,
+    which has the least mean squared error. The surface stays where it is, see `split_edges`. Frames are read once for
+    each subdivision and once for the colors, but not all of them.
 
     Args:
         mesh: of these frames. Its colors are kept where no frame sees it.
@@ -128,4 +128,3 @@ def _mean_colors(mesh: TriangleMesh, parts: Sequence[PosedFrames], noise: tuple[
         added *= seen.weights[:, None]
         sums[seen.ids] += added
     return np.clip(np.rint(sums[:, :3] / sums[:, 3:]), 0, 255).astype(np.uint8)
-

@@ -52,8 +52,8 @@ def split_edges(mesh: TriangleMesh, edges: MeshEdges, chosen: np.ndarray, colors
     """Puts a vertex in the middle of each chosen edge, and divides the faces at it.
 
     A face with one such edge becomes two faces, with two three, with three four ("green" and "red" refinement, Bank,
-    Sherman and Weiser 1983). As both faces at an edge take its middle, the mesh has no cracks or T-junctions, and as the
-    new faces lie in the plane of the old one, the surface is the same to rounding.
+    Sherman and Weiser 1983). As both faces at an edge take its middle, the mesh has no cracks or T-junctions, and as
+    the new faces lie in the plane of the old one, the surface is the same to rounding.
 
     Args:
         mesh: to be divided. Not changed.
@@ -62,8 +62,8 @@ def split_edges(mesh: TriangleMesh, edges: MeshEdges, chosen: np.ndarray, colors
         colors: uint8 [M, 3] of the new vertices.
 
     Returns:
-        The mesh: first its vertices as they were, then the middles in the order of `chosen`; faces in the order of those
-        that they are parts of. Deterministic.
+        The mesh: first its vertices as they were, then the middles in the order of `chosen`; faces in the order of
+        those that they are parts of. Deterministic.
     """
     new = np.full(len(edges.ends), -1, np.int64)
     new[chosen] = len(mesh.vertices) + np.arange(len(chosen))
@@ -71,9 +71,7 @@ def split_edges(mesh: TriangleMesh, edges: MeshEdges, chosen: np.ndarray, colors
     vertices = np.concatenate([mesh.vertices, middles])
     faces, parents = _divided(mesh.faces.astype(np.int64), new[edges.of_faces], vertices)
     faces = faces[np.argsort(parents, kind="stable")].astype(np.int32)
-    return TriangleMesh(
-        vertices, faces, np.concatenate([mesh.colors, colors]), np.concatenate([mesh.normals, normals])
-    )
+    return TriangleMesh(vertices, faces, np.concatenate([mesh.colors, colors]), np.concatenate([mesh.normals, normals]))
 
 
 def _divided(faces: np.ndarray, middles: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,12 +14,12 @@ from spslam.meshing.frame_fusion import PosedFrames
 from spslam.meshing.texture.bake import sample
 from spslam.meshing.texture.views import NEAREST_M, ColorView
 
-# A point is hidden where the surface's nearest points around its pixel lie so much before it: meters, and pixels along a
-# slanted surface. It is seen from angles up to the first cosine; flatter views have next to no pixels for it. The slant
-# itself is bounded by the second.
+# A point is hidden where the surface's nearest points around its pixel lie so much before it: meters, and pixels along
+# a slanted surface. It is seen from angles up to the first cosine; flatter views have next to no pixels for it. The
+# slant itself is bounded by the second.
 _APART_M, _APART_PX, _LEAST_COSINE, _SLANTED_COSINE = 0.004, 2.0, 0.02, 0.15
-# The nearest points hide what lies between them: gaps of less than so many pixels are closed. More would close gaps that
-# there are, as between the legs of a chair; of near surface, whose points are farther from each other, depth is measured.
+# The nearest points hide what lies between them: gaps of less than so many pixels are closed. More would close gaps
+# that there are, as between the legs of a chair; of near surface, with points farther apart, depth is measured.
 _CLOSED_PX = 3
 # A measured depth hides what lies so much behind it: meters and deviations of the noise.
 _BEHIND_M, _BEHIND_DEVIATIONS = 0.02, 3.0
@@ -105,9 +105,7 @@ class SurfacePoints:
         return np.flatnonzero((z + self._radii > NEAREST_M) & (inside | (z < 5 * self._radii)))
 
 
-def read_seen(
-    surface: SurfacePoints, parts: Sequence[PosedFrames], noise: tuple[float, float]
-) -> Iterator[SeenPoints]:
+def read_seen(surface: SurfacePoints, parts: Sequence[PosedFrames], noise: tuple[float, float]) -> Iterator[SeenPoints]:
     """What all frames of all parts see of a surface, in order; frames that can't be read are left out.
 
     Args:

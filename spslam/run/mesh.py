@@ -141,7 +141,8 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     }
     del volume  # the largest of what is held, not needed for colors
     if job.texture is None:
-        mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, ColorOptions(noise, job.options.color_subdivisions))
+        options = ColorOptions(noise, job.options.color_subdivisions)
+        mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options)
     return mesh, figures
 
 

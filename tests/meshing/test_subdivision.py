@@ -109,7 +109,8 @@ def test_normals_of_middles_are_unit_vectors_or_none():
     mesh = blob()
     points, normals = midpoints(mesh, mesh_edges(mesh.faces, len(mesh.vertices)).ends)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5) and points.dtype == normals.dtype == np.float32
-    opposite = TriangleMesh(mesh.vertices[:2], np.zeros((0, 3), np.int32), mesh.colors[:2], np.float32([[0, 0, 1], [0, 0, -1]]))
+    none, normals = np.zeros((0, 3), np.int32), np.float32([[0, 0, 1], [0, 0, -1]])
+    opposite = TriangleMesh(mesh.vertices[:2], none, mesh.colors[:2], normals)
     assert (midpoints(opposite, np.array([[0, 1]]))[1] == 0).all()
 
 
