@@ -1,16 +1,16 @@
 """Colors of fused meshes at views that were held out: of vertices and of textures, beside Open3D's fusion.
 
-    python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxels 0.01 0.005
+    python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxels 0.01 0.005 --subdivisions 0 1
 
 Of the tracked frames of a finished run every so many-th is held out; the others are fused at the run's poses, without
-the map's filling, by Open3D with the first size of voxels and by spslam with each, with colors of vertices and with a
-texture. All meshes are rendered at the poses of the frames held out and compared with the images over the pixels that
-all of them show: PSNR in dB, mean over the views, and SSIM; PSNR over those of them where all have the frame's depth to
-3 cm, as elsewhere the surface is wrong, not its color; and PSNR ("corrected") after the mesh's image was given another
-gain per channel and moved by an affine warp so that it agrees best with the frame, each mesh by its own: what a
-camera with automatic exposure, or whose color is late, does to the image held out is no error of a mesh. Coverage is
-the share of all pixels that a mesh shows. Of Open3D's weight thresholds the one with the better PSNR counts. Needs
-`pip install 'spslam[open3d]'`.
+the map's filling, by Open3D with the first size of voxels and by spslam with each: with the voxels' colors, with the
+frames' at vertices (a run writes those of edges divided once) and with a texture. All meshes are rendered at the poses
+of the frames held out and compared with the images over the pixels that all of them show: PSNR in dB, mean over the
+views, and SSIM; PSNR over those of them where all have the frame's depth to 3 cm, as elsewhere the surface is wrong,
+not its color; and PSNR ("corrected") after the mesh's image was given another gain per channel and moved by an affine
+warp so that it agrees best with the frame, each mesh by its own: what a camera with automatic exposure, or whose color
+is late, does to the image held out is no error of a mesh. Coverage is the share of all pixels that a mesh shows. Of
+Open3D's weight thresholds the one with the better PSNR counts. Needs `pip install 'spslam[open3d]'`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from spslam.evaluation.image_metrics import psnr_db, ssim
 from spslam.evaluation.run_output import RunOutput
 from spslam.geometry import transform_points
 from spslam.meshing import TriangleMesh
+from spslam.meshing.color_detail import ColorOptions, color_mesh
 from spslam.meshing.frame_fusion import FusionOptions, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.render import rasterize, render_colors
@@ -79,15 +80,23 @@ def measure(run: RunOutput, args: argparse.Namespace) -> tuple[int, dict[str, di
         meshes[f"Open3D {1e3 * args.voxels[0]:g} mm, weights {threshold}"] = mesh
     for voxel in args.voxels:
         mesh = extract_fused_mesh(fuse_frames(frames, FusionOptions(voxel, MEMORY_MB, noise)))
-        meshes[f"vertices {1e3 * voxel:g} mm"] = mesh
-        started = time.perf_counter()
-        textured = texture_mesh(mesh, frames, TextureOptions(noise, args.texel))
-        print(f"{textured} of {len(frames)} frames in {time.perf_counter() - started:.0f} s", flush=True)
-        meshes[f"texture {1e3 * voxel:g} mm"] = textured
-        if args.save:
-            textured.save(args.save / f"{run.folder.path.name}-{1e3 * voxel:g}.glb")
+        size = f"{1e3 * voxel:g} mm"
+        meshes[f"voxels {size}"] = mesh
+        for number in args.subdivisions:
+            started = time.perf_counter()
+            colored, used = color_mesh(mesh, frames, ColorOptions(noise, number))
+            print(f"{colored} of {used} frames in {time.perf_counter() - started:.0f} s, before {mesh}", flush=True)
+            meshes[f"vertices {size}, divided {number} times"] = colored
+        if not args.no_texture:
+            started = time.perf_counter()
+            textured = texture_mesh(mesh, frames, TextureOptions(noise, args.texel))
+            print(f"{textured} of {len(frames)} frames in {time.perf_counter() - started:.0f} s", flush=True)
+            meshes[f"texture {size}"] = textured
     views = list(posed_frames(dataset, held).read())
     views = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
+    if args.save:
+        for name, each in meshes.items():
+            each.save(args.save / f"{run.folder.path.name}-{name.replace(' ', '-').replace(',', '')}.glb")
     figures = dict(zip(meshes, compare(list(meshes.values()), views, dataset.camera), strict=True))
     others = sorted((name for name in figures if name.startswith("Open3D")), key=lambda name: figures[name]["psnr_db"])
     for name in others[:-1]:
@@ -171,7 +180,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--voxels", type=float, nargs="+", default=[0.01], help="m; Open3D has the first")
     parser.add_argument("--texel", type=float, help="m; as finely as the frames saw if not given")
     parser.add_argument("--no-open3d", action="store_true", help="leave Open3D out")
-    parser.add_argument("--save", type=Path, help="folder for the textured meshes, as .glb")
+    parser.add_argument("--no-texture", action="store_true", help="leave textures out")
+    parser.add_argument("--subdivisions", type=int, nargs="*", default=[1], help="of edges, for colors of vertices")
+    parser.add_argument("--save", type=Path, help="folder for the meshes, as .glb")
     return parser
 
 

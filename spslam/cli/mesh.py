@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from spslam.datasets.base import RgbdDataset
     from spslam.evaluation.run_output import RunOutput
     from spslam.meshing import TriangleMesh
+    from spslam.options import MeshOptions
     from spslam.run.mesh import EarlierFrames, TextureWish
 
 SOURCES = ("tsdf", "neural")
@@ -32,6 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         type=positive_meters,
         help="edge length of a voxel or marching-cubes cell in meters; the run's mesh.resolution_m if not given",
+    )
+    parser.add_argument(
+        "--subdivisions",
+        metavar="N",
+        type=int,
+        choices=range(4),
+        help="how many times edges are divided for finer colors; the run's mesh.color_subdivisions if not given",
     )
     parser.add_argument(
         "--format", choices=MESH_FORMATS, help="file format; ply if not given, glb with --texture, which ply can't have"
@@ -64,10 +72,8 @@ def execute(args: argparse.Namespace) -> None:
     from spslam.scene import Scene
 
     run = RunOutput.read(args.output)
-    source = args.source or ("neural" if _is_live(run) else config.mesh.source)
-    changes = {"source": source, "resolution_m": args.resolution or config.mesh.resolution_m}
-    options = config.mesh.model_copy(update=changes)
-    dataset = _open_again(run, config, args.texture) if source == "tsdf" or args.texture else None
+    options = _mesh_options(args, config.mesh, "neural" if _is_live(run) else config.mesh.source)
+    dataset = _open_again(run, config, args.texture) if options.source == "tsdf" or args.texture else None
     earlier = _earlier(folder) if "map" in run.metrics else []
     scene, noise = Scene.load(map_file), measured_noise(run.metrics)
     job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args))
@@ -76,6 +82,22 @@ def execute(args: argparse.Namespace) -> None:
     if path == folder.mesh:
         add_metrics(run, figures)
     _print_mesh(path, mesh, figures)
+
+
+def _mesh_options(args: argparse.Namespace, options: MeshOptions, source: str) -> MeshOptions:
+    """The options of a run's mesh with what was asked for in their place.
+
+    Raises:
+        OutputError: subdivisions were asked for that the mesh asked for has not.
+    """
+    source = args.source or source
+    if args.subdivisions is not None and (source == "neural" or args.texture):
+        other = "--texture has finer colors" if args.texture else "the mesh of the map alone has no colors of frames"
+        raise OutputError(f"--subdivisions is of vertices with colors of frames, and {other}")
+    changes = {"source": source, "resolution_m": args.resolution or options.resolution_m}
+    if args.subdivisions is not None:
+        changes["color_subdivisions"] = args.subdivisions
+    return options.model_copy(update=changes)
 
 
 def _file_format(args: argparse.Namespace) -> str:
@@ -106,12 +128,8 @@ def _execute_merged(args: argparse.Namespace, folder: RunFolder, config: Config,
     from spslam.scene import Scene
     from spslam.slam.graph.archive import KeyframeArchive
 
-    changes = {
-        "source": args.source or config.mesh.source,
-        "resolution_m": args.resolution or config.mesh.resolution_m,
-    }
     archive = KeyframeArchive.load(require_run_file(folder.keyframes))
-    path, options = folder.mesh_as(file_format), config.mesh.model_copy(update=changes)
+    path, options = folder.mesh_as(file_format), _mesh_options(args, config.mesh, config.mesh.source)
     mesh, figures, missing = write_map_mesh(path, Scene.load(folder.map), archive, options, _texture(args))
     for line in missing:
         print(f"! {line}")

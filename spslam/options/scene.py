@@ -82,3 +82,10 @@ class MeshOptions(Section):
         needs=(need(is_("mesh.source", "tsdf")),),
         ge=1,
     )
+    color_subdivisions: int = option(
+        "how many times edges of faces are divided in two for finer colors where images vary between their ends; 0 "
+        "divides none",
+        needs=(need(is_("mesh.source", "tsdf")),),
+        ge=0,
+        le=3,
+    )

@@ -16,6 +16,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import OutputError
 from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
+from spslam.meshing.color_detail import ColorOptions, color_mesh
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
@@ -108,24 +109,46 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
         check_textured_format(path)
         if dataset is None:
             raise OutputError(f"{path}: a texture is made of frames, and none can be read again")
-    trajectories = [*(each.trajectory for each in job.earlier), job.trajectory]
-    tracked = np.concatenate([each.poses[~each.lost] for each in trajectories])
-    figures: dict[str, Any] = {"mesh_source": "neural" if dataset is None else job.options.source}
-    if figures["mesh_source"] == "neural" or dataset is None:
-        resolution_m = job.options.resolution_m
-        mesh = extract_mesh(job.scene, resolution_m, job.camera, None if job.camera is None else tracked)
+    if dataset is None or job.options.source == "neural":
+        mesh, figures = _extracted(job)
     else:
-        frames = frames_of(job, dataset)
-        fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, job.noise or DEFAULT_NOISE)
-        volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
-        mesh = extract_fused_mesh(volume, job.scene, dataset.camera, tracked)
-        resolution_m = volume.voxel_size
-        figures |= {"mesh_frames": sum(len(part) for part in frames), "mesh_mb": volume.nbytes / 2**20}
+        mesh, figures = _fused(job, dataset)
     if job.texture is None or dataset is None:
         save_mesh(mesh, path)
     else:
         figures |= _write_textured(path, mesh, job, dataset, job.texture.texel_m)
-    return mesh, {**figures, "mesh_resolution_m": resolution_m, "mesh_s": time.perf_counter() - started}
+    return mesh, {**figures, "mesh_s": time.perf_counter() - started}
+
+
+def _extracted(job: MeshJob) -> tuple[TriangleMesh, dict[str, Any]]:
+    """The mesh of the map alone, and figures."""
+    resolution_m = job.options.resolution_m
+    mesh = extract_mesh(job.scene, resolution_m, job.camera, None if job.camera is None else _tracked_poses(job))
+    return mesh, {"mesh_source": "neural", "mesh_resolution_m": resolution_m}
+
+
+def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, Any]]:
+    """The mesh of the frames, and figures. If it is to have a texture, its vertices have the voxels' colors."""
+    frames, noise = frames_of(job, dataset), job.noise or DEFAULT_NOISE
+    fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, noise)
+    volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
+    mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job))
+    figures = {
+        "mesh_source": "tsdf",
+        "mesh_frames": sum(len(part) for part in frames),
+        "mesh_mb": volume.nbytes / 2**20,
+        "mesh_resolution_m": volume.voxel_size,
+    }
+    del volume  # the largest of what is held, not needed for colors
+    if job.texture is None:
+        options = ColorOptions(noise, job.options.color_subdivisions)
+        mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options)
+    return mesh, figures
+
+
+def _tracked_poses(job: MeshJob) -> np.ndarray:
+    trajectories = [*(each.trajectory for each in job.earlier), job.trajectory]
+    return np.concatenate([each.poses[~each.lost] for each in trajectories])
 
 
 def _write_textured(

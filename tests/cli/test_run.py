@@ -236,6 +236,21 @@ def test_mesh_command_makes_the_runs_own_mesh_again(tmp_path):
     assert (tmp_path / "out" / "mesh.ply").read_bytes() == own
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["mesh_source"] == "tsdf" and metrics["mesh_resolution_m"] == 0.01
+    assert metrics["mesh_frames"] == metrics["mesh_color_frames"] == 3
+
+
+def test_mesh_command_divides_edges_for_finer_colors(finished):
+    folder, _ = finished
+    vertices = []
+    for number in ("0", "1"):
+        arguments = ["--resolution", "0.05", "--subdivisions", number, "--format", "obj"]
+        result = spslam("mesh", "out", *arguments, cwd=folder)
+        assert result.returncode == 0, result.stderr
+        vertices.append((folder / "out" / "mesh.obj").read_text().count("\nv "))
+    assert 0 < vertices[0] < vertices[1]
+    for other in (["--source", "neural"], ["--texture"]):
+        refused = spslam("mesh", "out", "--subdivisions", "1", *other, cwd=folder)
+        assert_refused(refused, "--subdivisions is of vertices with colors of frames")
 
 
 def test_mesh_command_extracts_the_map_alone(finished):

@@ -52,13 +52,16 @@ def mesh_of(*rectangles, step_m: float = 0.04) -> TriangleMesh:
 
 
 class Painted(RgbdDataset):
-    """Frames of rectangles at given poses; colors of frame i are multiplied by `gains[i]`, those in `broken` fail."""
+    """Frames of rectangles at given poses; colors of frame i are multiplied by `gains[i]`, those in `broken` fail.
+
+    `paint` has the colors of points that are not red.
+    """
 
     name = "painted"
     camera = CAMERA
 
-    def __init__(self, rectangles, poses, gains=None, broken=(), without_depth=False):
-        self.rectangles, self._poses = rectangles, poses
+    def __init__(self, rectangles, poses, gains=None, broken=(), without_depth=False, paint=pattern):
+        self.rectangles, self._poses, self.paint = rectangles, poses, paint
         self.gains = np.ones(len(poses)) if gains is None else gains
         self.broken, self.without_depth = broken, without_depth
 
@@ -85,7 +88,7 @@ class Painted(RgbdDataset):
             a, b = ((points - corner) @ side / (side @ side) for side in (u, v))
             hit = (t > 0) & (t < depth) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
             depth[hit] = t[hit]
-            colors[hit] = RED if red else pattern(points[hit])
+            colors[hit] = RED if red else self.paint(points[hit])
         image = np.clip(np.rint(colors * self.gains[index]), 0, 255).astype(np.uint8).reshape(120, 160, 3)
         known = np.isfinite(depth) & (not self.without_depth)
         depth = np.where(known, depth, 0).astype(np.float32).reshape(120, 160)

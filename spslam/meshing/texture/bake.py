@@ -177,6 +177,8 @@ def warped(places: np.ndarray, warp: np.ndarray) -> np.ndarray:
 
 def sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Bilinear colors [N, C] of an image [H, W, C] at float32 pixel coordinates [N]."""
+    if not len(u):  # which OpenCV refuses
+        return np.empty((0, image.shape[2]), image.dtype)
     short = -len(u) % _ROW
     columns, rows = (np.pad(each, (0, short)).reshape(-1, _ROW) for each in (u, v))
     return cv2.remap(image, columns, rows, cv2.INTER_LINEAR).reshape(-1, image.shape[2])[: len(u)]

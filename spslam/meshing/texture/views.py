@@ -48,9 +48,13 @@ class ColorView:
     pose: np.ndarray
     noise: tuple[float, float]
 
+    def projection(self) -> np.ndarray:
+        """float32 [3, 4], from (x, y, z, 1) in the world, m, to (u z, v z, z), px m and m."""
+        return (self.camera.matrix() @ inverse(self.pose)[:3]).astype(np.float32)
+
     def homogeneous(self, points: np.ndarray) -> np.ndarray:
         """Where points float32 [N, 3] in the world fall in the image: float32 [N, 3] of (u z, v z, z), px m and m."""
-        matrix = (self.camera.matrix() @ inverse(self.pose)[:3]).astype(np.float32)
+        matrix = self.projection()
         places = np.empty((len(points), 3), np.float32)
         for row in range(3):  # not @: for such thin products BLAS would start threads on all cores
             places[:, row] = matrix[row, 0] * points[:, 0]

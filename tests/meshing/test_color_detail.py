@@ -1,0 +1,176 @@
+"""Colors of vertices from frames of known walls: what is seen, where edges are divided, what it is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spslam.meshing.color_detail import ColorOptions, color_mesh, thinned
+from spslam.meshing.render import render_colors
+from spslam.meshing.subdivision import mesh_edges
+from spslam.meshing.texture.views import read_views
+from spslam.meshing.visible_points import SurfacePoints
+from tests.meshing.painted import CAMERA, FLOOR, GRAY, NOISE, RED, SIGN, WALL, frames, mesh_of, pattern
+
+STEP_M, SQUARE_M = 0.08, 0.12
+OPTIONS = ColorOptions(NOISE, 1)
+
+
+def checkerboard(points):
+    """Squares on the left, plain on the right."""
+    x, y, _ = np.floor(points / SQUARE_M + 1e-4).T.astype(int)
+    light = (x + y) % 2 == 0
+    return np.where((points[:, :1] < 0) & light[:, None], 200.0, 60.0).repeat(3, axis=1)[:, :3]
+
+
+@pytest.fixture(scope="module")
+def board():
+    return mesh_of(WALL, step_m=STEP_M), frames(WALL, paint=checkerboard, count=24)
+
+
+def divided_bare(mesh, count):
+    """New vertices on the plain half, away from the outline of the wall, where pixels are mixed with what is behind."""
+    added = mesh.vertices[count:]
+    return added[(added[:, 0] > STEP_M) & (added[:, 0] < 1.1) & (np.abs(added[:, 1]) < 0.7)]
+
+
+def error(mesh, views):
+    """Root mean square of rendered against input images, levels."""
+    off = []
+    for view in read_views(views, NOISE):
+        image, depth = render_colors(mesh.vertices, mesh.faces, mesh.colors, CAMERA, view.pose)
+        shown = (depth > 0) & (view.frame.depth > 0)
+        off.append(((image.astype(float) - view.frame.color) ** 2)[shown].mean())
+    return float(np.sqrt(np.mean(off)))
+
+
+def test_a_checkerboard_becomes_sharper(board):
+    mesh, views = board
+    errors = [error(color_mesh(mesh, views, ColorOptions(NOISE, n))[0], [views]) for n in (0, 1, 2)]
+    assert errors[1] < 0.8 * errors[0] and errors[2] < 0.8 * errors[1]
+
+
+def test_a_bare_surface_is_not_divided(board):
+    mesh, views = board
+    divided, _ = color_mesh(mesh, views, ColorOptions(NOISE, 2))
+    noisy, _ = color_mesh(mesh, _Noisy.of(views), ColorOptions(NOISE, 2))
+    for each in (divided, noisy):
+        assert len(each.vertices) > len(mesh.vertices) + 1000
+        assert not len(divided_bare(each, len(mesh.vertices)))
+
+
+class _Noisy(type(frames(WALL).dataset)):
+    """With noise of four levels in each pixel."""
+
+    @classmethod
+    def of(cls, views):
+        dataset = cls(views.dataset.rectangles, views.poses, paint=views.dataset.paint)
+        return replace(views, dataset=dataset)
+
+    def read(self, index):
+        frame = super().read(index)
+        noise = np.random.default_rng(index).normal(0, 4, frame.color.shape)
+        return replace(frame, color=np.clip(np.rint(frame.color + noise), 0, 255).astype(np.uint8))
+
+
+def test_changes_of_exposure_are_no_detail(board):
+    mesh, views = board
+    gains = np.linspace(0.8, 1.2, 24)
+    divided, _ = color_mesh(mesh, frames(WALL, paint=checkerboard, count=24, gains=gains), OPTIONS)
+    assert len(divided.vertices) > len(mesh.vertices) + 300
+    assert not len(divided_bare(divided, len(mesh.vertices)))
+
+
+def test_the_surface_stays_as_it_is(board):
+    mesh, views = board
+    divided, _ = color_mesh(mesh, views, ColorOptions(NOISE, 2))
+    assert np.array_equal(divided.vertices[: len(mesh.vertices)], mesh.vertices)
+    before, after = (mesh_edges(each.faces, len(each.vertices)) for each in (mesh, divided))
+    for each, edges in ((mesh, before), (divided, after)):
+        assert len(each.vertices) - len(edges.ends) + len(each.faces) == 1  # Euler's number of a disk
+    outline = [np.bincount(edges.of_faces.ravel()) for edges in (before, after)]
+    assert all(set(counts) == {1, 2} for counts in outline)
+    lengths = [
+        np.linalg.norm(np.diff(each.vertices[edges.ends[counts == 1]], axis=1), axis=2).sum()
+        for each, edges, counts in zip((mesh, divided), (before, after), outline, strict=True)
+    ]
+    assert lengths[0] == pytest.approx(lengths[1], rel=1e-5)
+
+
+def test_the_same_frames_give_the_same_colors(board):
+    one, two = (color_mesh(*board, OPTIONS)[0] for _ in range(2))
+    assert all(np.array_equal(getattr(one, name), getattr(two, name)) for name in vars(one))
+
+
+@pytest.mark.parametrize("without_depth", [False, True])
+def test_what_stands_before_a_wall_does_not_color_it(without_depth):
+    scene = WALL, SIGN
+    colored, _ = color_mesh(mesh_of(*scene, step_m=0.02), frames(*scene, without_depth=without_depth), OPTIONS)
+    x, y, z = np.abs(colored.vertices.T)
+    wall = (z > 1.9) & (x < 1.0) & (y < 0.6)
+    off = np.abs(colored.colors[wall] - pattern(colored.vertices[wall])).max(1)
+    assert off.max() < 40 and (off < 10).mean() > 0.98  # a pixel at the sign's outline has both
+    sign = (z < 1.6) & (x < 0.17) & (colored.vertices[:, 1] > -0.27) & (colored.vertices[:, 1] < 0.07)
+    assert sign.sum() > 100 and (colored.colors[sign] == RED).all()
+
+
+def test_seen_points_are_those_that_no_rectangle_hides():
+    scene = WALL, FLOOR, SIGN
+    mesh = mesh_of(*scene, step_m=0.02)
+    surface = SurfacePoints(mesh.vertices, mesh.normals)
+    for view in read_views([frames(*scene)], NOISE):
+        seen = surface.seen_by(view)
+        assert (np.diff(seen.ids) > 0).all() and (seen.weights > 0).all()
+        wanted = plainly_seen(mesh, view, scene)
+        wanted[mesh.vertices[:, 1] > 0.79] = -1  # between wall and floor
+        assert np.isin(np.flatnonzero(wanted == 1), seen.ids).mean() > 0.995
+        assert not (wanted[seen.ids] == 0).any()
+
+
+def plainly_seen(mesh, view, rectangles):
+    """For each vertex 1 where it is seen, 0 where it is far outside or far behind something, -1 between."""
+    points = mesh.vertices.astype(np.float64)
+    local = (points - view.pose[:3, 3]) @ view.pose[:3, :3]
+    u, v = (local[:, :2] / local[:, 2:] * CAMERA.fx).T + np.array([[CAMERA.cx], [CAMERA.cy]])
+    margin = np.minimum.reduce([u, v, CAMERA.width - 1 - u, CAMERA.height - 1 - v])
+    margin[local[:, 2] < 0.05] = -1
+    seen = np.where(margin >= 1, 1, np.where(margin < 0, 0, -1))
+    for corner, a, b, _ in rectangles:
+        normal = np.cross(a, b)
+        rays = points - view.pose[:3, 3]
+        along = rays @ normal
+        share = ((corner - view.pose[:3, 3]) @ normal) / np.where(along == 0, 1e-9, along)
+        at = view.pose[:3, 3] + share[:, None] * rays
+        inset = np.minimum.reduce([each for s in (a, b) for each in _insets((at - corner) @ s / np.linalg.norm(s), s)])
+        before = (share > 0) & (share < 1 - 1e-3)
+        seen[before & (inset > -0.1)] = np.where((inset > 0.08) & (share < 0.9), 0, -1)[before & (inset > -0.1)]
+    return seen
+
+
+def _insets(along, side):
+    return along, np.linalg.norm(side) - along
+
+
+def test_vertices_that_no_frame_sees_keep_their_color():
+    mesh = mesh_of(WALL, (np.array([-1.2, -0.8, 2.5]), np.array([0, 1.6, 0.0]), np.array([2.4, 0, 0.0]), False))
+    colored, used = color_mesh(mesh, frames(WALL, broken=(3,)), OPTIONS)
+    hidden = colored.vertices[:, 2] > 2.4
+    assert hidden.any() and (colored.colors[hidden] == GRAY).all() and used == 12
+    unread, _ = color_mesh(mesh, frames(WALL, broken=range(12)), OPTIONS)
+    assert np.array_equal(unread.faces, mesh.faces) and (unread.colors == GRAY).all()
+
+
+def test_every_so_many_th_frame_through_all_parts():
+    parts = [frames(WALL, count=7), frames(WALL, count=8)]
+    kept = thinned(parts, 5)
+    assert [part.indices.tolist() for part in kept] == [[0, 5], [3]]
+    assert np.array_equal(kept[1].poses, parts[1].poses[[3]])
+
+
+def test_an_empty_mesh_stays_empty():
+    mesh = mesh_of(WALL)
+    empty = replace(
+        mesh, vertices=mesh.vertices[:0], faces=mesh.faces[:0], colors=mesh.colors[:0], normals=mesh.normals[:0]
+    )
+    colored, _ = color_mesh(empty, frames(WALL, count=2), OPTIONS)
+    assert len(colored.vertices) == len(colored.faces) == 0
