@@ -326,9 +326,7 @@ class Recovery:
         tracked = self._judged(replace(tracked, fit=fit))
         if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
             return replace(tracked, consistent_frames=0)
-        is_likely = (
-            tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
-        )
+        is_likely = tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
         frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(is_consistent))
         if frames >= CONSISTENT_FRAMES:
             return replace(tracked, lost=False, consistent_frames=0)
