@@ -1,10 +1,10 @@
 """Colors of fused meshes at views that were held out: of vertices and of textures, beside Open3D's fusion.
 
-    python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxels 0.01 0.005 --subdivisions 0 1
+    python -m experiments.mesh_colors RUN [RUN ...] --every 8 --voxels 0.01 0.005 --subdivisions 0 2
 
 Of the tracked frames of a finished run every so many-th is held out; the others are fused at the run's poses, without
 the map's filling, by Open3D with the first size of voxels and by spslam with each: with the voxels' colors, with the
-frames' at vertices (a run writes those of edges divided once) and with a texture. All meshes are rendered at the poses
+frames' at vertices (a run writes those of edges divided twice) and with a texture. All meshes are rendered at the poses
 of the frames held out and compared with the images over the pixels that all of them show: PSNR in dB, mean over the
 views, and SSIM; PSNR over those of them where all have the frame's depth to 3 cm, as elsewhere the surface is wrong,
 not its color; and PSNR ("corrected") after the mesh's image was given another gain per channel and moved by an affine
@@ -181,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--texel", type=float, help="m; as finely as the frames saw if not given")
     parser.add_argument("--no-open3d", action="store_true", help="leave Open3D out")
     parser.add_argument("--no-texture", action="store_true", help="leave textures out")
-    parser.add_argument("--subdivisions", type=int, nargs="*", default=[1], help="of edges, for colors of vertices")
+    parser.add_argument("--subdivisions", type=int, nargs="*", default=[2], help="of edges, for colors of vertices")
     parser.add_argument("--save", type=Path, help="folder for the meshes, as .glb")
     return parser
 

@@ -33,7 +33,7 @@ class ColorOptions:
     """
 
     noise: tuple[float, float]
-    subdivisions: int = 1
+    subdivisions: int = 2
 
 
 def color_mesh(
