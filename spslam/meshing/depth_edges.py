@@ -1,4 +1,4 @@
-"""Edges in depth images: what steps there are between pixels of one surface, and which frames show a recording's edges."""
+"""Edges in depth images: the steps between pixels of one surface, and the frames that a recording is judged by."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NEAREST_M = 1e-3
 
 
 def some_depths(frames: Readable[RgbdFrame]) -> Iterator[np.ndarray]:
-    """Depth images float32 [H, W], m, of a few frames spread over a recording; those that can't be read are left out."""
+    """Depth images float32 [H, W], m, of a few frames spread over a recording, without those that can't be read."""
     for position in np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]:
         try:
             yield frames[int(position)].depth

@@ -96,8 +96,8 @@ def tsdf_integrate_(
     truncation. Voxels farther behind learn nothing, nor do those more than three voxels behind whose depth is larger
     than the plane's on their ray by 1 / 0.3 of the truncation. Those in front learn that they are free, which removes
     what has moved away; those farther in front than the truncation with the weight of a plane that far behind them, as
-    noise of far surface is none of the space before it. Colors within 1.5 voxels of the surface are averaged with the plane's weight squared, less
-    where a pixel is larger than a voxel.
+    noise of far surface is none of the space before it. Colors within 1.5 voxels of the surface are averaged with the
+    plane's weight squared, less where a pixel is larger than a voxel.
 
     Args:
         block_coords: int32 [B, 3], distinct.
