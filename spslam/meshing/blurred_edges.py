@@ -25,7 +25,8 @@ _SHARP = 0.8
 # The inner pixels, two to each side of the middle, have this share of the change across a ramp; of the tread of a stair
 # it is two thirds.
 _INNER, _INNER_SHARE = 2, 0.8
-# The share of edges that is blurred: at most 0.6 where a sensor mixes single pixels (time of flight), 1 if it smooths.
+# The share of edges that is blurred: at most 0.6 where a sensor mixes single pixels (time of flight), 1 where it
+# smooths.
 _BLURRED_SHARE = 0.8
 
 

@@ -1,4 +1,4 @@
-"""Edges in depth images: steps between pixels of one surface, and which frames show a recording's edges."""
+"""Edges in depth images: the steps between pixels of one surface, and the frames that a recording is judged by."""
 
 from __future__ import annotations
 

@@ -27,10 +27,12 @@ COARSENING = 1.5
 _MOST_ATTEMPTS = 12
 # Truncation in deviations of the noise of near depth, and at most; a phone's LiDAR, smoothed at edges, needs so many.
 NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
-# Weight of a pixel between two surfaces, on a ramp where depth was smoothed over edges or flying: what else was seen
-# there counts for more, and as `extract_fused_mesh` asks for as large a share of the weight nearby, little of it stays
-# beside surface. What lies between may be the floor of a landing, of which a camera sees but its edge.
-BETWEEN_WEIGHT = 0.01
+# Weight of a pixel on a ramp between two surfaces, where depth was smoothed over edges: what else was seen there counts
+# for more, and as `extract_fused_mesh` asks for as large a share of the weight nearby, little of a ramp stays beside
+# surface. What lies between may be the floor of a landing, of which a camera sees but its edge.
+RAMP_WEIGHT = 0.01
+# Of a flying pixel, likewise. It is another point in every frame, so that a tenth is enough; with less, landings go.
+FLYING_WEIGHT = 0.1
 _WORKERS, _AHEAD = 2, 4
 
 
@@ -200,7 +202,7 @@ def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, fl
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
             if edges is _EdgeKind.FLYING:
-                planes[..., 4][_on(flying_pixels(frame.depth, noise), device)] *= BETWEEN_WEIGHT
+                planes[..., 4][_on(flying_pixels(frame.depth, noise), device)] *= FLYING_WEIGHT
         volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
 
 
@@ -210,7 +212,7 @@ def _ramps(
     """Planes float32 [H, W, 5] of the pixels of a depth image [H, W] (m) that are not `kept`, with little weight."""
     ramps = ops.measure_planes(depth, intrinsics, noise, shared_noise=True)
     ramps[kept > 0] = 0
-    ramps[..., 4] *= BETWEEN_WEIGHT
+    ramps[..., 4] *= RAMP_WEIGHT
     return ramps
 
 

@@ -1,6 +1,5 @@
 """Input of the fused ops that describes a scene: the tensors of a map, its sizes and the layout of its planes."""
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -106,11 +105,7 @@ class SceneView:
         check_plane_layout(function, self.plane_layout, len(self.texels), "plane_layout")
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
-        """The three lists that the schemas of the ops have: tensors, scalars and plane layout; not to be changed."""
-        return self._arguments
-
-    @functools.cached_property
-    def _arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
+        """The three lists that the schemas of the ops have: tensors, scalars and plane layout."""
         tensors = [
             self.hash_keys,
             self.hash_values,

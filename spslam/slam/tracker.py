@@ -97,7 +97,7 @@ class Tracker:
         if tracking.optimizer == "adam":
             return self._track_adam(problem, iterations)
         found = self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
-        if found.fit.is_far_from_prediction:
+        if not first and found.fit.is_far_from_prediction:
             return replace(self.track_from(problem, found.pose), iterations=iterations + tracking.iterations)
         return found
 

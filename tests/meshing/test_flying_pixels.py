@@ -49,6 +49,14 @@ def test_a_recording_is_judged_by_its_edges():
     assert not has_flying_pixels(frames(*[boxes(seed=seed) for seed in range(3)]), NOISE)
 
 
+def test_treads_of_a_stair_are_no_flying_pixels():
+    """Some are one or two pixels wide, between others that are wider."""
+    widths = (6, 1, 6, 6, 2, 6, 6, 3, 6)
+    rows = np.repeat(NEAR_M + 0.2 * np.arange(len(widths), dtype=np.float32), widths)
+    depth = np.tile(rows[:, None], (1, 100))
+    assert flying_pixels(depth, NOISE).any() and not has_flying_pixels(frames(depth), NOISE)
+
+
 def test_little_is_not_enough_to_judge():
     class Broken(list):
         def __getitem__(self, position):

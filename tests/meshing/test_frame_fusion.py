@@ -97,12 +97,14 @@ def test_little_of_ramps_between_surfaces_stays(room):
 
 
 def test_little_of_flying_pixels_stays():
-    """A box before a wall, of which the camera sees but the front; pixels at its edges lie between the two."""
-    box = np.full((96, 128), np.float32(2.0))
+    """A box before a wall, with pixels at its edges that lie between the two; one frame sees past it."""
+    wall = np.full((96, 128), np.float32(2.0))
+    box = wall.copy()
     box[30:70, 20:100] = 1.0
-    mixed = _Views(*[cv2.GaussianBlur(box, (3, 3), 0.6)] * 10)
-    depth = extract_fused_mesh(fuse_frames(mixed, FusionOptions(0.01, 500, (4e-6, 1e-6))), min_part_m2=0).vertices[:, 2]
-    assert ((depth > 1.1) & (depth < 1.9)).sum() < 0.005 * len(depth)
+    views = _Views(*[cv2.GaussianBlur(box, (3, 3), 0.6)] * 10, wall)
+    depth = extract_fused_mesh(fuse_frames(views, FusionOptions(0.01, 500, (4e-6, 1e-6))), min_part_m2=0).vertices[:, 2]
+    assert (np.abs(depth - 1) < 0.02).sum() > 1000
+    assert not ((depth > 1.1) & (depth < 1.9)).any()  # 2 % of them where these pixels count as others
 
 
 class _Views(PosedFrames):
