@@ -97,9 +97,11 @@ class Tracker:
         if tracking.optimizer == "adam":
             return self._track_adam(problem, iterations)
         found = self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
-        if not first and found.fit.is_far_from_prediction:
-            return replace(self.track_from(problem, found.pose), iterations=iterations + tracking.iterations)
-        return found
+        if not found.fit.is_far_from_prediction:
+            return found
+        further = self.track_from(problem, found.pose)
+        is_on_map = further.fit.inlier_share >= tracking.min_inlier_share
+        return replace(further if is_on_map else found, iterations=iterations + tracking.iterations)
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
         """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
