@@ -87,7 +87,7 @@ class Mapper:
         if iterations == 0 or state.scene.volume.num_voxels == 0:
             return None
         usable = state.usable
-        if True not in usable.numpy():
+        if not usable.numpy().any():
             return None
         return self.begin_on(state, self._select(state, usable), iterations)
 

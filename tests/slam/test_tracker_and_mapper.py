@@ -110,6 +110,20 @@ def test_tracking_goes_on_where_the_prediction_was_far_off(dataset, monkeypatch,
     assert error_m < 0.5 * error_at_once_m if goes_on else torch.equal(found.pose, at_once.pose)
 
 
+def test_a_pose_stays_as_it_was_found_where_tracking_on_leads_off_the_map(dataset, monkeypatch):
+    system = processed(dataset, 1)
+    tracker = system.tracker
+    pixels = sample_frame(dataset[1], dataset.camera, system.config)
+    start = pose_tensor(dataset.poses()[1], CPU)
+    start[4] += 0.05
+    problem = TrackingProblem(system.state.scene, pixels.records, start, 1)
+    away = pose_tensor(shifted(50.0), CPU)
+    monkeypatch.setattr(tracker, "track_from", lambda problem, _: tracker.measure(problem, away))
+    found = tracker.track(problem)
+    assert found.fit.is_far_from_prediction and found.fit.inlier_share > 0.5
+    assert np.linalg.norm(found.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
+
+
 def test_the_host_may_work_while_a_frame_is_tracked(dataset):
     system, states = processed(dataset, 1), []
     system.while_tracking = lambda: states.append(len(system.state.frames))
