@@ -19,6 +19,7 @@ _FOLDER = Path(__file__).resolve().parent.parent
 _LIBRARY_OF_ISA = {"avx512": "_images_cpu_avx512.so", "avx2": "_images_cpu_avx2.so", "baseline": "_images_cpu.so"}
 _CHANNELS = 3
 _MOST_BYTES = 2**31 - 1  # places in an image are 32-bit numbers
+_NO_MEMORY = 1  # returned by compiled functions
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,34 @@ def register_color(
     return colors, kept
 
 
+def unfilter_png(filtered: bytes, shape: tuple[int, int], channels: int, bits: int) -> np.ndarray | None:
+    """Undoes the filters of a PNG's rows, as its inflated data have them; releases Python's lock meanwhile.
+
+    Args:
+        filtered: of each row the number of its filter, and then its pixels.
+        shape: rows and columns of the image, which is not interlaced.
+        channels: of a pixel, 1 to 4; one only with 16 bits.
+        bits: of a channel, 8 or 16.
+
+    Returns:
+        uint8 or uint16 [H, W], or [H, W, C] of several channels; None where a row's filter is none that there is.
+
+    Raises:
+        ValueError: there are not as many bytes as such an image has.
+        ImportError, MemoryError: as `register_color`.
+    """
+    (rows, columns), pixel_bytes = shape, channels * bits // 8
+    row_bytes = columns * pixel_bytes
+    if len(filtered) != rows * (1 + row_bytes) or not 1 <= pixel_bytes <= 4 or rows * row_bytes > _MOST_BYTES:
+        raise ValueError(f"unfilter_png: not an image {[rows, columns, channels]} of {bits} bits")
+    image = np.empty((rows, columns) if channels == 1 else (rows, columns, channels), np.dtype(f"u{bits // 8}"))
+    sizes = np.array([rows, row_bytes, pixel_bytes], np.int32)
+    failure = _library().spslam_unfilter_png(filtered, sizes.ctypes.data, int(bits == 16), image.ctypes.data)
+    if failure == _NO_MEMORY:
+        raise MemoryError("unfilter_png: not enough memory for an image of this size")
+    return None if failure else image
+
+
 def _checked(name: str, image: np.ndarray, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
     if image.dtype != dtype or image.shape != shape:
         wanted = f"{np.dtype(dtype).name} {list(shape)}"
@@ -103,6 +132,7 @@ def _library() -> ctypes.CDLL:
             library = ctypes.CDLL(str(path))
             if chosen or library.spslam_runs_here():
                 library.spslam_register_color.argtypes = [ctypes.c_void_p] * 7
+                library.spslam_unfilter_png.argtypes = [ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p]
                 return library
     raise ImportError(
         f"spslam: no compiled image functions for {' or '.join(names)} in {_FOLDER}; install the wheel, "

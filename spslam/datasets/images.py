@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from spslam.datasets.image_header import image_size, is_truncated
+from spslam.datasets.png import decode_png
 from spslam.errors import DatasetError, brief
 from spslam.reading import read_bytes
 
@@ -56,8 +57,12 @@ def decode_color(content: bytes, name: str, size: Size | None = None) -> np.ndar
         name: what errors name.
         size: see `read_color`.
     """
-    image = _decode(content, name, size, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+    _check_content(content, name, size)
+    image = decode_png(content, channels=3)
+    if image is None:
+        image = _decode(content, name, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+    return image
 
 
 def read_depth(
@@ -81,7 +86,7 @@ def read_depth(
     if path.suffix.lower() == ".npy":
         stored = _load_array(path, size)
     else:
-        stored = _decode(_image_bytes(path), str(path), size, cv2.IMREAD_UNCHANGED)
+        stored = _decode_stored(_image_bytes(path), str(path), size)
     return _checked_depth(stored, str(path), units_per_meter, invalid)
 
 
@@ -97,7 +102,7 @@ def decode_depth(
         size: see `read_depth`.
         invalid: see `read_depth`.
     """
-    return _checked_depth(_decode(content, name, size, cv2.IMREAD_UNCHANGED), name, units_per_meter, invalid)
+    return _checked_depth(_decode_stored(content, name, size), name, units_per_meter, invalid)
 
 
 def read_confidence(path: Path, size: Size) -> np.ndarray:
@@ -113,7 +118,7 @@ def read_confidence(path: Path, size: Size) -> np.ndarray:
     Raises:
         DatasetError: as `read_color`, or several channels, or more bits.
     """
-    stored = _decode(_image_bytes(path), str(path), size, cv2.IMREAD_UNCHANGED)
+    stored = _decode_stored(_image_bytes(path), str(path), size)
     if stored.ndim != 2 or stored.dtype != np.uint8:
         raise DatasetError(
             f"{path}: confidence must be 8-bit with one channel, got {stored.dtype} {list(stored.shape)}"
@@ -200,15 +205,28 @@ def _checked_depth(stored: np.ndarray, name: str, units_per_meter: float | None,
     return depth_in_meters(stored, units_per_meter, invalid)
 
 
-def _decode(content: bytes, name: str, size: Size | None, flags: int) -> np.ndarray:
+def _decode_stored(content: bytes, name: str, size: Size | None) -> np.ndarray:
+    """The numbers as they are stored, [H, W] where there is one channel."""
+    _check_content(content, name, size)
+    stored = decode_png(content, channels=1)
+    return _decode(content, name, cv2.IMREAD_UNCHANGED) if stored is None else stored
+
+
+def _check_content(content: bytes, name: str, size: Size | None) -> None:
+    """Raises DatasetError where a file can't be decoded as its end is missing, or for the size in its header."""
     # Checked beforehand because some versions of OpenCV return the half they could decode.
     if is_truncated(content):
         raise DatasetError(f"{name}: the image is truncated ({len(content)} bytes, no end mark)")
     try:
-        _check_size(image_size(content), size, name)
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+        actual = image_size(content)
     except ValueError as error:
         raise DatasetError(f"{name}: can't be decoded as an image: {error}") from None
+    _check_size(actual, size, name)
+
+
+def _decode(content: bytes, name: str, flags: int) -> np.ndarray:
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except cv2.error as error:
         raise DatasetError(f"{name}: can't be decoded as an image: {error.err}") from error
     if image is None:

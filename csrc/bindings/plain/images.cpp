@@ -2,6 +2,7 @@
 #include <new>
 
 #include "spslam/color_registration.h"
+#include "spslam/png_filters.h"
 
 // Whether this processor has the instructions that the kernels are compiled for; this file is compiled for any.
 extern "C" __attribute__((visibility("default"))) int spslam_runs_here() {
@@ -36,6 +37,23 @@ extern "C" __attribute__((visibility("default"))) int spslam_register_color(
     spslam::register_color(spslam::Cpu{}, registration, {colors, unseen, depth}, registered_colors, registered_depth);
   } catch (const std::bad_alloc&) {
     return 1;
+  }
+  return 0;
+}
+
+// sizes: rows, bytes of a row without its filter's number, bytes of a pixel. Of numbers of 16 bits the bytes are
+// exchanged. Returns 0, 1 where there is not enough memory, 2 where a row's filter is none.
+extern "C" __attribute__((visibility("default"))) int spslam_unfilter_png(const std::uint8_t* filtered,
+                                                                          const std::int32_t* sizes, int is_16_bit,
+                                                                          std::uint8_t* out) {
+  const spslam::PngRows image{sizes[0], sizes[1], sizes[2]};
+  try {
+    if (!spslam::unfilter_png(spslam::Cpu{}, image, filtered, out)) return 2;
+  } catch (const std::bad_alloc&) {
+    return 1;
+  }
+  if (is_16_bit) {
+    spslam::swap_bytes(spslam::Cpu{}, image.rows * image.row_bytes / 2, reinterpret_cast<std::uint16_t*>(out));
   }
   return 0;
 }
