@@ -71,8 +71,8 @@ def measure(args: argparse.Namespace, case: tuple[str, str, str, int]) -> dict:
     """One run, in a process of its own, and its figures."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "run"
-        command = [sys.executable, "-m", "spslam", "run", "places", "--output", str(output), "--quiet"]
-        options = [f"device={args.device}", "run.previews=0", "mesh.resolution_m=0.1", *settings(args, case)]
+        command = [sys.executable, "-m", "spslam", "run", "places", "--output", str(output), "--quiet", "--no-mesh"]
+        options = [f"device={args.device}", "run.previews=0", *settings(args, case)]
         command += [word for option in options for word in ("--set", option)]
         command += [] if args.preset is None else ["--preset", args.preset]
         done = subprocess.run(command, env=_environment(), capture_output=True, text=True)

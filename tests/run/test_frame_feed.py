@@ -93,7 +93,7 @@ def test_upload_does_not_synchronize():
 
 @pytest.mark.parametrize(
     ("cores", "kind", "workers"),
-    [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (64, "cuda", 16), (16, "cuda", 8)],
+    [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (64, "cuda", 16), (16, "cuda", 12)],
 )
 def test_number_of_threads_depends_on_cores_and_device(monkeypatch, cores, kind, workers):
     monkeypatch.setattr(frame_feed.os, "sched_getaffinity", lambda _: range(cores), raising=False)
