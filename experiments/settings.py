@@ -181,25 +181,25 @@ def serve(device_name: str, threads: int) -> None:
 
 
 def run_job(job: Job, device: torch.device, threads: int) -> dict[str, Any]:
-    """Tracks and maps the sequence; returns ATE, RPE, lost and recovered frames, and frames/s."""
+    """Tracks and maps what can be read of the sequence; returns ATE, RPE, lost and recovered frames, and frames/s."""
     config = job.load_config(threads)
     dataset = Subset(open_dataset(config.dataset, job.folder or None), job.start, job.stop, job.step)
     ground_truth = dataset.poses()
     warm_up(config, dataset.camera, device)
     system = SlamSystem(config, dataset.camera, ground_truth[0], device)
-    reports, started = [], time.perf_counter()
+    reports, read, started = [], [], time.perf_counter()
     with FrameFeed(dataset, config, device) as feed:
-        for frame in feed:
-            if isinstance(frame, DatasetError):
-                raise frame
-            reports.append(system.submit(frame))
+        for position, frame in enumerate(feed):
+            if not isinstance(frame, DatasetError):
+                read.append(position)
+                reports.append(system.submit(frame))
     system.finish()
     recovered = sum(report.result().recovered for report in reports)
-    fps = len(dataset) / (time.perf_counter() - started)
+    fps = len(read) / (time.perf_counter() - started)
     estimated = system.trajectory()
-    known = estimated.mask_lost(ground_truth)
+    known = estimated.mask_lost(ground_truth[read])
     figures = {**ate(estimated.poses, known), **rpe(estimated.poses, known)}
-    counts = {"frames": len(dataset), "lost": int(estimated.lost.sum()), "recovered": recovered, "fps": fps}
+    counts = {"frames": len(read), "lost": int(estimated.lost.sum()), "recovered": recovered, "fps": fps}
     environment = describe_environment(device)
     return {**asdict(job), **figures, **counts, **{k: environment[k] for k in ("device_name", "torch", "commit")}}
 
