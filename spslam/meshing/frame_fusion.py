@@ -186,24 +186,23 @@ def surface_cells(scene: Scene) -> torch.Tensor:
 
 def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, float], edges: _EdgeKind) -> None:
     """Fuses the frames of one dataset, whose edges are of a kind."""
-    camera, device = part.dataset.camera, volume.sdf.device
-    intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+    device, intrinsics = volume.sdf.device, frame_intrinsics(part)
     if edges is _EdgeKind.BLURRED:
         for frame, pose in part.read():
-            depth, kept = (_on(image, device) for image in (frame.depth, without_blurred_edges(frame.depth, noise)))
-            volume.make_room(_ramps(depth, kept, intrinsics, noise), _pose7(pose, device), intrinsics, noise)
+            depth, kept = (on_device(image, device) for image in (frame.depth, without_blurred_edges(frame.depth, noise)))
+            volume.make_room(_ramps(depth, kept, intrinsics, noise), pose7_on(pose, device), intrinsics, noise)
     for frame, pose in part.read():
-        depth = _on(frame.depth, device)
+        depth = on_device(frame.depth, device)
         if edges is _EdgeKind.BLURRED:
-            kept = _on(without_blurred_edges(frame.depth, noise), device)
+            kept = on_device(without_blurred_edges(frame.depth, noise), device)
             # Smoothed depth: neighbors have the same noise.
             planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
             planes += _ramps(depth, kept, intrinsics, noise)
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
             if edges is _EdgeKind.FLYING:
-                planes[..., 4][_on(flying_pixels(frame.depth, noise), device)] *= FLYING_WEIGHT
-        volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
+                planes[..., 4][on_device(flying_pixels(frame.depth, noise), device)] *= FLYING_WEIGHT
+        volume.integrate_planes(planes, pose7_on(pose, device), intrinsics, on_device(frame.color, device), noise)
 
 
 def _ramps(
@@ -216,9 +215,17 @@ def _ramps(
     return ramps
 
 
-def _on(image: np.ndarray, device: torch.device) -> torch.Tensor:
+def frame_intrinsics(part: PosedFrames) -> ops.Intrinsics:
+    """The camera of a part's frames."""
+    camera = part.dataset.camera
+    return ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def on_device(image: np.ndarray, device: torch.device) -> torch.Tensor:
+    """An image as a tensor, of the same memory on the CPU where it is contiguous."""
     return torch.from_numpy(np.ascontiguousarray(image)).to(device)
 
 
-def _pose7(pose: np.ndarray, device: torch.device) -> torch.Tensor:
+def pose7_on(pose: np.ndarray, device: torch.device) -> torch.Tensor:
+    """T_world_camera [4, 4] as float32 [7]: unit quaternion (w, x, y, z) and translation."""
     return torch.from_numpy(matrix_to_pose7(pose)).to(device, torch.float32)

@@ -142,7 +142,7 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     del volume  # the largest of what is held, not needed for colors
     if job.texture is None:
         options = ColorOptions(noise, job.options.color_subdivisions)
-        mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options)
+        mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options, job.scene.device)
     return mesh, figures
 
 
