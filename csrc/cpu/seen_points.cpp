@@ -12,33 +12,48 @@ constexpr int kPointLanes = 64;
 constexpr std::int64_t kRunGrain = 1, kRowGrain = 16;
 static_assert(kSeenRun % kPointLanes == 0, "a run must be whole batches");
 
+// Coordinates [count, 3] as one array per axis; lanes without any are NaN.
+void load_axes(const float* from, int count, float* x, float* y, float* z) {
+  if (count == kPointLanes) {
+    SPS_SIMD for (int m = 0; m < kPointLanes; ++m) x[m] = from[3 * m], y[m] = from[3 * m + 1], z[m] = from[3 * m + 2];
+    return;
+  }
+  std::fill_n(x, kPointLanes, NAN);
+  std::fill_n(y, kPointLanes, NAN);
+  std::fill_n(z, kPointLanes, NAN);
+  for (int m = 0; m < count; ++m) x[m] = from[3 * m], y[m] = from[3 * m + 1], z[m] = from[3 * m + 2];
+}
+
 // Where a batch of points falls.
 struct PlacedPoints {
   alignas(64) float x[kPointLanes], y[kPointLanes], z[kPointLanes];  // world
   alignas(64) float u[kPointLanes], v[kPointLanes], depth[kPointLanes];
-  alignas(64) std::int32_t inside[kPointLanes];
+  // The nearest pixel's place in the depth buffer, and in the image, -1 outside.
+  alignas(64) std::int32_t drawn[kPointLanes], pixel[kPointLanes];
 
   // Of the points [first, first + count); returns whether any is in the image. Not inlined, so that the same points
   // fall on the same pixels wherever it is called.
   __attribute__((noinline)) bool place(const SeenSurface& surface, std::int64_t first, int count,
                                        const SeenFrame& frame, const Pose<float>& pose) {
-    const float* from = surface.points + 3 * first;
-    for (int m = 0; m < count; ++m) x[m] = from[3 * m], y[m] = from[3 * m + 1], z[m] = from[3 * m + 2];
-    for (int m = count; m < kPointLanes; ++m) x[m] = y[m] = z[m] = NAN;
+    load_axes(surface.points + 3 * first, count, x, y, z);
     // Copies, as what the loop writes might else be part of what it reads.
     const SeenFrame view = frame;
     const Pose<float> seen_from = pose;
-    std::int32_t any = 0;
-#pragma omp simd reduction(| : any)
+    const std::int32_t stride = static_cast<std::int32_t>(drawn_stride(frame));
+    std::int32_t last = -1;
+#pragma omp simd reduction(max : last)
     for (int m = 0; m < kPointLanes; ++m) {
       const SeenPlace at = seen_place(view, seen_from, {x[m], y[m], z[m]});
-      u[m] = at.u;
-      v[m] = at.v;
-      depth[m] = at.z;
-      inside[m] = at.inside;
-      any |= at.inside;
+      const float column = at.u, row = at.v, away = at.z;
+      const std::int32_t in_image = nearest_pixel(view, column, row, away, view.width);
+      u[m] = column;
+      v[m] = row;
+      depth[m] = away;
+      drawn[m] = nearest_pixel(view, column, row, away, stride) + stride + 1;
+      pixel[m] = in_image;
+      last = in_image > last ? in_image : last;
     }
-    return any != 0;
+    return last >= 0;
   }
 };
 
@@ -87,7 +102,7 @@ class DrawnDepth {
 
   void draw(const PlacedPoints& points) {
     for (int m = 0; m < kPointLanes; ++m) {
-      if (points.inside[m]) lower(&at(drawn_, points.u[m], points.v[m]), points.depth[m]);
+      if (points.pixel[m] >= 0) lower(drawn_ + points.drawn[m], points.depth[m]);
     }
   }
 
@@ -109,7 +124,7 @@ class DrawnDepth {
     });
   }
 
-  float front(float u, float v) const { return at(drawn_, u, v); }
+  float front(std::int32_t place) const { return drawn_[place]; }
 
  private:
   static SPS_INLINE float least(const float* at) { return smaller(at[-1], smaller(at[0], at[1])); }
@@ -122,10 +137,6 @@ class DrawnDepth {
     });
   }
 
-  float& at(float* buffer, float u, float v) const {
-    return buffer[stride_ + 1 + nearest_pixel(u, v, static_cast<std::int32_t>(stride_))];
-  }
-
   const SeenFrame& frame_;
   std::int64_t stride_;
   float *drawn_, *lowest_;
@@ -135,21 +146,20 @@ class DrawnDepth {
 void look_at(const SeenSurface& surface, std::int64_t first, int count, const PlacedPoints& points,
              const SeenFrame& frame, const Pose<float>& pose, const DrawnDepth& drawn, std::uint8_t* colors,
              float* weights) {
-  alignas(64) float nx[kPointLanes] = {}, ny[kPointLanes] = {}, nz[kPointLanes] = {};
+  alignas(64) float nx[kPointLanes], ny[kPointLanes], nz[kPointLanes];
   alignas(64) float front[kPointLanes], measured[kPointLanes], weight[kPointLanes];
-  const float* normals = surface.normals + 3 * first;
-  for (int m = 0; m < count; ++m) nx[m] = normals[3 * m], ny[m] = normals[3 * m + 1], nz[m] = normals[3 * m + 2];
+  load_axes(surface.normals + 3 * first, count, nx, ny, nz);
   for (int m = 0; m < kPointLanes; ++m) {
-    const bool inside = points.inside[m] != 0;
-    front[m] = inside ? drawn.front(points.u[m], points.v[m]) : 0.0f;
-    measured[m] = inside ? frame.depth[nearest_pixel(points.u[m], points.v[m], frame.width)] : 0.0f;
+    const std::int32_t pixel = points.pixel[m];
+    front[m] = pixel < 0 ? 0.0f : drawn.front(points.drawn[m]);
+    measured[m] = pixel < 0 ? 0.0f : frame.depth[pixel];
   }
   const SeenFrame view = frame;
   const Pose<float> seen_from = pose;
   SPS_SIMD for (int m = 0; m < kPointLanes; ++m) {
     const float cosine = seen_cosine(seen_from, {points.x[m], points.y[m], points.z[m]}, {nx[m], ny[m], nz[m]});
     const float seen = seen_weight(view, points.depth[m], cosine, front[m], measured[m]);
-    weight[m] = points.inside[m] ? seen : 0.0f;
+    weight[m] = points.pixel[m] >= 0 ? seen : 0.0f;
   }
   for (int m = 0; m < count; ++m) {
     std::uint8_t* color = colors + 3 * (first + m);

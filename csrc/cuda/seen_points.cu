@@ -38,8 +38,9 @@ void see_points<Cuda>(Cuda device, const SeenSurface& surface, const SeenFrame& 
     if (!sphere_in_view(frame, pose, surface.spheres + 4 * (i / kSeenRun))) return;
     const float* p = surface.points + 3 * i;
     const SeenPlace at = seen_place(frame, pose, {p[0], p[1], p[2]});
-    if (!at.inside) return;
-    float* to = drawn + stride + 1 + nearest_pixel(at.u, at.v, static_cast<std::int32_t>(stride));
+    const std::int32_t pixel = nearest_pixel(frame, at.u, at.v, at.z, static_cast<std::int32_t>(stride));
+    if (pixel < 0) return;
+    float* to = drawn + stride + 1 + pixel;
     // Of positive numbers the bits are in the same order.
     atomicMin(reinterpret_cast<int*>(to), __float_as_int(at.z));
   });
@@ -55,10 +56,11 @@ void see_points<Cuda>(Cuda device, const SeenSurface& surface, const SeenFrame& 
       const float *p = surface.points + 3 * i, *n = surface.normals + 3 * i;
       const Vec3<float> world{p[0], p[1], p[2]};
       const SeenPlace at = seen_place(frame, pose, world);
-      if (at.inside) {
-        const std::int64_t place = stride + 1 + nearest_pixel(at.u, at.v, static_cast<std::int32_t>(stride));
+      const std::int32_t pixel = nearest_pixel(frame, at.u, at.v, at.z, frame.width);
+      if (pixel >= 0) {
+        const std::int64_t place = (pixel / frame.width + 1) * stride + pixel % frame.width + 1;
         const float front = closed_front(drawn + place, lowest + place, stride);
-        const float measured = frame.depth[nearest_pixel(at.u, at.v, frame.width)];
+        const float measured = frame.depth[pixel];
         weight = seen_weight(frame, at.z, seen_cosine(pose, world, {n[0], n[1], n[2]}), front, measured);
         if (weight > 0.0f) seen_color(frame, at.u, at.v, color);
       }

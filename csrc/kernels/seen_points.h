@@ -37,25 +37,27 @@ SPS_INLINE Vec3<float> in_camera(const Pose<float>& pose, const Vec3<float>& wor
           r[2] * from.x + r[5] * from.y + r[8] * from.z};
 }
 
-// Where a point falls: pixel coordinates and depth (m), and whether that is in the image. Else u and v are 0.
+// Where a point falls: pixel coordinates and depth, m. Of points behind the camera u and v say nothing.
 struct SeenPlace {
   float u, v, z;
-  bool inside;
 };
 
 SPS_INLINE SeenPlace seen_place(const SeenFrame& frame, const Pose<float>& pose, const Vec3<float>& world) {
   const Vec3<float> at = in_camera(pose, world);
   const float inverse_z = 1.0f / (at.z > kNearestSeen ? at.z : kNearestSeen);
-  const float u = frame.camera.fx * at.x * inverse_z + frame.camera.cx;
-  const float v = frame.camera.fy * at.y * inverse_z + frame.camera.cy;
-  const bool inside = (at.z > kNearestSeen) & (u >= 0.0f) & (v >= 0.0f) & (u <= static_cast<float>(frame.width - 1)) &
-                      (v <= static_cast<float>(frame.height - 1)) & (at.z < kNothingDrawn);
-  return {inside ? u : 0.0f, inside ? v : 0.0f, at.z, inside};
+  return {frame.camera.fx * at.x * inverse_z + frame.camera.cx, frame.camera.fy * at.y * inverse_z + frame.camera.cy,
+          at.z};
 }
 
-// The nearest pixel's place in an image with `stride` columns.
-SPS_INLINE std::int32_t nearest_pixel(float u, float v, std::int32_t stride) {
-  return static_cast<std::int32_t>(v + 0.5f) * stride + static_cast<std::int32_t>(u + 0.5f);
+// The nearest pixel's place in an image with `stride` columns; -1 where a point does not fall into the frame.
+SPS_INLINE std::int32_t nearest_pixel(const SeenFrame& frame, float u, float v, float z, std::int32_t stride) {
+  const float right = static_cast<float>(frame.width - 1), bottom = static_cast<float>(frame.height - 1);
+  const bool inside =
+      (z > kNearestSeen) & (z < kNothingDrawn) & (u >= 0.0f) & (v >= 0.0f) & (u <= right) & (v <= bottom);
+  // Converted only where it fits.
+  const float column = inside ? u + 0.5f : 0.0f, row = inside ? v + 0.5f : 0.0f;
+  const std::int32_t pixel = static_cast<std::int32_t>(row) * stride + static_cast<std::int32_t>(column);
+  return inside ? pixel : -1;
 }
 
 // Whether a ball (center, radius) reaches into the field of view; true of what is not finite.
