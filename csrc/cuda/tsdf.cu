@@ -80,7 +80,8 @@ __global__ void __launch_bounds__(kIntegrateThreads)
       if (pixel < 0) continue;
       const MeasuredPlane plane = load_plane(frame.planes + static_cast<std::int64_t>(kPlaneSize) * pixel);
       const float distance = plane_distance(plane, at);
-      const TsdfObservation seen = observe_voxel(plane, distance, at.z, blocks.voxel_size, options);
+      const TsdfObservation seen =
+          observe_voxel(plane.distance, plane.weight, distance, at.z, blocks.voxel_size, options);
       if (!(seen.weight > 0.0f)) continue;
       const std::int64_t place = kTsdfBlockVoxels * row + m;
       update_voxel(seen, options.max_weight, blocks.sdf[place], blocks.weights[place]);
