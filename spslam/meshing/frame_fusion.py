@@ -18,6 +18,7 @@ from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
+from spslam.meshing.reading import reading_threads
 from spslam.meshing.sdf_sampling import near_surface
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
@@ -33,7 +34,6 @@ NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
 RAMP_WEIGHT = 0.01
 # Of a flying pixel, likewise. It is another point in every frame, so that a tenth is enough; with less, landings go.
 FLYING_WEIGHT = 0.1
-_WORKERS, _AHEAD = 2, 4
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class PosedFrames:
 
     def read(self) -> Iterator[tuple[RgbdFrame, np.ndarray]]:
         """Frames and poses in order, read ahead by threads; frames that can't be read are left out."""
-        with prefetch(self, _WORKERS, _AHEAD) as frames:
+        with prefetch(self, *reading_threads()) as frames:
             for frame, pose in zip(frames, self.poses, strict=True):
                 if not isinstance(frame, DatasetError):
                     yield frame, pose
