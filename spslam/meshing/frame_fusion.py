@@ -6,6 +6,7 @@ import enum
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -147,7 +148,7 @@ def fuse_frames(
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
             for part, kind in zip(parts, edges, strict=True):
-                _fuse_part(volume, part, part.noise or options.noise, kind)
+                _fuse_part(volume, _EdgeImages(part, part.noise or options.noise, kind))
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -184,25 +185,59 @@ def surface_cells(scene: Scene) -> torch.Tensor:
     return near_surface(cells, volume.voxel_size_m, sdf, MAX_SLOPE, CHUNK_POINTS)
 
 
-def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, float], edges: _EdgeKind) -> None:
-    """Fuses the frames of one dataset, whose edges are of a kind."""
-    device, intrinsics = volume.sdf.device, frame_intrinsics(part)
-    if edges is _EdgeKind.BLURRED:
-        for frame, pose in part.read():
-            depth, kept = (on_device(image, device) for image in (frame.depth, without_blurred_edges(frame.depth, noise)))
-            volume.make_room(_ramps(depth, kept, intrinsics, noise), pose7_on(pose, device), intrinsics, noise)
-    for frame, pose in part.read():
+@dataclass(frozen=True)
+class _EdgeImages:
+    """Frames with what lies between two surfaces in them, found on the threads that read.
+
+    Attributes:
+        part: the frames.
+        noise: of their depth.
+        edges: of what kind they are.
+    """
+
+    part: PosedFrames
+    noise: tuple[float, float]
+    edges: _EdgeKind
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __getitem__(self, position: int) -> tuple[RgbdFrame, Any]:
+        """A frame, and depth without ramps, float32 [H, W], or which pixels are flying, bool [H, W]."""
+        frame = self.part[position]
+        if self.edges is _EdgeKind.BLURRED:
+            return frame, without_blurred_edges(frame.depth, self.noise)
+        return frame, flying_pixels(frame.depth, self.noise) if self.edges is _EdgeKind.FLYING else None
+
+    def read(self) -> Iterator[tuple[int, RgbdFrame, Any]]:
+        """Positions, frames and their edges in order; frames that can't be read are left out."""
+        with prefetch(self, *reading_threads()) as images:
+            for position, image in enumerate(images):
+                if not isinstance(image, DatasetError):
+                    yield position, *image
+
+
+def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages) -> None:
+    """Fuses the frames of one dataset."""
+    device, intrinsics, noise = volume.sdf.device, frame_intrinsics(images.part), images.noise
+    poses = images.part.poses
+    if images.edges is _EdgeKind.BLURRED:
+        for position, frame, kept in images.read():
+            ramps = _ramps(on_device(frame.depth, device), on_device(kept, device), intrinsics, noise)
+            volume.make_room(ramps, pose7_on(poses[position], device), intrinsics, noise)
+    for position, frame, found in images.read():
         depth = on_device(frame.depth, device)
-        if edges is _EdgeKind.BLURRED:
-            kept = on_device(without_blurred_edges(frame.depth, noise), device)
+        if images.edges is _EdgeKind.BLURRED:
+            kept = on_device(found, device)
             # Smoothed depth: neighbors have the same noise.
             planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
             planes += _ramps(depth, kept, intrinsics, noise)
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
-            if edges is _EdgeKind.FLYING:
-                planes[..., 4][on_device(flying_pixels(frame.depth, noise), device)] *= FLYING_WEIGHT
-        volume.integrate_planes(planes, pose7_on(pose, device), intrinsics, on_device(frame.color, device), noise)
+            if images.edges is _EdgeKind.FLYING:
+                planes[..., 4][on_device(found, device)] *= FLYING_WEIGHT
+        color = on_device(frame.color, device)
+        volume.integrate_planes(planes, pose7_on(poses[position], device), intrinsics, color, noise)
 
 
 def _ramps(
