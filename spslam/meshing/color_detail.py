@@ -129,4 +129,4 @@ def _mean_colors(
 
 
 def _surface(points: np.ndarray, normals: np.ndarray, device: torch.device) -> ops.SurfacePoints:
-    return ops.SurfacePoints(*(torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in (points, normals)))
+    return ops.SurfacePoints.of(*(torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in (points, normals)))

@@ -1,6 +1,6 @@
 """Which points of a surface frames see, with which colors, and sums of these over frames. Not differentiable."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 
@@ -18,40 +18,41 @@ _SUMS, _DETAIL_SUMS = 4, 5
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points of a surface that are looked for in frames.
-
-    Args:
-        points: float32 [N, 3], world, m; next to each other in space where they are in the tensor, for speed alone.
-        normals: float32 [N, 3], unit vectors towards free space.
-
-    Raises:
-        TypeError, ValueError: a tensor of another dtype, shape or device.
+    """Points of a surface that are looked for in frames; `SurfacePoints.of` makes one.
 
     Attributes:
+        points: float32 [N, 3], world, m.
+        normals: float32 [N, 3], unit vectors towards free space.
         spheres: float32 [N / 1024 rounded up, 4], center and radius of a ball around each 1024 points, m.
     """
 
     points: torch.Tensor
     normals: torch.Tensor
-    spheres: torch.Tensor = field(init=False, repr=False)
+    spheres: torch.Tensor
 
-    def __post_init__(self) -> None:
-        check_tensor("SurfacePoints", "points", self.points, ("N", 3), torch.float32)
-        check_tensor("SurfacePoints", "normals", self.normals, tuple(self.points.shape), torch.float32, self.points)
-        object.__setattr__(self, "spheres", _spheres(self.points))
+    @staticmethod
+    def of(points: torch.Tensor, normals: torch.Tensor) -> "SurfacePoints":
+        """Of points, float32 [N, 3], and their normals, next to each other where they are in the tensor, for speed.
+
+        Raises:
+            TypeError, ValueError: points of another dtype or shape.
+
+        Example:
+            >>> SurfacePoints.of(torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]]), torch.ones(2, 3)).spheres.tolist()
+            [[1.0, 0.0, 1.0, 1.0]]
+        """
+        check_tensor("SurfacePoints.of", "points", points, ("N", 3), torch.float32)
+        if not len(points):
+            return SurfacePoints(points, normals, points.new_zeros(0, 4))
+        short = -len(points) % _RUN
+        runs = torch.cat((points, points[-1:].expand(short, 3))).view(-1, _RUN, 3)
+        low, high = runs.amin(1), runs.amax(1)
+        # Not finite where a point of the run is not: such a run is never left out.
+        spheres = torch.cat((0.5 * (low + high), 0.5 * (high - low).norm(dim=1, keepdim=True)), 1)
+        return SurfacePoints(points, normals, spheres)
 
     def __len__(self) -> int:
         return len(self.points)
-
-
-def _spheres(points: torch.Tensor) -> torch.Tensor:
-    """The balls around runs of points; not finite where a point of the run is not, which then is never left out."""
-    if not len(points):
-        return points.new_zeros(0, 4)
-    short = -len(points) % _RUN
-    runs = torch.cat((points, points[-1:].expand(short, 3))).view(-1, _RUN, 3)
-    low, high = runs.amin(1), runs.amax(1)
-    return torch.cat((0.5 * (low + high), 0.5 * (high - low).norm(dim=1, keepdim=True)), 1)
 
 
 @public_op()
@@ -89,24 +90,29 @@ def see_points(
 
     Example:
         >>> points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 9.0, 2.0]])
-        >>> surface = SurfacePoints(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3))
+        >>> surface = SurfacePoints.of(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3))
         >>> color, pose = torch.full((8, 8, 3), 90, dtype=torch.uint8), torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
         >>> colors, weights = see_points(surface, torch.zeros(8, 8), color, pose, Intrinsics(8.0, 8.0, 4.0, 4.0))
         >>> weights.tolist(), colors[0].tolist()
         ([16.0, 0.0, 0.0], [90, 90, 90])
     """
     name = "see_points"
-    check_tensor(name, "depth", depth, ("H", "W"), torch.float32, like=surface.points)
+    points = surface.points
+    check_tensor(name, "surface.points", points, ("N", 3), torch.float32)
+    check_tensor(name, "surface.normals", surface.normals, (len(points), 3), torch.float32, like=points)
+    runs = -(-len(points) // _RUN)
+    check_tensor(name, "surface.spheres", surface.spheres, (runs, 4), torch.float32, like=points)
+    check_tensor(name, "depth", depth, ("H", "W"), torch.float32, like=points)
     check(max(depth.shape) <= _MAX_SIDE, name, "depth", f"have at most {_MAX_SIDE} px per side", list(depth.shape))
     check_tensor(name, "color", color, (*depth.shape, 3), torch.uint8, like=depth)
     check_tensor(name, "pose", pose, (7,), torch.float32, like=depth)
     check_intrinsics(name, intrinsics)
     check_noise(name, noise)
-    tensors = surface.points, surface.normals, surface.spheres, depth, color, pose
+    tensors = points, surface.normals, surface.spheres, depth, color, pose
     return torch.ops.spslam.see_points(*tensors, list(intrinsics), list(noise))
 
 
-@public_op(as_given=("sums", "weights"))
+@public_op(as_given=("sums",))
 def add_seen_colors_(sums: torch.Tensor, colors: torch.Tensor, weights: torch.Tensor) -> None:
     """Adds weighted colors, and the weights, to the sums that a mean is made of.
 
@@ -131,7 +137,7 @@ def add_seen_colors_(sums: torch.Tensor, colors: torch.Tensor, weights: torch.Te
     torch.ops.spslam.add_seen_colors_(sums, colors, weights)
 
 
-@public_op(as_given=("sums", "weights"))
+@public_op(as_given=("sums",))
 def add_color_detail_(sums: torch.Tensor, colors: torch.Tensor, weights: torch.Tensor, ends: torch.Tensor) -> None:
     """Adds what a frame says of the color in the middle of edges, where it sees the middle and both ends.
 

@@ -119,7 +119,7 @@ def test_what_stands_before_a_wall_does_not_color_it(without_depth):
 def test_seen_points_are_those_that_no_rectangle_hides():
     scene = WALL, FLOOR, SIGN
     mesh = mesh_of(*scene, step_m=0.02)
-    surface = ops.SurfacePoints(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.normals))
+    surface = ops.SurfacePoints.of(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.normals))
     views = frames(*scene)
     for view, (_, weights) in zip(read_views([views], NOISE), read_seen(surface, [views], NOISE), strict=True):
         seen = weights.numpy() > 0

@@ -43,7 +43,7 @@ def frame(seed=1):
 
 def seen(points, normals, depth, color, pose=POSE, device="cpu"):
     on = [torch.from_numpy(each).to(device) for each in (points, normals, depth, color)]
-    return ops.see_points(ops.SurfacePoints(*on[:2]), *on[2:], pose.to(device), CAMERA, NOISE)
+    return ops.see_points(ops.SurfacePoints.of(*on[:2]), *on[2:], pose.to(device), CAMERA, NOISE)
 
 
 @pytest.mark.parametrize("seed", range(3))
