@@ -19,7 +19,8 @@ std::tuple<Tensor, Tensor> see_points(Tensor points, Tensor normals, Tensor sphe
   SPS_CHECK(depth.size(0) <= kMostSide && depth.size(1) <= kMostSide, kName, ": images must have at most ", kMostSide,
             " pixels per side");
   SPS_CHECK(has_shape(pose, {kPoseSize}), kName, ": pose must have shape [7]");
-  SPS_CHECK(noise.size() == 2 && noise[0] >= 0.0 && noise[1] >= 0.0, kName, ": noise must be two numbers of at least 0");
+  SPS_CHECK(noise.size() == 2 && noise[0] >= 0.0 && noise[1] >= 0.0, kName,
+            ": noise must be two numbers of at least 0");
   DeviceScope scope(points);
   points = as_contiguous(points);
   normals = as_contiguous(normals);
@@ -35,7 +36,8 @@ std::tuple<Tensor, Tensor> see_points(Tensor points, Tensor normals, Tensor sphe
                         static_cast<std::int32_t>(depth.size(0)),
                         load_intrinsics(kName, intrinsics),
                         {static_cast<float>(noise[0]), static_cast<float>(noise[1])}};
-  const Tensor colors = empty(points, {count, 3}, ScalarType::Byte), weights = empty(points, {count}, ScalarType::Float);
+  const Tensor colors = empty(points, {count, 3}, ScalarType::Byte),
+               weights = empty(points, {count}, ScalarType::Float);
   const Tensor workspace = empty(points, {see_points_workspace_bytes(frame)}, ScalarType::Byte);
   spslam::see_points(scope.context, surface, frame, mutable_data<std::uint8_t>(colors), mutable_data<float>(weights),
                      mutable_data<std::uint8_t>(workspace));

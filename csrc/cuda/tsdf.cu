@@ -101,12 +101,13 @@ void measure_planes<Cuda>(Cuda device, const DepthImage& image, const PlaneNoise
     const std::int32_t u = static_cast<std::int32_t>(i % image.width), v = static_cast<std::int32_t>(i / image.width);
     const auto inverse_at = [&](int du, int dv) {
       const bool inside = u + du >= 0 && v + dv >= 0 && u + du < image.width && v + dv < image.height;
-      return inside ? inverse_depth(image.depth[i + static_cast<std::int64_t>(dv) * image.width + du]) : kUnknownInverse;
+      return inside ? inverse_depth(image.depth[i + static_cast<std::int64_t>(dv) * image.width + du])
+                    : kUnknownInverse;
     };
     const float center = inverse_at(0, 0);
-    const PlaneMiddle middle =
-        plane_middle(own_noise(noise), image.camera, center, one_sided_slope(inverse_at(-1, 0), center, inverse_at(1, 0)),
-                     one_sided_slope(inverse_at(0, -1), center, inverse_at(0, 1)));
+    const PlaneMiddle middle = plane_middle(own_noise(noise), image.camera, center,
+                                            one_sided_slope(inverse_at(-1, 0), center, inverse_at(1, 0)),
+                                            one_sided_slope(inverse_at(0, -1), center, inverse_at(0, 1)));
     PlaneSums sums{};
     SPS_UNROLL for (int dv = -kPlaneRadius; dv <= kPlaneRadius; ++dv) {
       add_plane_row(middle, dv, inverse_at(-2, dv), inverse_at(-1, dv), inverse_at(0, dv), inverse_at(1, dv),

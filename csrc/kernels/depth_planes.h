@@ -108,8 +108,8 @@ SPS_INLINE PlaneSample plane_sample(float q, const PlaneMiddle& middle, int du, 
 
 // Adds the row of a window that lies `dv` pixels below its middle: the pixels at u - 2 to u + 2. Pairs on both sides of
 // the middle have the same factors.
-SPS_INLINE void add_plane_row(const PlaneMiddle& middle, int dv, float q_left2, float q_left, float q_own, float q_right,
-                              float q_right2, PlaneSums& sums) {
+SPS_INLINE void add_plane_row(const PlaneMiddle& middle, int dv, float q_left2, float q_left, float q_own,
+                              float q_right, float q_right2, PlaneSums& sums) {
   static_assert(kPlaneRadius == 2, "the window's columns are written out");
   const PlaneSample own = plane_sample(q_own, middle, 0, dv);
   const PlaneSample left = plane_sample(q_left, middle, -1, dv), right = plane_sample(q_right, middle, 1, dv);

@@ -177,8 +177,8 @@ SPS_INLINE float weight_before(float weight, float plane_distance, float along, 
   constexpr float kPerCosine = 1.0f / kTouchCosine;
   const float met = depth * plane_distance / along, farthest = plane_distance * kPerCosine;
   const float seen = met < farthest ? met : farthest, nearest = depth + truncation;
-  const float more = (kPoseVariance + depth_variance(options.noise, seen)) /
-                     (kPoseVariance + depth_variance(options.noise, nearest));
+  const float more =
+      (kPoseVariance + depth_variance(options.noise, seen)) / (kPoseVariance + depth_variance(options.noise, nearest));
   return weight * ((along > 0.0f) & (seen > nearest) ? more : 1.0f);
 }
 

@@ -21,8 +21,8 @@ void add_color_detail(Device device, const std::uint8_t* colors, const float* we
            [=] SPS_HOST_DEVICE(std::int64_t e) { add_edge_detail(colors, weights, edges, e, sums); });
 }
 
-#define SPS_INSTANTIATE_SEEN_POINTS(Device)                                                                      \
-  template void add_seen_colors<Device>(Device, const std::uint8_t*, const float*, std::int64_t, float*);       \
+#define SPS_INSTANTIATE_SEEN_POINTS(Device)                                                               \
+  template void add_seen_colors<Device>(Device, const std::uint8_t*, const float*, std::int64_t, float*); \
   template void add_color_detail<Device>(Device, const std::uint8_t*, const float*, const SeenEdges&, float*);
 
 }  // namespace spslam

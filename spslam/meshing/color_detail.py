@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from spslam import ops
-from spslam.meshing.frame_fusion import PosedFrames
+from spslam.meshing.frame_fusion import PosedFrames, on_device
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.subdivision import MeshEdges, mesh_edges, midpoints, split_edges
 from spslam.meshing.visible_points import read_seen
@@ -129,4 +129,4 @@ def _mean_colors(
 
 
 def _surface(points: np.ndarray, normals: np.ndarray, device: torch.device) -> ops.SurfacePoints:
-    return ops.SurfacePoints.of(*(torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in (points, normals)))
+    return ops.SurfacePoints.of(on_device(points, device), on_device(normals, device))

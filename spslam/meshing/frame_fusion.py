@@ -256,9 +256,9 @@ def frame_intrinsics(part: PosedFrames) -> ops.Intrinsics:
     return ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def on_device(image: np.ndarray, device: torch.device) -> torch.Tensor:
-    """An image as a tensor, of the same memory on the CPU where it is contiguous."""
-    return torch.from_numpy(np.ascontiguousarray(image)).to(device)
+def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """An array as a tensor, of the same memory on the CPU where it is contiguous."""
+    return torch.from_numpy(np.ascontiguousarray(array)).to(device)
 
 
 def pose7_on(pose: np.ndarray, device: torch.device) -> torch.Tensor:

@@ -67,9 +67,9 @@ def see_points(
     """The points of a surface that a frame sees from their front, and their colors in it.
 
     What hides others is the points themselves, drawn into a depth buffer whose gaps of less than 3 px are closed, and
-    the frame's depth: a point is hidden 4 mm and 2 px of the slanted surface behind the nearest ones, and 2 cm and three
-    deviations of the noise behind what was measured. Depth that was measured behind a point does not hide it, nor does
-    unknown depth: the colors that a frame has there are those that the surface is seen with.
+    the frame's depth: a point is hidden 4 mm and 2 px of the slanted surface behind the nearest ones, and 2 cm and
+    three deviations of the noise behind what was measured. Depth that was measured behind a point does not hide it, nor
+    does unknown depth: the colors that a frame has there are those that the surface is seen with.
 
     Args:
         surface: the points and their normals.

@@ -84,7 +84,7 @@ def test_points_that_are_not_finite_are_not_seen(device):
     points, normals = surface(1500)
     depth, color = frame()
     whole = seen(points, normals, depth, color, device=device)[1].cpu().numpy()
-    broken = np.flatnonzero(whole > 0)[:: 7]
+    broken = np.flatnonzero(whole > 0)[::7]
     points[broken] = np.nan
     points[broken[::2]] = np.inf
     weights = seen(points, normals, depth, color, device=device)[1].cpu().numpy()
