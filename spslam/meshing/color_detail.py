@@ -105,6 +105,7 @@ def _has_detail(
     sums = torch.zeros(len(rows), 5, device=device)
     for colors, weights in read_seen(surface, parts, noise):
         ops.add_color_detail_(sums, colors, weights, on_edges)
+        del colors, weights  # before the next frame's are made
     off, (squares, counts) = sums[:, :3].cpu().numpy(), sums[:, 3:].T.cpu().numpy()
     several = counts >= 2
     if not several.any():
@@ -125,6 +126,7 @@ def _mean_colors(
     sums = torch.nn.functional.pad(own, (0, 1), value=1.0) * _OWN_WEIGHT
     for colors, weights in read_seen(_surface(mesh.vertices, mesh.normals, device), parts, noise):
         ops.add_seen_colors_(sums, colors, weights)
+        del colors, weights
     return (sums[:, :3] / sums[:, 3:]).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
 
 

@@ -42,11 +42,11 @@ class SurfacePoints:
             [[1.0, 0.0, 1.0, 1.0]]
         """
         check_tensor("SurfacePoints.of", "points", points, ("N", 3), torch.float32)
-        if not len(points):
-            return SurfacePoints(points, normals, points.new_zeros(0, 4))
-        short = -len(points) % _RUN
-        runs = torch.cat((points, points[-1:].expand(short, 3))).view(-1, _RUN, 3)
-        low, high = runs.amin(1), runs.amax(1)
+        whole = len(points) // _RUN * _RUN
+        runs = [points[:whole].reshape(-1, _RUN, 3)]
+        if whole < len(points):
+            runs.append(points[None, whole:])
+        low, high = torch.cat([run.amin(1) for run in runs]), torch.cat([run.amax(1) for run in runs])
         # Not finite where a point of the run is not: such a run is never left out.
         spheres = torch.cat((0.5 * (low + high), 0.5 * (high - low).norm(dim=1, keepdim=True)), 1)
         return SurfacePoints(points, normals, spheres)
