@@ -24,7 +24,7 @@ class InverseDepth {
       for (std::int64_t r = first; r < last; ++r) {
         float* row = begin + r * stride_;
         const std::int64_t v = r - kPlaneRadius;
-        std::fill(row, row + stride_, 0.0f);
+        std::fill(row, row + stride_, kUnknownInverse);
         if (v < 0 || v >= image.height) continue;
         const float* depth = image.depth + v * image.width;
         SPS_SIMD for (std::int32_t u = 0; u < image.width; ++u) row[kPlaneRadius + u] = inverse_depth(depth[u]);
@@ -39,14 +39,9 @@ class InverseDepth {
   const float* origin_;
 };
 
-// Adds the row of a window that lies `Dv` pixels below its middle, around the pixel at q.
-template <int Dv>
-SPS_INLINE void add_plane_row(const float* q, const PlaneMiddle& middle, PlaneSums& sums) {
-  add_plane_sample(q[-2], middle, -2, Dv, plane_window_weight(-2, Dv), sums);
-  add_plane_sample(q[-1], middle, -1, Dv, plane_window_weight(-1, Dv), sums);
-  add_plane_sample(q[0], middle, 0, Dv, plane_window_weight(0, Dv), sums);
-  add_plane_sample(q[1], middle, 1, Dv, plane_window_weight(1, Dv), sums);
-  add_plane_sample(q[2], middle, 2, Dv, plane_window_weight(2, Dv), sums);
+// Adds the row of a window around the pixel at q.
+SPS_INLINE void add_row_at(const float* q, const PlaneMiddle& middle, int dv, PlaneSums& sums) {
+  add_plane_row(middle, dv, q[-2], q[-1], q[0], q[1], q[2], sums);
 }
 
 // Planes of the pixels [first, first + kPixelLanes) of a row that lie in the image.
@@ -57,34 +52,35 @@ void planes_of_batch(const DepthImage& image, const InverseDepth& inverse, const
   const float* centers = inverse.row(v) + first;
   const float *above = inverse.row(v - 1) + first, *below = inverse.row(v + 1) + first;
   const Intrinsics camera = image.camera;
+  // Not chosen in the loops, where it would keep the compiler from using vectors.
+  const DepthNoise whole = noise.depth, own = own_noise(noise);
   SPS_SIMD for (int i = 0; i < kPixelLanes; ++i) {
     const float slope_u = one_sided_slope(centers[i - 1], centers[i], centers[i + 1]);
     const float slope_v = one_sided_slope(above[i], centers[i], below[i]);
-    const PlaneMiddle middle = plane_middle(noise, camera, centers[i], slope_u, slope_v);
+    const PlaneMiddle middle = plane_middle(own, camera, centers[i], slope_u, slope_v);
     by_u[i] = middle.by_u;
     by_v[i] = middle.by_v;
     gates[i] = middle.inverse_gate;
   }
-  static_assert(kPlaneRadius == 2, "the window's rows and columns are written out");
+  static_assert(kPlaneRadius == 2, "the window's rows are written out");
   const float *highest = inverse.row(v - 2) + first, *lowest = inverse.row(v + 2) + first;
   // All sums of a pixel in one loop, so that they stay in registers.
   SPS_SIMD for (int i = 0; i < kPixelLanes; ++i) {
     PlaneSums s{};
     const PlaneMiddle middle{centers[i], by_u[i], by_v[i], gates[i]};
-    add_plane_row<-2>(highest + i, middle, s);
-    add_plane_row<-1>(above + i, middle, s);
-    add_plane_row<0>(centers + i, middle, s);
-    add_plane_row<1>(below + i, middle, s);
-    add_plane_row<2>(lowest + i, middle, s);
+    add_row_at(highest + i, middle, -2, s);
+    add_row_at(above + i, middle, -1, s);
+    add_row_at(centers + i, middle, 0, s);
+    add_row_at(below + i, middle, 1, s);
+    add_row_at(lowest + i, middle, 2, s);
     sums[0][i] = s.one, sums[1][i] = s.u, sums[2][i] = s.v, sums[3][i] = s.uu, sums[4][i] = s.uv;
     sums[5][i] = s.vv, sums[6][i] = s.q, sums[7][i] = s.qu, sums[8][i] = s.qv, sums[9][i] = s.qq;
   }
-  const float whole = whole_plane_window();
   const float row = static_cast<float>(v);
   SPS_SIMD for (int i = 0; i < kPixelLanes; ++i) {
     const PlaneSums s{sums[0][i], sums[1][i], sums[2][i], sums[3][i], sums[4][i],
                       sums[5][i], sums[6][i], sums[7][i], sums[8][i], sums[9][i]};
-    const MeasuredPlane plane = fit_plane(s, camera, noise, static_cast<float>(first + i), row, centers[i], whole);
+    const MeasuredPlane plane = fit_plane(s, camera, whole, own, static_cast<float>(first + i), row, centers[i]);
     out[0][i] = plane.normal.x;
     out[1][i] = plane.normal.y;
     out[2][i] = plane.normal.z;

@@ -1,6 +1,7 @@
 #include "launch/tsdf.h"
 
 #include <algorithm>
+#include <cstring>
 
 #include "cpu/plane_lanes.h"
 
@@ -140,22 +141,39 @@ struct ColoredVoxels {
   }
 };
 
+// Distances of the voxels of a slice from the planes of their pixels, and of these from the camera, 0 where there is
+// none; returns whether a voxel has a plane that it lies before, or at most `reach` behind.
+bool measure_slice(const VoxelSlice& at, const PlaneFrame& frame, float reach, float* distance, float* from_camera) {
+  static constexpr float kNothing[4] = {};
+  // Normal and distance are copied as one vector: gathers of vectors are slower on many processors.
+  alignas(64) float planes[4 * kVoxelLanes];
+  for (int m = 0; m < kVoxelLanes; ++m) {
+    const std::int64_t pixel = at.pixels[m];
+    std::memcpy(planes + 4 * m, pixel < 0 ? kNothing : frame.planes + kPlaneSize * pixel, sizeof kNothing);
+  }
+  std::int32_t any = 0;
+#pragma omp simd reduction(| : any)
+  for (int m = 0; m < kVoxelLanes; ++m) {
+    const MeasuredPlane plane{{planes[4 * m], planes[4 * m + 1], planes[4 * m + 2]}, planes[4 * m + 3], 1.0f};
+    const float own = plane_distance(plane, {at.x[m], at.y[m], at.z[m]}), away = planes[4 * m + 3];
+    const std::int32_t near = (own > -reach) & (away > 0.0f) ? 1 : 0;
+    distance[m] = own;
+    from_camera[m] = away;
+    any |= near;
+  }
+  return any != 0;
+}
+
 // Adds a frame to the distances of slice i of a block; its voxels that take a color are appended. No truncation there
 // is larger than `reach`.
 void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const VoxelSlice& at, const PlaneFrame& frame,
                      const TsdfOptions& options, float reach, ColoredVoxels& colored_voxels) {
-  PlaneLanes<kVoxelLanes> planes;
-  planes.load(frame.planes, [&](int m) { return at.pixels[m]; });
-  alignas(64) float distance[kVoxelLanes];
-  const TsdfOptions seen_with = options;
-  float most = 0.0f;
-#pragma omp simd reduction(max : most)
+  alignas(64) float distance[kVoxelLanes], from_camera[kVoxelLanes], plane_weight[kVoxelLanes];
+  if (!measure_slice(at, frame, reach, distance, from_camera)) return;
   for (int m = 0; m < kVoxelLanes; ++m) {
-    distance[m] = plane_distance(planes[m], {at.x[m], at.y[m], at.z[m]});
-    const float near = distance[m] > -reach ? planes.weight[m] : 0.0f;
-    most = near > most ? near : most;
+    plane_weight[m] = at.pixels[m] < 0 ? 0.0f : frame.planes[kPlaneSize * std::int64_t{at.pixels[m]} + 4];
   }
-  if (!(most > 0.0f)) return;
+  const TsdfOptions seen_with = options;
   const float voxel_size = blocks.voxel_size;
   const float* depth = at.z;
   alignas(64) float sdf[kVoxelLanes], weight[kVoxelLanes];
@@ -163,7 +181,8 @@ void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const Vo
   std::int32_t any = 0;
 #pragma omp simd reduction(| : any)
   for (int m = 0; m < kVoxelLanes; ++m) {
-    const TsdfObservation seen = observe_voxel(planes[m], distance[m], depth[m], voxel_size, seen_with);
+    const TsdfObservation seen =
+        observe_voxel(from_camera[m], plane_weight[m], distance[m], depth[m], voxel_size, seen_with);
     const float seen_sdf = seen.sdf, seen_weight = seen.weight;
     const std::int32_t colored = takes_color(seen_weight, distance[m], voxel_size);
     sdf[m] = seen_sdf;
@@ -177,7 +196,7 @@ void integrate_slice(const TsdfBlocks& blocks, std::int64_t row, int i, const Vo
     update_voxel({sdf[m], weight[m]}, seen_with.max_weight, to_sdf[m], to_weight[m]);
   }
   if (!any || !frame.colors) return;
-  colored_voxels.append(i, at, planes.weight, takes, frame, blocks.colors + kTsdfColorSize * kTsdfBlockVoxels * row);
+  colored_voxels.append(i, at, plane_weight, takes, frame, blocks.colors + kTsdfColorSize * kTsdfBlockVoxels * row);
 }
 
 // Adds a frame to a block.

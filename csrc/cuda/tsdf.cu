@@ -80,7 +80,8 @@ __global__ void __launch_bounds__(kIntegrateThreads)
       if (pixel < 0) continue;
       const MeasuredPlane plane = load_plane(frame.planes + static_cast<std::int64_t>(kPlaneSize) * pixel);
       const float distance = plane_distance(plane, at);
-      const TsdfObservation seen = observe_voxel(plane, distance, at.z, blocks.voxel_size, options);
+      const TsdfObservation seen =
+          observe_voxel(plane.distance, plane.weight, distance, at.z, blocks.voxel_size, options);
       if (!(seen.weight > 0.0f)) continue;
       const std::int64_t place = kTsdfBlockVoxels * row + m;
       update_voxel(seen, options.max_weight, blocks.sdf[place], blocks.weights[place]);
@@ -100,20 +101,20 @@ void measure_planes<Cuda>(Cuda device, const DepthImage& image, const PlaneNoise
     const std::int32_t u = static_cast<std::int32_t>(i % image.width), v = static_cast<std::int32_t>(i / image.width);
     const auto inverse_at = [&](int du, int dv) {
       const bool inside = u + du >= 0 && v + dv >= 0 && u + du < image.width && v + dv < image.height;
-      return inside ? inverse_depth(image.depth[i + static_cast<std::int64_t>(dv) * image.width + du]) : 0.0f;
+      return inside ? inverse_depth(image.depth[i + static_cast<std::int64_t>(dv) * image.width + du])
+                    : kUnknownInverse;
     };
     const float center = inverse_at(0, 0);
-    const PlaneMiddle middle =
-        plane_middle(noise, image.camera, center, one_sided_slope(inverse_at(-1, 0), center, inverse_at(1, 0)),
-                     one_sided_slope(inverse_at(0, -1), center, inverse_at(0, 1)));
+    const PlaneMiddle middle = plane_middle(own_noise(noise), image.camera, center,
+                                            one_sided_slope(inverse_at(-1, 0), center, inverse_at(1, 0)),
+                                            one_sided_slope(inverse_at(0, -1), center, inverse_at(0, 1)));
     PlaneSums sums{};
-    for (int dv = -kPlaneRadius; dv <= kPlaneRadius; ++dv) {
-      for (int du = -kPlaneRadius; du <= kPlaneRadius; ++du) {
-        add_plane_sample(inverse_at(du, dv), middle, du, dv, plane_window_weight(du, dv), sums);
-      }
+    SPS_UNROLL for (int dv = -kPlaneRadius; dv <= kPlaneRadius; ++dv) {
+      add_plane_row(middle, dv, inverse_at(-2, dv), inverse_at(-1, dv), inverse_at(0, dv), inverse_at(1, dv),
+                    inverse_at(2, dv), sums);
     }
-    const MeasuredPlane plane = fit_plane(sums, image.camera, noise, static_cast<float>(u), static_cast<float>(v),
-                                          center, whole_plane_window());
+    const MeasuredPlane plane = fit_plane(sums, image.camera, noise.depth, own_noise(noise), static_cast<float>(u),
+                                          static_cast<float>(v), center);
     store_plane(plane, planes + kPlaneSize * i);
   });
 }

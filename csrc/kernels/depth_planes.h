@@ -7,6 +7,7 @@
 #include <cstdint>
 
 #include "core/macros.h"
+#include "core/math.h"
 #include "core/vec.h"
 #include "kernels/depth_noise.h"
 #include "spslam/tsdf.h"
@@ -42,17 +43,17 @@ struct PlaneSums {
 };
 constexpr int kPlaneSums = 10;
 
-// The middle of a window: its inverse depth, a first guess of the slopes (1/m per px), and one over the gate.
+// The middle of a window: its inverse depth, one over the gate, and a first guess of the slopes, in gates per px.
 struct PlaneMiddle {
   float q, by_u, by_v, inverse_gate;
 };
 
 // Of a pixel at an offset in the window.
-SPS_INLINE float plane_window_weight(int du, int dv) {
+SPS_INLINE constexpr float plane_window_weight(int du, int dv) {
   return 1.0f / (1.0f + 0.15f * static_cast<float>(du * du + dv * dv));
 }
 
-SPS_INLINE float whole_plane_window() {
+SPS_INLINE constexpr float whole_plane_window() {
   float whole = 0.0f;
   for (int dv = -kPlaneRadius; dv <= kPlaneRadius; ++dv) {
     for (int du = -kPlaneRadius; du <= kPlaneRadius; ++du) whole += plane_window_weight(du, dv);
@@ -65,10 +66,11 @@ SPS_INLINE DepthNoise own_noise(const PlaneNoise& noise) {
   return noise.is_shared ? DepthNoise{0.0f, 0.0f} : noise.depth;
 }
 
-// 1/m; 0 where depth is unknown.
+// 1/m; where depth is unknown, a number that is beyond the gate around any other.
+constexpr float kUnknownInverse = -1e15f;
 SPS_INLINE float inverse_depth(float depth) {
   constexpr float kNearest = 1e-3f, kFarthest = 1e6f;
-  return (depth > kNearest) & (depth < kFarthest) ? 1.0f / depth : 0.0f;
+  return (depth > kNearest) & (depth < kFarthest) ? 1.0f / depth : kUnknownInverse;
 }
 
 // Slope along one axis: the smaller one of the differences to both neighbors, as an edge lies on one side at most.
@@ -78,34 +80,55 @@ SPS_INLINE float one_sided_slope(float before, float middle, float after) {
   return take_backward ? backward : after > 0.0f ? forward : 0.0f;
 }
 
-SPS_INLINE PlaneMiddle plane_middle(const PlaneNoise& noise, const Intrinsics& camera, float q, float by_u,
+SPS_INLINE PlaneMiddle plane_middle(const DepthNoise& own_noise, const Intrinsics& camera, float q, float by_u,
                                     float by_v) {
   const float safe = q > 0.0f ? q : 1.0f;
-  const float deviation = std::sqrt(depth_variance(own_noise(noise), 1.0f / safe)) * safe;
+  const float deviation = std::sqrt(depth_variance(own_noise, 1.0f / safe)) * safe;
   const float wide = kPlaneGateDeviations * deviation;
-  const float steepest_u = kSteepest * safe / camera.fx, steepest_v = kSteepest * safe / camera.fy;
+  const float steepest_u = kSteepest / camera.fx * safe, steepest_v = kSteepest / camera.fy * safe;
   const bool surface_u = std::fabs(by_u) < steepest_u, surface_v = std::fabs(by_v) < steepest_v;
-  return {q, surface_u ? by_u : 0.0f, surface_v ? by_v : 0.0f, 1.0f / ((kPlaneGate + wide) * safe)};
+  const float inverse_gate = 1.0f / ((kPlaneGate + wide) * safe);
+  return {q, surface_u ? by_u * inverse_gate : 0.0f, surface_v ? by_v * inverse_gate : 0.0f, inverse_gate};
 }
 
-// Adds a pixel of the window, weighted by Tukey's biweight of its distance from the plane through the middle.
-SPS_INLINE void add_plane_sample(float q, const PlaneMiddle& middle, int du, int dv, float window_weight,
-                                 PlaneSums& sums) {
-  const float u = static_cast<float>(du), v = static_cast<float>(dv);
+// A pixel of the window: its weight, by Tukey's biweight of its distance from the plane through the middle, and the
+// difference of its inverse depth to the middle's, times the weight, and times its square.
+struct PlaneSample {
+  float one, q, qq;
+};
+
+SPS_INLINE PlaneSample plane_sample(float q, const PlaneMiddle& middle, int du, int dv) {
   const float difference = q - middle.q;
-  const float share = (difference - middle.by_u * u - middle.by_v * v) * middle.inverse_gate;
-  const float closeness = 1.0f - share * share;
-  const float weight = (closeness > 0.0f) & (q > 0.0f) ? closeness * closeness * window_weight : 0.0f;
-  sums.one += weight;
-  sums.u += weight * u;
-  sums.v += weight * v;
-  sums.uu += weight * (u * u);
-  sums.uv += weight * (u * v);
-  sums.vv += weight * (v * v);
-  sums.q += weight * difference;
-  sums.qu += weight * difference * u;
-  sums.qv += weight * difference * v;
-  sums.qq += weight * difference * difference;
+  const float slope = middle.by_u * static_cast<float>(du) + middle.by_v * static_cast<float>(dv);
+  const float share = difference * middle.inverse_gate - slope;
+  const float closeness = larger(1.0f - share * share, 0.0f);
+  const float weight = closeness * closeness * plane_window_weight(du, dv);
+  return {weight, weight * difference, weight * difference * difference};
+}
+
+// Adds the row of a window that lies `dv` pixels below its middle: the pixels at u - 2 to u + 2. Pairs on both sides of
+// the middle have the same factors.
+SPS_INLINE void add_plane_row(const PlaneMiddle& middle, int dv, float q_left2, float q_left, float q_own,
+                              float q_right, float q_right2, PlaneSums& sums) {
+  static_assert(kPlaneRadius == 2, "the window's columns are written out");
+  const PlaneSample own = plane_sample(q_own, middle, 0, dv);
+  const PlaneSample left = plane_sample(q_left, middle, -1, dv), right = plane_sample(q_right, middle, 1, dv);
+  const PlaneSample left2 = plane_sample(q_left2, middle, -2, dv), right2 = plane_sample(q_right2, middle, 2, dv);
+  const float near = right.one + left.one, far = right2.one + left2.one;
+  const float one = own.one + (near + far);
+  const float u = (right.one - left.one) + 2.0f * (right2.one - left2.one);
+  const float q = own.q + ((right.q + left.q) + (right2.q + left2.q));
+  const float v = static_cast<float>(dv);
+  sums.one += one;
+  sums.u += u;
+  sums.v += v * one;
+  sums.uu += near + 4.0f * far;
+  sums.uv += v * u;
+  sums.vv += v * v * one;
+  sums.q += q;
+  sums.qu += (right.q - left.q) + 2.0f * (right2.q - left2.q);
+  sums.qv += v * q;
+  sums.qq += own.qq + ((right.qq + left.qq) + (right2.qq + left2.qq));
 }
 
 // How much a plane at a depth (m) counts, of 1 without noise.
@@ -118,20 +141,22 @@ struct MeasuredPlane {
   float distance, weight;
 };
 
-// The plane of a pixel (u, v) from its window's sums; all 0 where there is none.
-SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera, const PlaneNoise& noise, float u,
-                                   float v, float center, float whole_window) {
+// The plane of a pixel (u, v) from its window's sums; all 0 where there is none. `own_noise` is that of `noise` which
+// differs from neighbor to neighbor.
+SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera, const DepthNoise& noise,
+                                   const DepthNoise& own_noise, float u, float v, float center) {
+  constexpr float kInverseWindow = 1.0f / whole_plane_window();
   const float scale = s.one > 0.0f ? 1.0f / s.one : 0.0f;
   const float mu = s.u * scale, mv = s.v * scale, mq = s.q * scale;
   const float uu = s.uu * scale - mu * mu + kSlopePrior, vv = s.vv * scale - mv * mv + kSlopePrior;
   const float uv = s.uv * scale - mu * mv, qu = s.qu * scale - mq * mu, qv = s.qv * scale - mq * mv;
   const float inverse_determinant = 1.0f / (uu * vv - uv * uv);
   const float by_u = (qu * vv - qv * uv) * inverse_determinant, by_v = (qv * uu - qu * uv) * inverse_determinant;
-  const float support = s.one / whole_window;
-  const float over = (support - kLeastSupport) / (kFullSupport - kLeastSupport);
+  const float support = s.one * kInverseWindow;
+  const float over = (support - kLeastSupport) * (1.0f / (kFullSupport - kLeastSupport));
   // How far the window is from flat, and the pixel from the plane, in variances of inverse depth.
   const float safe = center > 0.0f ? center : 1.0f;
-  const float noise_variance = depth_variance(own_noise(noise), 1.0f / safe) * (safe * safe) * (safe * safe);
+  const float noise_variance = depth_variance(own_noise, 1.0f / safe) * (safe * safe) * (safe * safe);
   const float moved = mq - by_u * mu - by_v * mv;
   const float spread = s.qq * scale - mq * mq - by_u * qu - by_v * qv;
   const float own = 0.5f * moved * moved;
@@ -140,12 +165,14 @@ SPS_INLINE MeasuredPlane fit_plane(const PlaneSums& s, const Intrinsics& camera,
   const float share = (over < 0.0f ? 0.0f : over < 1.0f ? over : 1.0f) * flat;
   const float q = center + share * moved;
   // The plane is m . x = 1 in camera axes.
-  const float x = (u - camera.cx) / camera.fx, y = (v - camera.cy) / camera.fy;
+  const float inverse_fx = 1.0f / camera.fx, inverse_fy = 1.0f / camera.fy;
+  const float x = (u - camera.cx) * inverse_fx, y = (v - camera.cy) * inverse_fy;
   const float mx = by_u * camera.fx, my = by_v * camera.fy, mz = q - mx * x - my * y;
-  const float distance = 1.0f / std::sqrt(mx * mx + my * my + mz * mz);
-  const float cosine = q * distance / std::sqrt(x * x + y * y + 1.0f);
+  const float ray = std::sqrt(x * x + y * y + 1.0f);
+  const float inverse = 1.0f / (std::sqrt(mx * mx + my * my + mz * mz) * ray);
+  const float distance = inverse * ray, cosine = q * inverse;
   const bool known = (center > 0.0f) & (q > 0.0f) & (support > kLeastSupport) & (cosine > kLeastCosine);
-  const float certainty = plane_certainty(noise.depth, 1.0f / (known ? q : 1.0f));
+  const float certainty = plane_certainty(noise, 1.0f / (known ? q : 1.0f));
   const float body = support * (1.0f / kFullWeightSupport);
   const float weight = certainty * cosine * (body < 1.0f ? body : 1.0f);
   return {{known ? mx * distance : 0.0f, known ? my * distance : 0.0f, known ? mz * distance : 0.0f},

@@ -172,29 +172,31 @@ SPS_INLINE float plane_distance(const MeasuredPlane& plane, const Vec3<float>& a
 // The weight of a plane for a voxel, more than its own for one that lies farther before it than the truncation. That it
 // is free is no less certain where what is seen through it is far and noisy: it weighs what a plane that the truncation
 // just reaches would. Else a few pixels on an edge outvote any number that see past it to a far wall.
-SPS_INLINE float weight_before(const MeasuredPlane& plane, float along, float depth, float truncation,
+SPS_INLINE float weight_before(float weight, float plane_distance, float along, float depth, float truncation,
                                const TsdfOptions& options) {
-  const float met = depth * plane.distance / along, farthest = plane.distance / kTouchCosine;
+  constexpr float kPerCosine = 1.0f / kTouchCosine;
+  const float met = depth * plane_distance / along, farthest = plane_distance * kPerCosine;
   const float seen = met < farthest ? met : farthest, nearest = depth + truncation;
-  const float ratio = plane_certainty(options.noise, nearest) / plane_certainty(options.noise, seen);
-  return plane.weight * ((along > 0.0f) & (seen > nearest) ? ratio : 1.0f);
+  const float more =
+      (kPoseVariance + depth_variance(options.noise, seen)) / (kPoseVariance + depth_variance(options.noise, nearest));
+  return weight * ((along > 0.0f) & (seen > nearest) ? more : 1.0f);
 }
 
-// Of a voxel at a depth and a distance from a plane, of which only distance and weight are used.
-SPS_INLINE TsdfObservation observe_voxel(const MeasuredPlane& plane, float distance, float depth, float voxel_size,
-                                         const TsdfOptions& options) {
+// Of a voxel at a depth and a distance from a plane that lies `plane_distance` from the camera and has a weight.
+SPS_INLINE TsdfObservation observe_voxel(float plane_distance, float plane_weight, float distance, float depth,
+                                         float voxel_size, const TsdfOptions& options) {
   const float deviation = std::sqrt(depth_variance(options.noise, depth));
   const float wanted = options.near_truncation + deviation;
   const float truncation = noisy_truncation(wanted < options.truncation ? wanted : options.truncation, deviation);
   // Its depth less the plane's on its ray is -distance depth / along.
-  const float along = plane.distance - distance;
+  const float along = plane_distance - distance;
   const bool close = (-kTouchCosine * distance * depth < truncation * along) | (distance > -kBesideVoxels * voxel_size);
   const bool near = (distance > -truncation) & close;
-  const float noisy = kFullWeightDeviations * deviation / truncation;
-  const float full = noisy < kMostFullWeight ? noisy : kMostFullWeight;
-  const float fall = (1.0f + distance / truncation) / (1.0f - full);
-  const float weight = weight_before(plane, along, depth, truncation, options) * (fall < 1.0f ? fall : 1.0f);
-  return {distance < truncation ? distance : truncation, (plane.weight > 0.0f) & near ? weight : 0.0f};
+  const float noisy = kFullWeightDeviations * deviation, most = kMostFullWeight * truncation;
+  const float fall = (truncation + distance) / (truncation - (noisy < most ? noisy : most));
+  const float weight = weight_before(plane_weight, plane_distance, along, depth, truncation, options);
+  return {distance < truncation ? distance : truncation,
+          (plane_weight > 0.0f) & near ? weight * (fall < 1.0f ? fall : 1.0f) : 0.0f};
 }
 
 // The running mean of a voxel's distances.

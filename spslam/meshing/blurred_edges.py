@@ -8,13 +8,14 @@ pass an edge within two pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import Readable
-from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, some_depths, surface_steps
+from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, summed_counts, surface_steps
 
 # Half the width of the ramps that are looked for, and how far beyond it depth must be flat again, px.
 _REACH, _BEYOND = 3, 2
@@ -37,13 +38,16 @@ def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -
         frames: of one sensor; those that can't be read don't count.
         noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
     """
-    blurred = edges = 0
-    for depth in some_depths(frames):
+
+    def count(depth: np.ndarray) -> np.ndarray:
+        counts = np.zeros(2, np.int64)
         for profile in _profiles(depth, noise):
             found = profile.middles() & profile.whole()
-            edges += int(found.sum())
-            blurred += int((found & ~profile.sharp()).sum())
-    return edges >= LEAST_EDGES and blurred > _BLURRED_SHARE * edges
+            counts += found.sum(), (found & ~profile.sharp()).sum()
+        return counts
+
+    edges, blurred = np.broadcast_to(summed_counts(frames, count), 2)
+    return bool(edges >= LEAST_EDGES and blurred > _BLURRED_SHARE * edges)
 
 
 def without_blurred_edges(depth: np.ndarray, noise: tuple[float, float]) -> np.ndarray:
@@ -88,33 +92,38 @@ class _Profiles:
 
     def narrow(self) -> np.ndarray:
         """Bool [H, W]: most of the change is near the middle."""
-        before, after = self._sides(_INNER)
-        return np.abs(after - before) >= _INNER_SHARE * self._change()
+        before, after = self._within(_INNER)
+        return np.abs(after - before) >= _INNER_SHARE * self._change
 
     def sharp(self) -> np.ndarray:
         """Bool [H, W]: two neighboring steps make nearly all of the change."""
         inner = self.around[_BEYOND:-_BEYOND]
-        return np.abs(inner[2:] - inner[:-2]).max(0) >= _SHARP * self._change()
+        return np.abs(inner[2:] - inner[:-2]).max(0) >= _SHARP * self._change
 
     def between(self) -> np.ndarray:
         """Bool [H, W]: pixels at an edge that are on neither side."""
-        before, after = self._sides()
+        before, after = self._sides
         middle = self.around[_REACH + _BEYOND]
         apart = np.minimum(np.abs(middle - before), np.abs(middle - after))
         return self._edge() & (apart > self.gate)
 
     def _edge(self) -> np.ndarray:
         """Whether there is one within reach, flat beyond. What is unknown is taken for flat: ramps end there too."""
-        before, after = self._sides()
-        most = _FLAT * _BEYOND / (2 * _REACH) * self._change()
+        before, after = self._sides
+        most = _FLAT * _BEYOND / (2 * _REACH) * self._change
         rising = (np.abs(self.around[0] - before) > most) | (np.abs(self.around[-1] - after) > most)
-        return (self._change() > EDGE * self.gate) & ~rising
+        return (self._change > EDGE * self.gate) & ~rising
 
+    @cached_property
     def _change(self) -> np.ndarray:
-        before, after = self._sides()
+        before, after = self._sides
         return np.abs(after - before)
 
-    def _sides(self, reach: int = _REACH) -> tuple[np.ndarray, np.ndarray]:
+    @cached_property
+    def _sides(self) -> tuple[np.ndarray, np.ndarray]:
+        return self._within(_REACH)
+
+    def _within(self, reach: int) -> tuple[np.ndarray, np.ndarray]:
         """The farthest known pixels within reach before and after each one, or the pixel itself."""
         middle = _REACH + _BEYOND
         before = after = self.around[middle]

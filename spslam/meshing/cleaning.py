@@ -13,7 +13,7 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.meshing.mesh import face_components, face_normals
+from spslam.meshing.mesh import compact, face_components, face_normals
 from spslam.scene import SparseVolume
 
 # More views than this add nothing, as neighboring views see the same surface.
@@ -82,23 +82,27 @@ def front_facing_in_view(
     if len(poses) == 0:
         raise ValueError("front_facing_in_view: poses must have at least one finite pose, got none")
     views = poses[np.unique(np.linspace(0, len(poses) - 1, min(MAX_VIEWS, len(poses))).round().astype(int))]
-    front_facing = np.zeros(len(vertices), dtype=bool)
+    faces, used = compact(faces, len(vertices))
+    points, normals = (np.ascontiguousarray(each[used].T) for each in (vertices, normals))
+    front_facing = np.zeros(len(used), dtype=bool)
     for pose in views:
         remaining = np.flatnonzero(~front_facing)
-        front_facing[remaining] = _vertices_front_facing(vertices[remaining], normals[remaining], camera, pose)
+        front_facing[remaining] = _front_facing(points[:, remaining], normals[:, remaining], camera, pose)
     for _ in range(_RINGS):
         front_facing[faces[front_facing[faces].any(1)]] = True
     return front_facing[faces].any(1)
 
 
-def _vertices_front_facing(points: np.ndarray, normals: np.ndarray, camera: Camera, pose: np.ndarray) -> np.ndarray:
+def _front_facing(points: np.ndarray, normals: np.ndarray, camera: Camera, pose: np.ndarray) -> np.ndarray:
+    """Bool [N] of points and normals [3, N]."""
     rotation, center = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
-    rays = points - center
-    x, y, z = (rays @ rotation).T
+    rays = points - center[:, None]
+    # Not @: for such thin products BLAS would start threads on all cores.
+    x, y, z = (axis[0] * rays[0] + axis[1] * rays[1] + axis[2] * rays[2] for axis in rotation.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     in_view = (z > 0) & (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
-    return in_view & (np.einsum("ij,ij->i", rays, normals) < 0)
+    return in_view & (rays[0] * normals[0] + rays[1] * normals[1] + rays[2] * normals[2] < 0)
 
 
 def in_large_component(vertices: np.ndarray, faces: np.ndarray, min_area_m2: float) -> np.ndarray:

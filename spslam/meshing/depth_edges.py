@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from spslam.datasets.base import RgbdFrame
-from spslam.datasets.prefetch import Readable
+from spslam.datasets.prefetch import Readable, prefetch
 from spslam.errors import DatasetError
+from spslam.meshing.reading import reading_threads
 
 # Inverse depth of one surface differs by less than this share of it and so many deviations of the noise, as in
 # `ops.measure_planes`; at an edge it differs by so many times as much.
@@ -18,13 +20,34 @@ _FRAMES, LEAST_EDGES = 8, 100
 _NEAREST_M = 1e-3
 
 
-def some_depths(frames: Readable[RgbdFrame]) -> Iterator[np.ndarray]:
-    """Depth images float32 [H, W], m, of a few frames spread over a recording, without those that can't be read."""
-    for position in np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]:
-        try:
-            yield frames[int(position)].depth
-        except DatasetError:
-            continue
+def summed_counts(frames: Readable[RgbdFrame], count: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """What is counted in the depth images of a few frames spread over a recording, without those that can't be read.
+
+    Args:
+        frames: of one sensor.
+        count: integers [N] of a depth image float32 [H, W], m; called on threads.
+
+    Returns:
+        int64 [N], the sums; [0] without any frame.
+    """
+    positions = np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]
+    with prefetch(_Counts(frames, positions, count), *reading_threads()) as counts:
+        return sum((each for each in counts if not isinstance(each, DatasetError)), start=np.zeros(1, np.int64))
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """What is counted in each of some frames, worked out on the threads that read."""
+
+    frames: Readable[RgbdFrame]
+    positions: np.ndarray
+    count: Callable[[np.ndarray], np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return self.count(self.frames[int(self.positions[index])].depth)
 
 
 def surface_steps(depth: np.ndarray, noise: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

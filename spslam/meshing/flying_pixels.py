@@ -12,7 +12,7 @@ import numpy as np
 
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import Readable
-from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, some_depths, surface_steps
+from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, summed_counts, surface_steps
 
 # Before and after a pixel: the nearest ones that may lie on the two surfaces, px. Two pixels side by side may be mixed.
 _SIDES = ((-1, 1), (-1, 2), (-2, 1))
@@ -31,12 +31,15 @@ def has_flying_pixels(frames: Readable[RgbdFrame], noise: tuple[float, float]) -
         frames: of one sensor; those that can't be read don't count.
         noise: as of `flying_pixels`.
     """
-    flying = sharp = 0
-    for depth in some_depths(frames):
+
+    def count(depth: np.ndarray) -> np.ndarray:
+        counts = np.zeros(2, np.int64)
         for steps in _both_ways(depth, noise):
-            sharp += _crossings(*steps, 0)
-            flying += sum(_crossings(*steps, width) for width in (1, 2))
-    return flying + sharp >= LEAST_EDGES and flying > _FLYING_SHARE * (flying + sharp)
+            counts += _crossings(*steps, 0), sum(_crossings(*steps, width) for width in (1, 2))
+        return counts
+
+    sharp, flying = np.broadcast_to(summed_counts(frames, count), 2)
+    return bool(flying + sharp >= LEAST_EDGES and flying > _FLYING_SHARE * (flying + sharp))
 
 
 def flying_pixels(depth: np.ndarray, noise: tuple[float, float]) -> np.ndarray:

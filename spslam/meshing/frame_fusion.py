@@ -6,6 +6,7 @@ import enum
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
+from spslam.meshing.reading import reading_threads
 from spslam.meshing.sdf_sampling import near_surface
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
@@ -33,7 +35,6 @@ NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
 RAMP_WEIGHT = 0.01
 # Of a flying pixel, likewise. It is another point in every frame, so that a tenth is enough; with less, landings go.
 FLYING_WEIGHT = 0.1
-_WORKERS, _AHEAD = 2, 4
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class PosedFrames:
 
     def read(self) -> Iterator[tuple[RgbdFrame, np.ndarray]]:
         """Frames and poses in order, read ahead by threads; frames that can't be read are left out."""
-        with prefetch(self, _WORKERS, _AHEAD) as frames:
+        with prefetch(self, *reading_threads()) as frames:
             for frame, pose in zip(frames, self.poses, strict=True):
                 if not isinstance(frame, DatasetError):
                     yield frame, pose
@@ -147,7 +148,7 @@ def fuse_frames(
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
             for part, kind in zip(parts, edges, strict=True):
-                _fuse_part(volume, part, part.noise or options.noise, kind)
+                _fuse_part(volume, _EdgeImages(part, part.noise or options.noise, kind))
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -184,26 +185,59 @@ def surface_cells(scene: Scene) -> torch.Tensor:
     return near_surface(cells, volume.voxel_size_m, sdf, MAX_SLOPE, CHUNK_POINTS)
 
 
-def _fuse_part(volume: ops.TsdfVolume, part: PosedFrames, noise: tuple[float, float], edges: _EdgeKind) -> None:
-    """Fuses the frames of one dataset, whose edges are of a kind."""
-    camera, device = part.dataset.camera, volume.sdf.device
-    intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
-    if edges is _EdgeKind.BLURRED:
-        for frame, pose in part.read():
-            depth, kept = (_on(image, device) for image in (frame.depth, without_blurred_edges(frame.depth, noise)))
-            volume.make_room(_ramps(depth, kept, intrinsics, noise), _pose7(pose, device), intrinsics, noise)
-    for frame, pose in part.read():
-        depth = _on(frame.depth, device)
-        if edges is _EdgeKind.BLURRED:
-            kept = _on(without_blurred_edges(frame.depth, noise), device)
+@dataclass(frozen=True)
+class _EdgeImages:
+    """Frames with what lies between two surfaces in them, found on the threads that read.
+
+    Attributes:
+        part: the frames.
+        noise: of their depth.
+        edges: of what kind they are.
+    """
+
+    part: PosedFrames
+    noise: tuple[float, float]
+    edges: _EdgeKind
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __getitem__(self, position: int) -> tuple[RgbdFrame, Any]:
+        """A frame, and depth without ramps, float32 [H, W], or which pixels are flying, bool [H, W]."""
+        frame = self.part[position]
+        if self.edges is _EdgeKind.BLURRED:
+            return frame, without_blurred_edges(frame.depth, self.noise)
+        return frame, flying_pixels(frame.depth, self.noise) if self.edges is _EdgeKind.FLYING else None
+
+    def read(self) -> Iterator[tuple[int, RgbdFrame, Any]]:
+        """Positions, frames and their edges in order; frames that can't be read are left out."""
+        with prefetch(self, *reading_threads()) as images:
+            for position, image in enumerate(images):
+                if not isinstance(image, DatasetError):
+                    yield position, *image
+
+
+def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages) -> None:
+    """Fuses the frames of one dataset."""
+    device, intrinsics, noise = volume.sdf.device, frame_intrinsics(images.part), images.noise
+    poses = images.part.poses
+    if images.edges is _EdgeKind.BLURRED:
+        for position, frame, kept in images.read():
+            ramps = _ramps(on_device(frame.depth, device), on_device(kept, device), intrinsics, noise)
+            volume.make_room(ramps, pose7_on(poses[position], device), intrinsics, noise)
+    for position, frame, found in images.read():
+        depth = on_device(frame.depth, device)
+        if images.edges is _EdgeKind.BLURRED:
+            kept = on_device(found, device)
             # Smoothed depth: neighbors have the same noise.
             planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
             planes += _ramps(depth, kept, intrinsics, noise)
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
-            if edges is _EdgeKind.FLYING:
-                planes[..., 4][_on(flying_pixels(frame.depth, noise), device)] *= FLYING_WEIGHT
-        volume.integrate_planes(planes, _pose7(pose, device), intrinsics, _on(frame.color, device), noise)
+            if images.edges is _EdgeKind.FLYING:
+                planes[..., 4][on_device(found, device)] *= FLYING_WEIGHT
+        color = on_device(frame.color, device)
+        volume.integrate_planes(planes, pose7_on(poses[position], device), intrinsics, color, noise)
 
 
 def _ramps(
@@ -216,9 +250,17 @@ def _ramps(
     return ramps
 
 
-def _on(image: np.ndarray, device: torch.device) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image)).to(device)
+def frame_intrinsics(part: PosedFrames) -> ops.Intrinsics:
+    """The camera of a part's frames."""
+    camera = part.dataset.camera
+    return ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def _pose7(pose: np.ndarray, device: torch.device) -> torch.Tensor:
+def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """An array as a tensor, of the same memory on the CPU where it is contiguous."""
+    return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+
+
+def pose7_on(pose: np.ndarray, device: torch.device) -> torch.Tensor:
+    """T_world_camera [4, 4] as float32 [7]: unit quaternion (w, x, y, z) and translation."""
     return torch.from_numpy(matrix_to_pose7(pose)).to(device, torch.float32)

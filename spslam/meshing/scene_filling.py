@@ -46,7 +46,7 @@ class _SceneFilling:
     def __init__(self, volume: ops.TsdfVolume, scene: Scene):
         self._volume, self._scene = volume, scene
         axes = [torch.arange(BLOCK_SIDE, device=volume.sdf.device)] * 3
-        self._offsets = torch.cartesian_prod(*axes)
+        self._offsets = torch.cartesian_prod(*axes).int()
 
     def no_differences(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Sums and counts, int64 [V], for each of the map's vertices."""
@@ -58,23 +58,24 @@ class _SceneFilling:
     ) -> None:
         """Adds, to the vertices of the cells around measured voxels, how far they are from the map."""
         size = self._volume.voxel_size
-        near = values.abs() < _NEAR_VOXELS * size
-        points = self._points(rows)[near]
+        near = _places(values.abs() < _NEAR_VOXELS * size)
+        points = self._points(rows, near)
         distance, known = self._distances(points)
         difference = values[near] - distance
         known &= difference.abs() < _MOST_DIFFERENCE_VOXELS * size
-        corner_ids, _, _ = self._scene.volume.lookup(points[known])
-        units = (difference[known] / _UNIT_M).round().long()
-        for corner in range(corner_ids.shape[1]):
-            ids = corner_ids[:, corner].long()
-            inside = ids >= 0
-            sums.index_add_(0, ids[inside], units[inside])
-            counts.index_add_(0, ids[inside], torch.ones_like(units[inside]))
+        agreeing = known.nonzero()[:, 0]
+        corner_ids, _, _ = self._scene.volume.lookup(points[agreeing])
+        units = (difference[agreeing] / _UNIT_M).round().long()
+        ids = corner_ids.long().flatten()
+        inside = (ids >= 0).nonzero()[:, 0]
+        ids = ids[inside]
+        sums.index_add_(0, ids, units.repeat_interleave(corner_ids.shape[1])[inside])
+        counts.index_add_(0, ids, torch.ones_like(ids))
 
     def fill(self, rows: torch.Tensor, values: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
         """The values with the map's, moved by `shift` float32 [V] at its vertices, where they are NaN."""
-        unknown = values.isnan()
-        points = self._points(rows)[unknown]
+        unknown = _places(values.isnan())
+        points = self._points(rows, unknown)
         distance, known = self._distances(points)
         corner_ids, local, _ = self._scene.volume.lookup(points)
         moved = distance + ops.trilinear_interpolate(shift[:, None], corner_ids, local)[:, 0]
@@ -82,11 +83,19 @@ class _SceneFilling:
         filled[unknown] = torch.where(known, moved, torch.nan)
         return filled
 
-    def _points(self, rows: torch.Tensor) -> torch.Tensor:
-        """World points float32 [n, 512, 3] of the voxels of blocks."""
-        voxels = self._volume.block_coords[rows][:, None] * BLOCK_SIDE + self._offsets
-        return voxels.float() * self._volume.voxel_size
+    def _points(self, rows: torch.Tensor, places: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        """World points float32 [N, 3] of voxels: places among the rows, and in the blocks."""
+        block, voxel = places
+        return (self._volume.block_coords[rows[block]] * BLOCK_SIDE + self._offsets[voxel]).float() * (
+            self._volume.voxel_size
+        )
 
     def _distances(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         values, known = self._scene.sdf(points)
         return values * self._scene.settings.truncation_m, known
+
+
+def _places(mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows and columns, int64 [N] each, where a mask is set; as an index they are faster than the mask."""
+    rows, columns = mask.nonzero().unbind(1)
+    return rows, columns

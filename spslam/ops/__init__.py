@@ -43,6 +43,7 @@ from spslam.ops.render_step import RayBatch, RenderOptions, RenderStep, SceneGra
 from spslam.ops.rolling_shutter import ShutterMotion, rectify_shutter_images_, rectify_shutter_records_
 from spslam.ops.scene_query import query_color, query_sdf, query_sdf_gradient
 from spslam.ops.scene_view import Intrinsics, SceneView
+from spslam.ops.seen_points import SurfacePoints, add_color_detail_, add_seen_colors_, see_points
 from spslam.ops.sensor_noise import SensorNoise, measure_noise_
 from spslam.ops.track_adam import track_adam
 from spslam.ops.tsdf import tsdf_integrate_, tsdf_query, tsdf_ray_cast, tsdf_touched_blocks
@@ -94,12 +95,15 @@ __all__ = [
     "SensorNoise",
     "ShutterMotion",
     "Sine",
+    "SurfacePoints",
     "TriPlaneLevels",
     "TsdfVolume",
     "VolumeBuffers",
     "VolumeLevels",
     "VoxelHash",
     "VoxelLimitError",
+    "add_color_detail_",
+    "add_seen_colors_",
     "align_depth_images",
     "alpha_composite",
     "bilinear_interpolate",
@@ -143,6 +147,7 @@ __all__ = [
     "sample_along_rays",
     "sample_frame_pixels",
     "sample_indices",
+    "see_points",
     "select_covisible_frames",
     "set_num_threads",
     "solve_normal_equations",

@@ -22,6 +22,7 @@ from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
 from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.options import MeshOptions
+from spslam.run.threads import library_threads_limited
 from spslam.scene import Scene
 from spslam.trajectory import Trajectory
 
@@ -131,7 +132,8 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     """The mesh of the frames, and figures. If it is to have a texture, its vertices have the voxels' colors."""
     frames, noise = frames_of(job, dataset), job.noise or DEFAULT_NOISE
     fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, noise)
-    volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
+    with library_threads_limited():
+        volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
     mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job))
     figures = {
         "mesh_source": "tsdf",
@@ -142,7 +144,8 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     del volume  # the largest of what is held, not needed for colors
     if job.texture is None:
         options = ColorOptions(noise, job.options.color_subdivisions)
-        mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options)
+        with library_threads_limited():
+            mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options, job.scene.device)
     return mesh, figures
 
 

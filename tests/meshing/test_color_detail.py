@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from spslam import ops
 from spslam.meshing.color_detail import ColorOptions, color_mesh, thinned
 from spslam.meshing.render import render_colors
 from spslam.meshing.subdivision import mesh_edges
 from spslam.meshing.texture.views import read_views
-from spslam.meshing.visible_points import SurfacePoints
+from spslam.meshing.visible_points import read_seen
 from tests.meshing.painted import CAMERA, FLOOR, GRAY, NOISE, RED, SIGN, WALL, frames, mesh_of, pattern
 
 STEP_M, SQUARE_M = 0.08, 0.12
@@ -117,14 +119,14 @@ def test_what_stands_before_a_wall_does_not_color_it(without_depth):
 def test_seen_points_are_those_that_no_rectangle_hides():
     scene = WALL, FLOOR, SIGN
     mesh = mesh_of(*scene, step_m=0.02)
-    surface = SurfacePoints(mesh.vertices, mesh.normals)
-    for view in read_views([frames(*scene)], NOISE):
-        seen = surface.seen_by(view)
-        assert (np.diff(seen.ids) > 0).all() and (seen.weights > 0).all()
+    surface = ops.SurfacePoints.of(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.normals))
+    views = frames(*scene)
+    for view, (_, weights) in zip(read_views([views], NOISE), read_seen(surface, [views], NOISE), strict=True):
+        seen = weights.numpy() > 0
         wanted = plainly_seen(mesh, view, scene)
         wanted[mesh.vertices[:, 1] > 0.79] = -1  # between wall and floor
-        assert np.isin(np.flatnonzero(wanted == 1), seen.ids).mean() > 0.995
-        assert not (wanted[seen.ids] == 0).any()
+        assert seen[wanted == 1].mean() > 0.995
+        assert not seen[wanted == 0].any()
 
 
 def plainly_seen(mesh, view, rectangles):

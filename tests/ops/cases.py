@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam import ops
-from tests.ops import scene_cases, tsdf_cases
+from tests.ops import scene_cases, seen_points_cases, tsdf_cases
 from tests.ops.case_inputs import CAMERA, KEY, LAYOUT, SAMPLES, VOXEL, normal, on_device, random_coords, uniform
 from tests.ops.scenes import TRUNCATION
 
@@ -269,6 +269,9 @@ CASES = {
     "tsdf_integrate_": Case(tsdf_cases.integrate),
     "tsdf_query": Case(tsdf_cases.query),
     "tsdf_ray_cast": Case(tsdf_cases.ray_cast),
+    "see_points": Case(seen_points_cases.see),
+    "add_seen_colors_": Case(seen_points_cases.add_colors),
+    "add_color_detail_": Case(seen_points_cases.add_detail),
     "query_sdf": Case(scene_cases.scene_points),
     "query_sdf_gradient": Case(scene_cases.scene_points),
     "query_color": Case(scene_cases.scene_points),

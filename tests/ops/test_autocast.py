@@ -9,7 +9,7 @@ from tests.ops.cases import CASES, arguments
 
 LOWERED = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 # Changed in place, or of 16 bits by their meaning: not cast.
-AS_GIVEN = {"param", "grad", "exp_avg", "exp_avg_sq", "embeddings", "weights", "poses", "depth_thumbnails"}
+AS_GIVEN = {"param", "grad", "exp_avg", "exp_avg_sq", "embeddings", "weights", "sums", "poses", "depth_thumbnails"}
 
 
 def float_arguments(name, call):

@@ -15,8 +15,8 @@ from spslam.errors import DatasetError
 from spslam.geometry import inverse
 from spslam.meshing.frame_fusion import PosedFrames
 from spslam.meshing.mesh import TriangleMesh
+from spslam.meshing.reading import reading_threads
 
-_WORKERS, _AHEAD = 2, 4
 NEAREST_M = 0.05
 # A surface seen flatter than this is not taken: cosine of the angle of incidence.
 LEAST_COSINE = 0.15
@@ -76,7 +76,7 @@ def read_views(parts: Sequence[PosedFrames], noise: tuple[float, float]) -> Iter
     """All frames of all parts in order; those that can't be read are left out, the others keep their numbers."""
     first = 0
     for part in parts:
-        with prefetch(part, _WORKERS, _AHEAD) as frames:
+        with prefetch(part, *reading_threads()) as frames:
             for position, frame in enumerate(frames):
                 if not isinstance(frame, DatasetError):
                     camera, pose = part.dataset.camera, part.poses[position]
