@@ -250,6 +250,7 @@ CHECKPOINT = TensorSchema(
     {
         **_map_rules("scene."),
         "frames.poses": TensorRule(torch.float32, ("frames", 7)),
+        "frames.log_gains": TensorRule(torch.float32, ("frames", 1)),
         "frames.timestamps": TensorRule(torch.float64, ("frames",)),
         "frames.depth_times": TensorRule(torch.float64, ("frames",)),
         "frames.color_offsets": TensorRule(torch.float64, ("frames",)),
