@@ -72,6 +72,13 @@ class TrackedFrame:
         weight = self.fit.mean_robust_weight
         return -math.inf if math.isnan(weight) else weight
 
+    @property
+    def agreement(self) -> float:
+        """How well surface and, where colors are where depth is, image features agree with the pose: a gain of a tenth
+        of either counts alike."""
+        inliers = 1.0 if math.isnan(self.fit.feature_share) else self.fit.feature_inliers
+        return max(self.weight, 0.0) * inliers
+
     def is_same(self, other: "TrackedFrame") -> bool:
         """Whether another result is the same pose up to noise; waits for the device."""
         error_cm, error_deg = prediction_error(self.pose.tolist(), other.pose.tolist())
