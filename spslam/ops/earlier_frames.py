@@ -1,5 +1,6 @@
 """Earlier frames that `track_gauss_newton` compares a frame with, besides the map."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -94,8 +95,7 @@ class ColorTiming(NamedTuple):
         check_tensor(function, f"{name}.delay", self.delay, (1,), torch.float32, like=like)
         check(len(self.keyframes) == keyframes, function, name, f"have {keyframes} motions", len(self.keyframes))
         for motion in (self.frame, *self.keyframes):
-            check(motion.row < poses, function, name, "name poses that are there", motion)
-            _check_motion(function, name, motion)
+            _check_motion(function, name, motion, poses)
 
 
 class Exposure(NamedTuple):
@@ -185,6 +185,7 @@ class DepthKeyframes(NamedTuple):
         return [one for one in tensors if one is not None], scalars, [self.first_iteration, *frame, *places]
 
 
-def _check_motion(function: str, name: str, motion: FrameMotion) -> None:
-    check(motion.row < 0 or 1e-9 <= motion.seconds < 1e9, function, name, "name positive times", motion)
+def _check_motion(function: str, name: str, motion: FrameMotion, poses: float = math.inf) -> None:
+    fits = motion.row < 0 or (motion.row < poses and 1e-9 <= motion.seconds < 1e9)
+    check(fits, function, name, "name poses that are there and positive times", motion)
     check(abs(motion.color_offset) < 1e9, function, name, "have finite color offsets", motion)

@@ -257,7 +257,7 @@ def test_bad_exposures_are_named(generator):
             ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, OPTIONS, depth_keyframes=bad)
     for bad, message in (
         (reference._replace(log_gain=torch.zeros(2)), r"reference.log_gain must have shape \[1\]"),
-        (reference._replace(motion=ops.FrameMotion(0, 0.0)), "reference.motion must name positive times"),
+        (reference._replace(motion=ops.FrameMotion(0, 0.0)), "reference.motion must name poses that are there and positive times"),
     ):
         with pytest.raises((ValueError, TypeError), match=f"track_gauss_newton: {message}"):
             ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, OPTIONS, reference=bad)
