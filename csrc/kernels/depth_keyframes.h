@@ -130,8 +130,8 @@ SPS_INLINE Vec3<float> intensity_by_point(const DepthKeyframes& keyframes, const
   return {x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
 }
 
-// Adds the difference of intensities in meters, as many as the deviation of the sensor's noise is worth, to terms of the
-// pose and of the gain. `lever` is by how much the color's pose moves with a step of the frame's.
+// Adds the difference of intensities in meters, as many as the deviation of the sensor's noise is worth, to terms of
+// the pose and of the gain. `lever` is by how much the color's pose moves with a step of the frame's.
 template <class T>
 SPS_INLINE void add_keyframe_intensity(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
                                        const FrameProjection& at, const PixelNoise& noise, float width,
@@ -155,8 +155,8 @@ SPS_INLINE FrameProjection color_projection(const DepthKeyframes& keyframes, con
 }
 
 // Adds what a keyframe measured at a pixel's points to terms of type T: the distance from its surface, and where the
-// noise of intensities is known their difference, to `gain_terms` too; nothing where the point falls off the image or its surface is
-// unknown.
+// noise of intensities is known their difference, to `gain_terms` too; nothing where the point falls off the image or
+// its surface is unknown.
 template <class T>
 SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
                                             const PixelPoints& points, float kernel, const PixelNoise& noise,

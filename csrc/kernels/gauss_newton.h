@@ -87,8 +87,8 @@ SPS_INLINE PixelNoise noise_of(const Measurement& measure, const Pixel& pixel) {
 // Adds a point's residuals against every stride-th depth keyframe of the iteration, from `first` on.
 template <class T>
 SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const Pixel& pixel, const SurfacePoint& point,
-                                       const PixelNoise& noise, const MapResidual& map, int first, int stride,
-                                       T* terms, T* gain_terms) {
+                                       const PixelNoise& noise, const MapResidual& map, int first, int stride, T* terms,
+                                       T* gain_terms) {
   if (measure.num_keyframes == 0) return;
   const PixelPoints points = pixel_points(pixel, point, measure.frames->color, measure.options->intrinsics);
   for (int k = first; k < measure.num_keyframes; k += stride) {

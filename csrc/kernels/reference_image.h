@@ -48,9 +48,8 @@ SPS_INLINE void add_intensity_residual(const ReferenceImage& image, const Pose<f
   const float tolerance = kReferenceDepthAgreement * at.in_camera.z;
   const auto agrees = [&](const ReferenceCorner& c) { return std::fabs(c.depth - at.in_camera.z) < tolerance; };
   if (!(agrees(c00) && agrees(c01) && agrees(c10) && agrees(c11))) return;
-  const IntensityDifference difference =
-      scaled_difference(bilinear_value(c00.intensity, c01.intensity, c10.intensity, c11.intensity, at.a, at.b), scale,
-                        luma(pixel.color));
+  const IntensityDifference difference = scaled_difference(
+      bilinear_value(c00.intensity, c01.intensity, c10.intensity, c11.intensity, at.a, at.b), scale, luma(pixel.color));
   const float x = difference.by_u * image.intrinsics.fx * at.inverse_z;
   const float y = difference.by_v * image.intrinsics.fy * at.inverse_z;
   const Vec3<float> by_point{x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};

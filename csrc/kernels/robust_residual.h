@@ -49,8 +49,7 @@ template <class T>
 SPS_INLINE void add_gain_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, float by_gain,
                                   T weight, T* gain_terms) {
   const Vec3<float> by_rotation = cross(offset, slope);
-  const T row[kGainTerms] = {slope.x,       slope.y,       slope.z, by_rotation.x,
-                             by_rotation.y, by_rotation.z, by_gain, residual};
+  const T row[kGainTerms] = {slope.x, slope.y, slope.z, by_rotation.x, by_rotation.y, by_rotation.z, by_gain, residual};
   const T scaled = weight * static_cast<T>(by_gain);
   for (int t = 0; t < kGainTerms; ++t) gain_terms[t] += scaled * row[t];
 }

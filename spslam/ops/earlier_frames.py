@@ -101,9 +101,8 @@ class ColorTiming(NamedTuple):
 class Exposure(NamedTuple):
     """By how much brighter some frames' images are than others', as a camera's automatic exposure makes them.
 
-    A frame's gain is the factor of its brightness against what all frames' would be; an earlier image is compared with a
-    frame once it is as bright as that one, where that leaves it at most white. The frame's own gain is an unknown beside
-    its pose.
+    A frame's gain is the factor of its brightness against what all frames' would be. An earlier image is compared with
+    a frame as if it were as bright as that one, and at most white. The frame's own gain is an unknown beside its pose.
 
     Attributes:
         log_gains: float32 [F, 1] natural logarithms of the gains of the frames that `DepthKeyframes.poses` are of.

@@ -21,8 +21,8 @@ distances), and e0 = 0.3 px: images that are worse registered are so alike for n
 A reference image adds the photometric residual of direct methods (Kerl et al. 2013) for each pixel: the intensity I of
 an earlier frame at the projection of x, less the pixel's own, times a weight in meters.
 
-Where gains are known (`Exposure`), intensities of an earlier frame of log gain a count exp(b - a) times in both, at most
-1; b, of the frame itself, is one more unknown, which the normal equations of the pose are solved without (Schur
+Where gains are known (`Exposure`), intensities of an earlier frame of log gain a count exp(b - a) times in both, at
+most 1; b, of the frame itself, is one more unknown, which the normal equations of the pose are solved without (Schur
 complement) and which then takes its own step, of at most 0.2.
 """
 

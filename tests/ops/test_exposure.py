@@ -38,7 +38,8 @@ def _image(pose):
     """Depth and intensity float64 [H, W] of the painted corner, as a camera at `pose` float64 [4, 4] sees them."""
     depth = corner_depth(pose, INTRINSICS, *SHAPE)
     v, u = torch.meshgrid(*(torch.arange(size) for size in SHAPE), indexing="ij")
-    rays = torch.stack([(u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy, torch.ones(SHAPE)], -1)
+    x, y = (u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy
+    rays = torch.stack([x, y, torch.ones(SHAPE)], -1)
     points = (rays.double() * depth[..., None]) @ torch.from_numpy(pose[:3, :3]).T + torch.from_numpy(pose[:3, 3])
     return depth, _paint(points)
 
@@ -154,7 +155,8 @@ def test_gains_that_are_all_alike_change_nothing_but_by_the_unknown(device, gene
     noise, poses = noise_model(*NOISE, device=device), []
     for factor in (0.0, 0.7):
         keyframes = _keyframes([1.0, 1.0], device, frame=factor)
-        keyframes = keyframes._replace(exposure=keyframes.exposure._replace(log_gains=torch.full((2, 1), factor).to(device)))
+        exposure = keyframes.exposure._replace(log_gains=torch.full((2, 1), factor, device=device))
+        keyframes = keyframes._replace(exposure=exposure)
         poses.append(
             ops.track_gauss_newton(
                 ops.SceneView.empty(device=device), records, pose7(POSE, device), INTRINSICS, ONE_STEP, noise=noise,
@@ -257,7 +259,10 @@ def test_bad_exposures_are_named(generator):
             ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, OPTIONS, depth_keyframes=bad)
     for bad, message in (
         (reference._replace(log_gain=torch.zeros(2)), r"reference.log_gain must have shape \[1\]"),
-        (reference._replace(motion=ops.FrameMotion(0, 0.0)), "reference.motion must name poses that are there and positive times"),
+        (
+            reference._replace(motion=ops.FrameMotion(0, 0.0)),
+            "reference.motion must name poses that are there and positive times",
+        ),
     ):
         with pytest.raises((ValueError, TypeError), match=f"track_gauss_newton: {message}"):
             ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, OPTIONS, reference=bad)

@@ -91,8 +91,10 @@ def test_surface_and_image_features_decide_between_trusted_poses(other, times, d
 @pytest.mark.parametrize(("share", "taken"), [(1.0, 1), (math.nan, 0)])
 def test_of_results_that_are_one_pose_that_with_most_agreement_stands_for_all(recovery, monkeypatch, share, taken):
     """Where colors are where depth is; else the one of the best fit."""
-    results = [replace(with_features(0.05, n, share), pose=torch.tensor([1.0, 0, 0, 0, x, 0, 0])) for n, x in
-               ((100, 0.0), (140, 0.002))]
+    results = [
+        replace(with_features(0.05, n, share), pose=torch.tensor([1.0, 0, 0, 0, x, 0, 0]))
+        for n, x in ((100, 0.0), (140, 0.002))
+    ]
     frame = SimpleNamespace(with_features=lambda fit, pose: fit)
     monkeypatch.setattr(recovery, "_verify", lambda frame, tracked: tracked)
     assert recovery._likeliest(frame, results).pose is results[taken].pose

@@ -176,8 +176,8 @@ class ArrivingKeyframe:
     ) -> ArrivingKeyframe:
         """That of a frame's pixels, on any device, which it does not wait for.
 
-        With `log_gain` float32 [1] of the frame, see `ops.Exposure`, its image is as bright as with a gain of 1, so that
-        those of all keyframes are alike.
+        With `log_gain` float32 [1] of the frame, see `ops.Exposure`, its image is as bright as with a gain of 1, so
+        that those of all keyframes are alike.
         """
         images = pixels.depth_image, pixels.intensity_image
         depth, intensity = (image[:: camera.step, :: camera.step].flatten() for image in images)

@@ -345,5 +345,6 @@ def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: flo
     the prediction.
     """
     known = [other for other in others if not other.lost and not math.isnan(other.fit.feature_share)]
-    best = max((other for other in known if other.fit.feature_inliers >= MIN_DECIDING), key=lambda other: other.agreement, default=found)
+    seen = [other for other in known if other.fit.feature_inliers >= MIN_DECIDING]
+    best = max(seen, key=lambda other: other.agreement, default=found)
     return best if best.agreement > times * found.agreement else found
