@@ -9,8 +9,6 @@ import torch
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
 from spslam.slam.frame_table import FrameTable
-from spslam.slam.graph.keyframe import ArrivingKeyframe, KeyframeCamera
-from spslam.slam.pixels import sample_frame
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
 
@@ -85,26 +83,3 @@ def test_rows_of_a_table_carry_gains_on(device):
         log_gain = None if gain is None else torch.tensor([gain], device=device)
         table.append(pose, 0.1 * number, number, gain is None, thumbnail, log_gain=log_gain)
     assert table.log_gains[:, 0].tolist() == [0.0, 0.25, 0.25, 0.25, -0.5, -0.5]
-
-
-def test_images_of_keyframes_are_alike():
-    """Where a frame's own are darker, those of its keyframe are not."""
-    dataset = Recorded(COUNT, darkened)
-    pixels = sample_frame(dataset[8], dataset.camera, settings())
-    camera = KeyframeCamera.of(dataset.camera, 10.0, 4, 0.05)
-    log_gain = torch.tensor([np.log(GAINS[8])], dtype=torch.float32)
-    keyframe = ArrivingKeyframe.of(8, pixels, camera, log_gain).arrived()
-    even = ArrivingKeyframe.of(8, sample_frame(Recorded(COUNT)[8], dataset.camera, settings()), camera).arrived()
-    assert torch.equal(keyframe.depth.int(), even.depth.int())
-    # A step of a darkened image is 1.7 of an even one's.
-    assert (keyframe.intensity.int() - even.intensity.int()).abs().max() <= 2
-
-
-def test_the_graphs_keyframes_have_the_gains_of_their_frames():
-    dataset = Recorded(COUNT, darkened)
-    system = run(dataset, "graph.max_rotation_deg=2", "graph.max_translation_m=0.02")
-    keyframe = next(one for one in system.state.graph.keyframes if GAINS[one.frame] < 0.9)
-    pixels = sample_frame(dataset[keyframe.frame], dataset.camera, system.config)
-    gain = system.state.frames.log_gains[keyframe.frame]
-    want = ArrivingKeyframe.of(keyframe.frame, pixels, keyframe.camera, gain).arrived()
-    assert torch.equal(keyframe.intensity, want.intensity)

@@ -148,17 +148,14 @@ class GlobalMapping:
         """
         state, store, last = self._state, self._store, self._store.newest
         if last is None:
-            store.add(self._arriving(number, pixels), Link(np.eye(4), False))
+            store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(np.eye(4), False))
             return
         known = self._last_pose(last)
         if self._is_far(known, pose):
             moved = inverse(known) @ pose
             relocalized = bool(state.frames.lost[last:number].any()) or last < state.frames.opened
-            store.add(self._arriving(number, pixels), Link(moved, relocalized))
+            store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(moved, relocalized))
             self._reference = number, state.stamp, pose
-
-    def _arriving(self, number: int, pixels: FramePixels) -> ArrivingKeyframe:
-        return ArrivingKeyframe.of(number, pixels, self._store.camera, self._state.frames.log_gains[number])
 
     def newest_pose(self) -> np.ndarray:
         """float64 [4, 4] T_world_camera of the newest keyframe; identity where there is none."""

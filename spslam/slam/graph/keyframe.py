@@ -171,18 +171,10 @@ class ArrivingKeyframe:
     camera: KeyframeCamera
 
     @classmethod
-    def of(
-        cls, frame: int, pixels: FramePixels, camera: KeyframeCamera, log_gain: torch.Tensor | None = None
-    ) -> ArrivingKeyframe:
-        """That of a frame's pixels, on any device, which it does not wait for.
-
-        With `log_gain` float32 [1] of the frame, see `ops.Exposure`, its image is as bright as with a gain of 1, so
-        that those of all keyframes are alike.
-        """
+    def of(cls, frame: int, pixels: FramePixels, camera: KeyframeCamera) -> ArrivingKeyframe:
+        """That of a frame's pixels, on any device, which it does not wait for."""
         images = pixels.depth_image, pixels.intensity_image
         depth, intensity = (image[:: camera.step, :: camera.step].flatten() for image in images)
-        if log_gain is not None:
-            intensity = (intensity * torch.exp(-log_gain)).round_().clamp_(max=255).to(torch.uint8)
         content = fetch(torch.cat([depth.view(torch.uint8), intensity]))
         return cls(frame, content, event_recorder(depth.device)(), camera)
 
