@@ -31,7 +31,7 @@ ANCHORS = 2  # stored frames that hold a pose beside the last one
 WEAK_EIGENVALUE = 0.004  # below it surface leaves a direction almost free: poses that slide fit, and are consistent
 UNSURE_EIGENVALUE = 0.01  # below it so may a pose that is far from its prediction
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
-MIN_GAIN = 0.001  # of mean robust weight; smaller differences say nothing
+MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
 MAX_VERIFIED = 4  # poses of a frame
 MORE_AGREEING = 1.2  # times as much agreement decides for a pose that image features alone give
@@ -276,6 +276,7 @@ class Recovery:
         """
         candidates = [replace(one, fit=frame.with_features(one.fit, one.pose)) for one in candidates]
         distinct: list[TrackedFrame] = []
+        kept: list[int] = []  # their numbers
         weights = [candidate.weight + MIN_GAIN * (i == 0) for i, candidate in enumerate(candidates)]
         for i in sorted(range(len(candidates)), key=lambda i: -weights[i]):
             if distinct and weights[i] < distinct[0].weight - MAX_LOSS:
@@ -283,14 +284,19 @@ class Recovery:
             same = next((k for k, other in enumerate(distinct) if candidates[i].is_same(other)), None)
             if same is None:
                 distinct.append(candidates[i])
-            elif candidates[i].agreement > distinct[same].agreement:
-                distinct[same] = candidates[i]
+                kept.append(i)
+            elif self._favored(candidates, i) > self._favored(candidates, kept[same]):
+                distinct[same], kept[same] = candidates[i], i
         verified = [self._verify(frame, candidate) for candidate in distinct[:MAX_VERIFIED]]
         found = min(verified, key=lambda tracked: self._rank(tracked, anywhere))
         if anywhere:
             return found
         found = _by_features(found, verified)
         return found if seen is None else _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
+
+    @staticmethod
+    def _favored(candidates: Sequence[TrackedFrame], i: int) -> float:
+        return candidates[i].agreement * (1 + MIN_GAIN * (i == 0))
 
     def _rank(self, tracked: TrackedFrame, anywhere: bool) -> float:
         fit = tracked.fit
