@@ -24,17 +24,21 @@ inline FrameMotion load_motion(const char* name, const std::int64_t* integers, s
   return {integers[0], 1e-9f * static_cast<float>(integers[1]), 1e-9f * static_cast<float>(integers[2])};
 }
 
-// Of the images, the poses and, if any, the intensities and after them the delay of colors; none without tensors. They
-// must outlive the launch.
+// Of the images, the poses and, if any, the intensities, and after them the delay of colors, if any, and the log gains
+// of all frames and of the one compared, if any; none without tensors. They must outlive the launch.
 inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<Tensor>& tensors,
                                            const std::vector<double>& numbers,
                                            const std::vector<std::int64_t>& integers) {
   if (tensors.empty()) return {};
   const Scalars<KeyframeScalar> scalars(name, "depth_keyframe_scalars", numbers);
-  SPS_CHECK(tensors.size() >= 2 && tensors.size() <= 4 && tensors[0].dim() == 3 && tensors[1].dim() == 2 &&
+  SPS_CHECK(tensors.size() >= 2 && tensors.size() <= 6 && tensors[0].dim() == 3 && tensors[1].dim() == 2 &&
                 tensors[1].size(1) == kPoseSize && (tensors.size() == 2 || same_shape(tensors[2], tensors[0])),
             name, ": depth_keyframes must be images [R, H, W], poses [F, 7] and, if any, intensities [R, H, W]");
-  SPS_CHECK(tensors.size() < 4 || tensors[3].numel() == 1, name, ": color_delay must have one element");
+  const std::size_t size = tensors.size();
+  const bool has_delay = size == 4 || size == 6, has_gains = size >= 5;
+  SPS_CHECK(!has_delay || tensors[3].numel() == 1, name, ": color_delay must have one element");
+  SPS_CHECK(!has_gains || (tensors[size - 2].numel() == tensors[1].size(0) && tensors[size - 1].numel() == 1), name,
+            ": log_gains must be those of the poses' frames and of one more");
   SPS_CHECK(scalars[KeyframeScalar::kUnit] > 0.0 && scalars[KeyframeScalar::kKernelEnd] > 0.0, name,
             ": depth_keyframes must have a positive unit and kernel_end");
   constexpr std::size_t kFirst = static_cast<std::size_t>(KeyframeInteger::kCount),
@@ -45,7 +49,9 @@ inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<T
   DepthKeyframes keyframes{};
   keyframes.images = data<std::uint16_t>(tensors[0]);
   keyframes.intensities = tensors.size() > 2 ? data<std::uint8_t>(tensors[2]) : nullptr;
-  keyframes.color_delay = tensors.size() == 4 ? data<float>(tensors[3]) : nullptr;
+  keyframes.color_delay = has_delay ? data<float>(tensors[3]) : nullptr;
+  keyframes.log_gains = has_gains ? data<float>(tensors[size - 2]) : nullptr;
+  keyframes.frame_log_gain = has_gains ? data<float>(tensors[size - 1]) : nullptr;
   keyframes.poses = data<float>(tensors[1]);
   keyframes.height = tensors[0].size(1);
   keyframes.width = tensors[0].size(2);

@@ -25,21 +25,29 @@ constexpr char kName[] = "track_gauss_newton";
 enum class Scalar { kFx, kFy, kCx, kCy, SPS_GAUSS_NEWTON_SCALARS(SPS_NAME_PLACE) kCount };
 #undef SPS_NAME_PLACE
 enum class Integer { kNumPixels, kIterations, kSeed, kStream, kFrame, kTf32, kCount };
-enum class ReferenceScalar { kFx, kFy, kCx, kCy, kWeight, kKernel, kCount };
+enum class ReferenceScalar { kFx, kFy, kCx, kCy, kWeight, kKernel, kMotionRow, kMotionSeconds, kColorOffset, kCount };
 
-// Of the cells and the pose; none without tensors. They must outlive the launch.
-ReferenceImage load_reference(const std::vector<Tensor>& tensors, const std::vector<double>& numbers) {
+// Of the cells, the pose and, if known, the log gain; none without tensors. They must outlive the launch.
+ReferenceImage load_reference(const std::vector<Tensor>& tensors, const std::vector<double>& numbers,
+                              std::int64_t poses) {
   if (tensors.empty()) return {};
   const Scalars<ReferenceScalar> scalars(kName, "reference_scalars", numbers);
-  SPS_CHECK(tensors.size() == 2 && tensors[0].dim() == 3 && tensors[0].size(2) == 2 && tensors[1].numel() == kPoseSize,
-            kName, ": reference must be cells [H, W, 2] and a pose [7]");
+  SPS_CHECK((tensors.size() == 2 || (tensors.size() == 3 && tensors[2].numel() == 1)) && tensors[0].dim() == 3 &&
+                tensors[0].size(2) == 2 && tensors[1].numel() == kPoseSize,
+            kName, ": reference must be cells [H, W, 2], a pose [7] and, if any, a log gain [1]");
+  const double row = scalars[ReferenceScalar::kMotionRow], seconds = scalars[ReferenceScalar::kMotionSeconds];
+  SPS_CHECK(row < 0.0 || poses == 0 || (row < static_cast<double>(poses) && seconds > 0.0), kName,
+            ": reference must name a pose that is there and a positive time, got ", row, " and ", seconds, " s");
   return {data<float>(tensors[0]),
           data<float>(tensors[1]),
           tensors[0].size(0),
           tensors[0].size(1),
           load_intrinsics(scalars),
           scalars.as<float>(ReferenceScalar::kWeight),
-          scalars.as<float>(ReferenceScalar::kKernel)};
+          scalars.as<float>(ReferenceScalar::kKernel),
+          {row < 0.0 ? -1 : static_cast<std::int64_t>(row), static_cast<float>(seconds),
+           scalars.as<float>(ReferenceScalar::kColorOffset)},
+          tensors.size() == 3 ? data<float>(tensors[2]) : nullptr};
 }
 
 GaussNewtonOptions load_options(const Scalars<Scalar>& scalars, const Integers<Integer>& integers) {
@@ -79,10 +87,11 @@ Tensor track_gauss_newton(std::vector<Tensor> scene_tensors, std::vector<double>
   SPS_CHECK(frame.size() == 2 || frame[2].numel() == kSensorNoiseSize, kName, ": noise must have ", kSensorNoiseSize,
             " elements");
   options.noise = frame.size() == 2 ? nullptr : data<float>(frame[2]);
-  options.reference = load_reference(reference, reference_scalars);
+  options.reference =
+      load_reference(reference, reference_scalars, depth_keyframes.empty() ? 0 : depth_keyframes[1].size(0));
   options.depth_keyframes =
       load_depth_keyframes(kName, depth_keyframes, depth_keyframe_scalars, depth_keyframe_integers);
-  Tensor found = empty(pose, {2 * kPoseSize + 36 + options.iterations * kTrackingStatSize}, ScalarType::Float);
+  Tensor found = empty(pose, {2 * kPoseSize + 36 + options.iterations * kFrameStatSize}, ScalarType::Float);
   float* const start = mutable_data<float>(found);
   float* const result = start + kPoseSize;
   float* const hessian = result + kPoseSize;

@@ -13,7 +13,7 @@ namespace {
 constexpr std::int64_t kPixelGrain = 2 * kTileRows;
 
 // Sums over pixels [begin, end), whose records `record(i)` gives: terms of the map and, from kTrackingTerms on, of the
-// depth keyframes.
+// depth keyframes and of the gain.
 template <class Record>
 void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measurement& measure,
                 const Pose<float>& pose, std::int64_t begin, std::int64_t end, const Record& record, double* terms) {
@@ -25,9 +25,11 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
   PixelNoise noise[kTileRows];
   float sdf[kTileRows];
   const float inverse_voxel = 1.0f / scene.voxel_size;
+  double* const keyframe_terms = terms + kTrackingTerms;
+  double* const gain_terms = keyframe_terms + kKeyframeTerms;
   const auto add_keyframes = [&](const Pixel& pixel, const SurfacePoint& point, const PixelNoise& own,
                                  const MapResidual& map) {
-    add_keyframe_residuals(measure, pixel, point, own, map, 0, 1, terms + kTrackingTerms);
+    add_keyframe_residuals(measure, pixel, point, own, map, 0, 1, keyframe_terms, gain_terms + kGainTerms);
   };
   const auto flush = [&] {
     tile.decode(sdf);
@@ -43,7 +45,7 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
     const Pixel pixel = unpack_pixel(record(i));
     if (!(pixel.depth > 0.0f)) continue;
     const SurfacePoint point = surface_point(pixel, pose, options.intrinsics);
-    add_reference_residual(measure, pixel, point, terms);
+    add_reference_residual(measure, pixel, point, terms, gain_terms);
     const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
     const PixelNoise own = noise_of(measure, pixel);
     if (!cell.corner_ids) {
@@ -87,8 +89,8 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
                              const GaussNewtonOptions& options, void* workspace, float* pose, float* stats,
                              float* hessian) {
   const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
-  double terms[kJointTerms], joint[kNormalTerms];
-  EarlierFrames frames;
+  double terms[kJointTerms], joint[kJointNormals];
+  EarlierFrames frames{};
   for (int i = 0; i < kMaxEarlierFrames; ++i) load_earlier_frame(options, i, frames);
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     PhiloxKey key = options.key;
@@ -98,13 +100,16 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
              kPixelWords * philox_index(key, static_cast<std::uint32_t>(i), static_cast<std::uint64_t>(num_records));
     };
     const Measurement measure = measurement(options, &frames, iteration);
-    load_color_pose(options, pose, frames);
+    load_colors(options, pose, frames);
     sum_pixels(scene, net, measure, load_pose(pose), options.num_pixels, record, static_cast<double*>(workspace),
                terms);
-    float* own_stats = stats + kTrackingStatSize * iteration;
+    float* own_stats = stats + kFrameStatSize * iteration;
     tracking_fit(terms, options.num_pixels, own_stats);
-    join_keyframe_terms(terms, terms + kTrackingTerms, measure.num_keyframes, joint);
-    tracking_step(terms, joint, options.damping, held_damping(measure, terms), pose, own_stats + 2, hessian);
+    const double* keyframe_terms = terms + kTrackingTerms;
+    join_keyframe_terms(terms, keyframe_terms, keyframe_terms + kKeyframeTerms, measure.num_keyframes, joint);
+    float* log_gain = options.depth_keyframes.log_gains ? &frames.log_gain : nullptr;
+    tracking_step(terms, joint, options.damping, held_damping(measure, terms), pose, own_stats + 2, hessian, log_gain);
+    own_stats[kTrackingStatSize] = frames.log_gain;
   }
 }
 

@@ -20,9 +20,16 @@ constexpr int kBlockPixels = kWarps * fused::kTileRows;
 // A grid-wide barrier needs all blocks to be resident: few enough for the smallest device.
 constexpr std::int64_t kMaxTrackingBlocks = 16;
 constexpr int kPaddedTerms = kWarp;  // kTrackingTerms or kKeyframeTerms, one per lane
-static_assert(kTrackingTerms <= kPaddedTerms && kKeyframeTerms <= kPaddedTerms, "one lane per term");
-constexpr int kSets = 2;  // of terms: the map's, the depth keyframes'
+static_assert(kTrackingTerms <= kPaddedTerms && kKeyframeTerms <= kPaddedTerms && kAllGainTerms <= kPaddedTerms,
+              "one lane per term");
+constexpr int kSets = 3;  // of terms: the map's, the depth keyframes', the gain's
 constexpr int kSums = kSets * kPaddedTerms;
+static_assert(kSums <= kThreads, "one thread per sum");
+
+// A lane's terms.
+struct LaneTerms {
+  float map[kPaddedTerms] = {}, keyframes[kPaddedTerms] = {}, gain[kPaddedTerms] = {};
+};
 
 std::int64_t block_count(std::int64_t pixels) {
   return (pixels + kBlockPixels - 1) / kBlockPixels;
@@ -48,11 +55,11 @@ struct PixelSource {
   }
 };
 
-// Adds the share of a tile of pixels, one per lane, to the lane's terms of the map and of the depth keyframes.
+// Adds the share of a tile of pixels, one per lane, to the lane's terms.
 template <Precision kPrecision>
 __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const GeometryNetwork<kPrecision>& network,
                                                const Measurement& measure, const Pose<float>& pose, const Pixel& pixel,
-                                               int lane, float* terms, float* keyframe_terms) {
+                                               int lane, LaneTerms& terms) {
   const GaussNewtonOptions& options = *measure.options;
   const SurfacePoint point = surface_point(pixel, pose, options.intrinsics);
   std::int32_t voxel = kNoVoxel;
@@ -69,10 +76,10 @@ __device__ __forceinline__ void add_pixel_tile(const SceneView& scene, const Geo
   const PixelNoise noise = noise_of(measure, pixel);
   if (pixel.depth > 0.0f) {
     add_keyframe_residuals(measure, pixel, point, noise, {sdf * options.truncation, known}, lane % 4 / 2, 2,
-                           keyframe_terms);
+                           terms.keyframes, terms.gain + kGainTerms);
   }
-  if (adds && known) add_map_residual(measure, point.offset, sdf, gradient, noise.map_certainty, terms);
-  if (adds) add_reference_residual(measure, pixel, point, terms);
+  if (adds && known) add_map_residual(measure, point.offset, sdf, gradient, noise.map_certainty, terms.map);
+  if (adds) add_reference_residual(measure, pixel, point, terms.map, terms.gain);
 }
 
 // The pixels of one thread in the order in which it takes them: tile after tile of this block, then those of the next
@@ -115,12 +122,11 @@ __device__ __forceinline__ double sum_block(const SceneView& scene, const Geomet
                                             const Measurement& measure, const Pose<float>& pose, PixelQueue& queue,
                                             float (&sums)[kWarps][kSums]) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  float terms[kPaddedTerms] = {}, keyframe_terms[kPaddedTerms] = {};
-  for (Pixel pixel; queue.pop(pixel);) {
-    add_pixel_tile(scene, network, measure, pose, pixel, lane, terms, keyframe_terms);
-  }
-  sums[warp][lane] = transpose_sum(terms, lane);
-  sums[warp][kPaddedTerms + lane] = transpose_sum(keyframe_terms, lane);
+  LaneTerms terms;
+  for (Pixel pixel; queue.pop(pixel);) add_pixel_tile(scene, network, measure, pose, pixel, lane, terms);
+  sums[warp][lane] = transpose_sum(terms.map, lane);
+  sums[warp][kPaddedTerms + lane] = transpose_sum(terms.keyframes, lane);
+  sums[warp][2 * kPaddedTerms + lane] = transpose_sum(terms.gain, lane);
   __syncthreads();
   double sum = 0.0;
   if (threadIdx.x < kSums) {
@@ -129,19 +135,13 @@ __device__ __forceinline__ double sum_block(const SceneView& scene, const Geomet
   return sum;
 }
 
-// terms[t] = sum over blocks of partials[block][t], t < kSums; each half of the block sums every other block, and the
-// halves are added in order.
-__device__ void add_partials(const double* partials, std::int64_t blocks, double (&shares)[kThreads / kSums][kSums],
-                             double* terms) {
-  const int term = threadIdx.x % kSums, share = threadIdx.x / kSums;
-  double sum = 0.0;
-  for (std::int64_t b = share; b < blocks; b += kThreads / kSums) sum += __ldcg(partials + b * kSums + term);
-  shares[share][term] = sum;
-  __syncthreads();
-  if (share == 0) {
-    double total = 0.0;
-    for (int s = 0; s < kThreads / kSums; ++s) total += shares[s][term];
-    terms[term] = total;
+// terms[t] = sum over blocks of partials[block][t], t < kSums.
+__device__ void add_partials(const double* partials, std::int64_t blocks, double* terms) {
+  if (threadIdx.x < kSums) {
+    double sum = 0.0;
+#pragma unroll 8
+    for (std::int64_t b = 0; b < blocks; ++b) sum += __ldcg(partials + b * kSums + threadIdx.x);
+    terms[threadIdx.x] = sum;
   }
   __syncthreads();
 }
@@ -157,9 +157,9 @@ __global__ void __launch_bounds__(kThreads, 1)
   constexpr Precision kUsed = fused::kArchitecture < fused::kTensorArchitecture ? Precision::kFp32 : kPrecision;
   __shared__ GeometryNetwork<kUsed> network;
   __shared__ float sums[kWarps][kSums];
-  __shared__ double shares[kThreads / kSums][kSums], terms[kSums], joint[kNormalTerms];
+  __shared__ double terms[kSums], joint[kJointNormals];
   __shared__ EarlierFrames frames;
-  __shared__ float own_pose[kPoseSize], own_stats[kTrackingStatSize], own_hessian[36];
+  __shared__ float own_pose[kPoseSize], own_stats[kFrameStatSize], own_hessian[36];
   network.load(scene.geometry_params);
   if (threadIdx.x < kPoseSize) own_pose[threadIdx.x] = pose[threadIdx.x];
   if (threadIdx.x < kMaxEarlierFrames) load_earlier_frame(options, threadIdx.x, frames);
@@ -168,22 +168,25 @@ __global__ void __launch_bounds__(kThreads, 1)
   __syncthreads();
   for (std::int64_t iteration = 0; iteration < options.iterations; ++iteration) {
     const Measurement measure = measurement(options, &frames, iteration);
-    if (threadIdx.x == 0) load_color_pose(options, own_pose, frames);
+    if (threadIdx.x == 0) load_colors(options, own_pose, frames);
     __syncthreads();
     const double sum = sum_block(scene, network, measure, load_pose(own_pose), queue, sums);
     // Two sets in turn: a block may be an iteration ahead of one that still reads.
     double* shared_sums = partials + (iteration % 2) * gridDim.x * kSums;
     if (threadIdx.x < kSums) __stcg(shared_sums + blockIdx.x * kSums + threadIdx.x, sum);
     cooperative_groups::this_grid().sync();
-    add_partials(shared_sums, gridDim.x, shares, terms);
+    add_partials(shared_sums, gridDim.x, terms);
     if (threadIdx.x == 0) {
-      join_keyframe_terms(terms, terms + kPaddedTerms, measure.num_keyframes, joint);
-      tracking_step(terms, joint, options.damping, held_damping(measure, terms), own_pose, own_stats + 2, own_hessian);
+      join_keyframe_terms(terms, terms + kPaddedTerms, terms + 2 * kPaddedTerms, measure.num_keyframes, joint);
+      float* log_gain = options.depth_keyframes.log_gains ? &frames.log_gain : nullptr;
+      tracking_step(terms, joint, options.damping, held_damping(measure, terms), own_pose, own_stats + 2, own_hessian,
+                    log_gain);
+      own_stats[kTrackingStatSize] = log_gain ? frames.log_gain : 0.0f;
     }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
     __syncthreads();
-    if (blockIdx.x == 0 && threadIdx.x < kTrackingStatSize) {
-      stats[iteration * kTrackingStatSize + threadIdx.x] = own_stats[threadIdx.x];
+    if (blockIdx.x == 0 && threadIdx.x < kFrameStatSize) {
+      stats[iteration * kFrameStatSize + threadIdx.x] = own_stats[threadIdx.x];
     }
   }
   if (blockIdx.x != 0) return;
@@ -208,8 +211,8 @@ __global__ void __launch_bounds__(kThreads)
 
 __global__ void __launch_bounds__(kThreads)
     store_kernel(const double* partials, std::int64_t blocks, std::int64_t num_pixels, PoseEquations out) {
-  __shared__ double shares[kThreads / kSums][kSums], terms[kSums];
-  add_partials(partials + blockIdx.x * blocks * kSums, blocks, shares, terms);
+  __shared__ double terms[kSums];
+  add_partials(partials + blockIdx.x * blocks * kSums, blocks, terms);
   if (threadIdx.x == 0) store_pose_equations(terms, blockIdx.x, num_pixels, out);
 }
 

@@ -40,15 +40,16 @@ SPS_INLINE void add_alignment_residuals(const Measurement& measure, const std::i
   const Pixel pixel = unpack_pixel(record);
   if (!(pixel.depth > 0.0f)) return;
   const SurfacePoint point = surface_point(pixel, pose, measure.options->intrinsics);
-  add_keyframe_residuals(measure, pixel, point, noise_of(measure, pixel), {0.0f, false}, 0, 1, terms);
+  T of_no_gain[kGainTerms] = {};
+  add_keyframe_residuals(measure, pixel, point, noise_of(measure, pixel), {0.0f, false}, 0, 1, terms, of_no_gain);
 }
 
 // The step that the sums over a pair's pixels give.
 SPS_INLINE void alignment_step(const double* keyframe_terms, double damping, float* pose) {
-  const double map_terms[kTrackingTerms] = {};
-  double joint[kNormalTerms];
+  const double map_terms[kTrackingTerms] = {}, gain_terms[kAllGainTerms] = {};
+  double joint[kJointNormals];
   float steps[2], hessian[36];
-  join_keyframe_terms(map_terms, keyframe_terms, 1, joint);
+  join_keyframe_terms(map_terms, keyframe_terms, gain_terms, 1, joint);
   tracking_step(map_terms, joint, damping, 0.0, pose, steps, hessian);
 }
 

@@ -19,6 +19,8 @@ namespace spslam {
 // After the normal equations: the sum of weights and, of pairs of a pixel and a keyframe where the map is known too,
 // the map's weighted squares and sum of weights. The cost's place holds the weighted squares of such pairs.
 constexpr int kKeyframeTerms = kNormalTerms + 3;
+// The equations of the pose and after them those of the gain.
+constexpr int kJointNormals = kNormalTerms + kGainTerms;
 // Four pixels whose inverse depths spread more than this share have an edge between them.
 constexpr float kMaxInverseDepthSpread = 0.03f;
 // A point whose depth differs from the surface's by more than this share is not on it.
@@ -32,19 +34,30 @@ struct DepthKeyframe {
   const std::uint8_t* intensities;  // null where there are none
   Pose<float> pose;
   ColorPose color;
+  float log_gain;  // of its frame
+  float scale;     // its intensities times this are as bright as the frame that is aligned
 };
+
+// By how much brighter than a frame of one log gain is one of another.
+SPS_INLINE float brightness_scale(float log_gain, float own) {
+  return std::exp(own - log_gain);
+}
 
 // The image in a row, of a frame at a pose.
 SPS_INLINE DepthKeyframe keyframe_image(const DepthKeyframes& keyframes, std::int64_t row, const Pose<float>& pose) {
   const std::int64_t first = row * keyframes.height * keyframes.width;
-  return {
-      keyframes.images + first, keyframes.intensities ? keyframes.intensities + first : nullptr, pose, {pose, 0.0f}};
+  const std::uint8_t* intensities = keyframes.intensities ? keyframes.intensities + first : nullptr;
+  return {keyframes.images + first, intensities, pose, {pose, 0.0f}, 0.0f, 1.0f};
 }
 
 SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& keyframes, int k) {
   const float* pose = keyframes.poses + kPoseSize * keyframes.pose_rows[k];
   DepthKeyframe keyframe = keyframe_image(keyframes, keyframes.image_rows[k], load_pose(pose));
   keyframe.color = color_pose(keyframes.poses, keyframes.motions[k], keyframes.color_delay, pose);
+  if (keyframes.log_gains) {
+    keyframe.log_gain = keyframes.log_gains[keyframes.pose_rows[k]];
+    keyframe.scale = brightness_scale(keyframe.log_gain, *keyframes.frame_log_gain);
+  }
   return keyframe;
 }
 
@@ -87,10 +100,18 @@ SPS_INLINE SurfaceDistance surface_distance(const DepthKeyframes& keyframes, con
   return {excess * inverse_slope, inverse_slope * gradient, true, std::fabs(excess) < kMaxDepthDifference};
 }
 
-// An earlier image's intensity at a projection less a pixel's own, and its derivatives (1/px).
+// An earlier image's intensity at a projection, as bright as the frame, less a pixel's own; its derivatives by the
+// place (1/px) and by the frame's log gain.
 struct IntensityDifference {
-  float value, by_u, by_v;
+  float value, by_u, by_v, by_gain;
 };
+
+// What would be brighter than white is white.
+SPS_INLINE IntensityDifference scaled_difference(const BilinearValue& earlier, float scale, float intensity) {
+  const float value = scale * earlier.value;
+  if (value > 1.0f) return {1.0f - intensity, 0.0f, 0.0f, 0.0f};
+  return {value - intensity, scale * earlier.by_u, scale * earlier.by_v, value};
+}
 
 SPS_INLINE IntensityDifference intensity_difference(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
                                                     const FrameProjection& at, float intensity) {
@@ -98,7 +119,7 @@ SPS_INLINE IntensityDifference intensity_difference(const DepthKeyframes& keyfra
   const std::uint8_t* row = keyframe.intensities + at.row * keyframes.width + at.column;
   const BilinearValue value = bilinear_value(kStep * row[0], kStep * row[1], kStep * row[keyframes.width],
                                              kStep * row[keyframes.width + 1], at.a, at.b);
-  return {value.value - intensity, value.by_u, value.by_v};
+  return scaled_difference(value, keyframe.scale, intensity);
 }
 
 // The derivative of the difference by the point in the keyframe's camera axes, 1/m.
@@ -109,18 +130,20 @@ SPS_INLINE Vec3<float> intensity_by_point(const DepthKeyframes& keyframes, const
   return {x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
 }
 
-// Adds the difference of intensities in meters: as many as the deviation of the sensor's noise is worth. `lever` is by
-// how much the color's pose moves with a step of the frame's.
+// Adds the difference of intensities in meters, as many as the deviation of the sensor's noise is worth, to terms of
+// the pose and of the gain. `lever` is by how much the color's pose moves with a step of the frame's.
 template <class T>
 SPS_INLINE void add_keyframe_intensity(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
                                        const FrameProjection& at, const PixelNoise& noise, float width,
-                                       const Vec3<float>& offset, float lever, T* terms) {
+                                       const Vec3<float>& offset, float lever, T* terms, T* gain_terms) {
   const IntensityDifference difference = intensity_difference(keyframes, keyframe, at, noise.intensity);
   const float deviation = intensity_deviation(noise.sensor, difference.by_u, difference.by_v);
   const float meters = noise.intensity_meters / deviation;
   const Vec3<float> by_point = intensity_by_point(keyframes, difference, at);
-  add_weighted_residual(offset, meters * difference.value, keyframe.color.pose.rotation * (lever * meters * by_point),
-                        static_cast<T>(robust_weight(difference.value, kRobustDeviations * width * deviation)), terms);
+  const Vec3<float> slope = keyframe.color.pose.rotation * (lever * meters * by_point);
+  const T weight = static_cast<T>(robust_weight(difference.value, kRobustDeviations * width * deviation));
+  add_weighted_residual(offset, meters * difference.value, slope, weight, terms);
+  add_gain_residual(offset, meters * difference.value, slope, meters * difference.by_gain, weight, gain_terms);
 }
 
 // Where a keyframe's color image shows a pixel's color, `at` being where its depth image shows the pixel's surface.
@@ -132,12 +155,12 @@ SPS_INLINE FrameProjection color_projection(const DepthKeyframes& keyframes, con
 }
 
 // Adds what a keyframe measured at a pixel's points to terms of type T: the distance from its surface, and where the
-// noise of intensities is known their difference; nothing where the point falls off the image or its surface is
-// unknown.
+// noise of intensities is known their difference, to `gain_terms` too; nothing where the point falls off the image or
+// its surface is unknown.
 template <class T>
 SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, const DepthKeyframe& keyframe,
                                             const PixelPoints& points, float kernel, const PixelNoise& noise,
-                                            const MapResidual& map, T* terms) {
+                                            const MapResidual& map, T* terms, T* gain_terms) {
   const Vec3<float>&world = points.depth.world, &offset = points.depth.offset;
   const FrameProjection at =
       project_into_frame(keyframe.pose, keyframes.intrinsics, keyframes.height, keyframes.width, world);
@@ -148,7 +171,7 @@ SPS_INLINE void add_depth_keyframe_residual(const DepthKeyframes& keyframes, con
     const FrameProjection color_at = color_projection(keyframes, keyframe, points, at);
     if (color_at.inside) {
       add_keyframe_intensity(keyframes, keyframe, color_at, noise, kernel / keyframes.kernel_end, points.color.offset,
-                             1.0f + points.lever, terms);
+                             1.0f + points.lever, terms, gain_terms);
     }
   }
   const float residual = surface.value, certainty = noise.keyframe_certainty;
@@ -174,11 +197,16 @@ SPS_INLINE double map_share(const double* keyframe_terms) {
   return share < kMinMapShare ? kMinMapShare : share < kMaxMapShare ? share : kMaxMapShare;
 }
 
-// The equations that the step is solved from: those of the map times its share, and the mean of the keyframes'.
-SPS_INLINE void join_keyframe_terms(const double* map_terms, const double* keyframe_terms, int count, double* joint) {
+// The equations that the step is solved from: those of the map times its share, and the mean of the keyframes'. `joint`
+// [kJointNormals] gets those of the pose and, from `gain_terms` of the reference and the keyframes, of the gain.
+SPS_INLINE void join_keyframe_terms(const double* map_terms, const double* keyframe_terms, const double* gain_terms,
+                                    int count, double* joint) {
   const double share = count > 0 ? map_share(keyframe_terms) : 1.0, mean = count > 0 ? 1.0 / count : 0.0;
   for (int t = 0; t < kNormalTerms; ++t) {
     joint[t] = count > 0 ? share * map_terms[t] + mean * keyframe_terms[t] : map_terms[t];
+  }
+  for (int t = 0; t < kGainTerms; ++t) {
+    joint[kNormalTerms + t] = count > 0 ? share * gain_terms[t] + mean * gain_terms[kGainTerms + t] : gain_terms[t];
   }
 }
 

@@ -16,34 +16,51 @@
 
 namespace spslam {
 
-// Terms of the map and, after them, of the depth keyframes.
-constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms;
+// Of the gain, by the reference image and by the depth keyframes.
+constexpr int kAllGainTerms = 2 * kGainTerms;
+// Terms of the map and, after them, of the depth keyframes and of the gain.
+constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms + kAllGainTerms;
 // Beyond this the decoder's tanh is saturated and its slope says nothing about where the surface is.
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
+constexpr double kMaxGainStep = 0.2;       // of the logarithm: exposure changes by less from one frame to the next
 
 // The earlier frames that a call compares with and the sensor's noise, read once.
 struct EarlierFrames {
   SensorNoise noise;
-  Pose<float> reference;
+  Pose<float> reference;  // where its colors were taken
+  float reference_scale;  // as of DepthKeyframe
   DepthKeyframe keyframes[kMaxDepthKeyframes];
-  ColorPose color;  // of the frame itself, where it is in the running iteration
+  // Of the frame itself, as the running iteration has them.
+  ColorPose color;
+  float log_gain;
 };
 constexpr int kMaxEarlierFrames = 1 + kMaxDepthKeyframes;
 
 // Reads number i of kMaxEarlierFrames, if there is one: the reference image is 0, the depth keyframes follow.
 SPS_INLINE void load_earlier_frame(const GaussNewtonOptions& options, int i, EarlierFrames& frames) {
-  if (i == 0 && options.reference.height > 0) frames.reference = load_pose(options.reference.pose);
-  if (i == 0 && options.noise) frames.noise = load_sensor_noise(options.noise);
-  if (i > 0 && i <= options.depth_keyframes.count) {
-    frames.keyframes[i - 1] = load_depth_keyframe(options.depth_keyframes, i - 1);
+  const ReferenceImage& reference = options.reference;
+  const DepthKeyframes& keyframes = options.depth_keyframes;
+  if (i == 0 && reference.height > 0) {
+    frames.reference = color_pose(keyframes.poses, reference.motion, keyframes.color_delay, reference.pose).pose;
+    frames.reference_scale = 1.0f;
   }
+  if (i == 0 && keyframes.log_gains) frames.log_gain = *keyframes.frame_log_gain;
+  if (i == 0 && options.noise) frames.noise = load_sensor_noise(options.noise);
+  if (i > 0 && i <= keyframes.count) frames.keyframes[i - 1] = load_depth_keyframe(keyframes, i - 1);
 }
 
-// Of the frame, while its pose [7] is what the last iteration found.
-SPS_INLINE void load_color_pose(const GaussNewtonOptions& options, const float* pose, EarlierFrames& frames) {
+// What the frame's pose [7] and gain, as the last iteration found them, mean for its colors.
+SPS_INLINE void load_colors(const GaussNewtonOptions& options, const float* pose, EarlierFrames& frames) {
   const DepthKeyframes& keyframes = options.depth_keyframes;
   frames.color = color_pose(keyframes.poses, keyframes.frame_motion, keyframes.color_delay, pose);
+  if (!keyframes.log_gains) return;
+  for (int k = 0; k < keyframes.count; ++k) {
+    frames.keyframes[k].scale = brightness_scale(frames.keyframes[k].log_gain, frames.log_gain);
+  }
+  if (options.reference.log_gain) {
+    frames.reference_scale = brightness_scale(*options.reference.log_gain, frames.log_gain);
+  }
 }
 
 // What the pixels of an iteration are measured against. It points to what all iterations and threads share.
@@ -70,23 +87,25 @@ SPS_INLINE PixelNoise noise_of(const Measurement& measure, const Pixel& pixel) {
 // Adds a point's residuals against every stride-th depth keyframe of the iteration, from `first` on.
 template <class T>
 SPS_INLINE void add_keyframe_residuals(const Measurement& measure, const Pixel& pixel, const SurfacePoint& point,
-                                       const PixelNoise& noise, const MapResidual& map, int first, int stride,
-                                       T* terms) {
+                                       const PixelNoise& noise, const MapResidual& map, int first, int stride, T* terms,
+                                       T* gain_terms) {
   if (measure.num_keyframes == 0) return;
   const PixelPoints points = pixel_points(pixel, point, measure.frames->color, measure.options->intrinsics);
   for (int k = first; k < measure.num_keyframes; k += stride) {
     add_depth_keyframe_residual(measure.options->depth_keyframes, measure.frames->keyframes[k], points,
-                                measure.kernel.keyframe, noise, map, terms);
+                                measure.kernel.keyframe, noise, map, terms, gain_terms);
   }
 }
 
 // Adds a pixel's residual against the reference image, where there is one.
 template <class T>
 SPS_INLINE void add_reference_residual(const Measurement& measure, const Pixel& pixel, const SurfacePoint& point,
-                                       T* terms) {
+                                       T* terms, T* gain_terms) {
   const ReferenceImage& reference = measure.options->reference;
   if (reference.height == 0) return;
-  add_intensity_residual(reference, measure.frames->reference, pixel, point.world, point.offset, terms);
+  const PixelPoints points = pixel_points(pixel, point, measure.frames->color, measure.options->intrinsics);
+  add_intensity_residual(reference, measure.frames->reference, measure.frames->reference_scale, pixel, points.color,
+                         1.0f + points.lever, terms, gain_terms);
 }
 
 SPS_INLINE bool is_tracking_inlier(float depth, bool inside, float sdf) {
@@ -140,13 +159,37 @@ SPS_INLINE double held_damping(const Measurement& measure, const double* terms) 
   return waits ? options.held_information * terms[kNormalTerms + 2] : 0.0;
 }
 
-// Solves the joint normal equations, with `held` added to the diagonal, and moves the pose. `steps` gets |dt| (m) and
+// What the equations of the frame's gain leave of those of the pose, and the gain's step once the pose's is known.
+struct GainEquations {
+  const double* terms;  // [kGainTerms]
+  double inverse;       // of the gain's information; 0 where nothing tells the gain
+
+  SPS_INLINE explicit GainEquations(const double* of) : terms(of), inverse(of[6] > 1e-12 ? 1.0 / of[6] : 0.0) {}
+
+  SPS_INLINE void eliminate(double (&h)[36], double (&g)[6]) const {
+    for (int a = 0; a < 6; ++a) {
+      for (int b = 0; b < 6; ++b) h[6 * a + b] -= inverse * terms[a] * terms[b];
+      g[a] -= inverse * terms[a] * terms[7];
+    }
+  }
+
+  SPS_INLINE double step(const float* pose_step) const {
+    double gradient = terms[7];
+    for (int a = 0; a < 6; ++a) gradient += terms[a] * static_cast<double>(pose_step[a]);
+    const double wanted = -inverse * gradient;
+    return wanted > kMaxGainStep ? kMaxGainStep : wanted > -kMaxGainStep ? wanted : -kMaxGainStep;
+  }
+};
+
+// Solves the joint normal equations, with `held` added to the diagonal, and moves the pose and, unless it is null, the
+// log gain, whose equations `joint` then has too. `steps` gets |dt| (m) and
 // |domega| (rad). `hessian` gets the map's matrix as if pixels had on average their score weights and no certainties:
 // it says how firmly the surface holds the pose, whatever its distance and the width of the kernel.
 SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, double held, float* pose,
-                              float* steps, float* hessian) {
+                              float* steps, float* hessian, float* log_gain = nullptr) {
   double h[36], g[6], cost, delta[6];
   store_normal_terms<double>(joint, h, g, &cost);
+  if (log_gain) GainEquations(joint + kNormalTerms).eliminate(h, g);
   double trace = 0.0;
   for (int a = 0; a < 6; ++a) trace += h[a * 7];
   // The absolute part keeps directions that no pixel sees from moving.
@@ -155,8 +198,9 @@ SPS_INLINE void tracking_step(const double* terms, const double* joint, double d
   for (int a = 0; a < 6; ++a) step[a] = static_cast<float>(delta[a]), norm += step[a] * step[a];
   norm = std::sqrt(norm);
   const float scale = norm > kMaxTrackingStep ? kMaxTrackingStep / norm : 1.0f;
-  const Vec3<float> dt{scale * step[0], scale * step[1], scale * step[2]};
-  const Vec3<float> domega{scale * step[3], scale * step[4], scale * step[5]};
+  for (int a = 0; a < 6; ++a) step[a] *= scale;
+  if (log_gain) *log_gain += static_cast<float>(GainEquations(joint + kNormalTerms).step(step));
+  const Vec3<float> dt{step[0], step[1], step[2]}, domega{step[3], step[4], step[5]};
   const Quaternion<float> q =
       normalized(quaternion_exp(domega) * Quaternion<float>{pose[0], pose[1], pose[2], pose[3]});
   pose[0] = q.w, pose[1] = q.x, pose[2] = q.y, pose[3] = q.z;

@@ -7,9 +7,11 @@
 
 #include "core/macros.h"
 #include "core/vec.h"
+#include "kernels/depth_keyframes.h"
 #include "kernels/earlier_frame.h"
 #include "kernels/pixel_record.h"
 #include "kernels/robust_residual.h"
+#include "kernels/surface_point.h"
 #include "spslam/gauss_newton.h"
 
 namespace spslam {
@@ -28,13 +30,16 @@ SPS_INLINE ReferenceCorner reference_corner(const ReferenceImage& image, std::in
 }
 
 // Adds the difference between the reference's intensity at the projection of the world point and the pixel's own, in
-// units of `weight` m, to hessian and gradient (terms of type T), not to the cost. `pose` is that of the reference.
+// units of `weight` m, to hessian and gradient (terms of type T), not to the cost, and to those of the gain. `pose` is
+// where the reference's colors were taken, `scale` makes it as bright as the frame, `lever` is by how much the color's
+// pose moves with a step of the frame's.
 // Nothing where the point falls off the image, or on a cell without depth or of another depth.
 template <class T>
-SPS_INLINE void add_intensity_residual(const ReferenceImage& image, const Pose<float>& pose, const Pixel& pixel,
-                                       const Vec3<float>& world, const Vec3<float>& offset, T* terms) {
+SPS_INLINE void add_intensity_residual(const ReferenceImage& image, const Pose<float>& pose, float scale,
+                                       const Pixel& pixel, const SurfacePoint& point, float lever, T* terms,
+                                       T* gain_terms) {
   if (!(pixel.depth > 0.0f)) return;
-  const FrameProjection at = project_into_frame(pose, image.intrinsics, image.height, image.width, world);
+  const FrameProjection at = project_into_frame(pose, image.intrinsics, image.height, image.width, point.world);
   if (!at.inside) return;
   const ReferenceCorner c00 = reference_corner(image, at.row, at.column),
                         c01 = reference_corner(image, at.row, at.column + 1),
@@ -43,15 +48,16 @@ SPS_INLINE void add_intensity_residual(const ReferenceImage& image, const Pose<f
   const float tolerance = kReferenceDepthAgreement * at.in_camera.z;
   const auto agrees = [&](const ReferenceCorner& c) { return std::fabs(c.depth - at.in_camera.z) < tolerance; };
   if (!(agrees(c00) && agrees(c01) && agrees(c10) && agrees(c11))) return;
-  const BilinearValue intensity =
-      bilinear_value(c00.intensity, c01.intensity, c10.intensity, c11.intensity, at.a, at.b);
-  const float difference = intensity.value - luma(pixel.color);
-  const float x = intensity.by_u * image.intrinsics.fx * at.inverse_z;
-  const float y = intensity.by_v * image.intrinsics.fy * at.inverse_z;
+  const IntensityDifference difference = scaled_difference(
+      bilinear_value(c00.intensity, c01.intensity, c10.intensity, c11.intensity, at.a, at.b), scale, luma(pixel.color));
+  const float x = difference.by_u * image.intrinsics.fx * at.inverse_z;
+  const float y = difference.by_v * image.intrinsics.fy * at.inverse_z;
   const Vec3<float> by_point{x, y, -(x * at.in_camera.x + y * at.in_camera.y) * at.inverse_z};
-  const Vec3<float> slope = image.weight * (pose.rotation * by_point);
-  add_weighted_residual(offset, image.weight * difference, slope,
-                        static_cast<T>(robust_weight(difference, image.kernel)), terms);
+  const Vec3<float> slope = (lever * image.weight) * (pose.rotation * by_point);
+  const T weight = static_cast<T>(robust_weight(difference.value, image.kernel));
+  const float residual = image.weight * difference.value;
+  add_weighted_residual(point.offset, residual, slope, weight, terms);
+  add_gain_residual(point.offset, residual, slope, image.weight * difference.by_gain, weight, gain_terms);
 }
 
 }  // namespace spslam

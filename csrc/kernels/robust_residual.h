@@ -14,6 +14,9 @@ namespace spslam {
 // cost is that of the score weights.
 constexpr int kTrackingTerms = kNormalTerms + 3;
 
+// Of the frame's log gain, beside normal equations of its pose: by pose and gain, by the gain alone, its gradient.
+constexpr int kGainTerms = 8;
+
 // Widths (m) of the robust kernel.
 struct KernelWidths {
   float step;      // of the weights that move the pose
@@ -38,6 +41,17 @@ SPS_INLINE void add_weighted_residual(const Vec3<float>& offset, float residual,
   const T cost = terms[kNormalTerms - 1];
   add_normal_terms<T>(jacobian, static_cast<T>(residual), weight, terms);
   terms[kNormalTerms - 1] = cost;
+}
+
+// Adds what a residual's derivative by the frame's log gain, `by_gain`, adds to `gain_terms`; the rest is as of
+// `add_weighted_residual`.
+template <class T>
+SPS_INLINE void add_gain_residual(const Vec3<float>& offset, float residual, const Vec3<float>& slope, float by_gain,
+                                  T weight, T* gain_terms) {
+  const Vec3<float> by_rotation = cross(offset, slope);
+  const T row[kGainTerms] = {slope.x, slope.y, slope.z, by_rotation.x, by_rotation.y, by_rotation.z, by_gain, residual};
+  const T scaled = weight * static_cast<T>(by_gain);
+  for (int t = 0; t < kGainTerms; ++t) gain_terms[t] += scaled * row[t];
 }
 
 // Adds a residual (m) with its robust weight times `certainty`. The measures of fit, cost and sum of weights, use the

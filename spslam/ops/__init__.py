@@ -21,6 +21,7 @@ from spslam.ops.earlier_frames import (
     NO_MOTION,
     ColorTiming,
     DepthKeyframes,
+    Exposure,
     FrameMotion,
     ReferenceImage,
 )
@@ -78,6 +79,7 @@ __all__ = [
     "DrawnPixels",
     "EncodedFrame",
     "FrameFusion",
+    "Exposure",
     "FrameMotion",
     "GaussNewtonOptions",
     "GridLevel",

@@ -1,5 +1,6 @@
 """Earlier frames that `track_gauss_newton` compares a frame with, besides the map."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -12,37 +13,6 @@ from spslam.ops.scene_view import Intrinsics, check_intrinsics
 LUMA_WEIGHTS: tuple[int, int, int] = torch.ops.spslam.luma_weights()
 
 _MAX_DEPTH_KEYFRAMES = 8
-
-
-class ReferenceImage(NamedTuple):
-    """A small gray image of an earlier frame, to compare colors with.
-
-    Attributes:
-        cells: float32 [H, W, 2] intensity in [0, 1] (`LUMA_WEIGHTS`) and depth (m, 0 where unknown). A point is
-            compared where it falls between four cells whose depth agrees with its own to a tenth.
-        pose: float32 [7] T_world_camera of the frame, unit quaternion (w, x, y, z) and translation (m).
-        intrinsics: in cells: those of s x s pixels have focal lengths f / s and principal point (c + 1/2) / s - 1/2.
-        weight: m that an intensity difference of 1 counts as.
-        kernel: width of the robust kernel, intensity.
-    """
-
-    cells: torch.Tensor
-    pose: torch.Tensor
-    intrinsics: Intrinsics
-    weight: float
-    kernel: float
-
-    def check(self, function: str, like: torch.Tensor) -> None:
-        """Raises TypeError or ValueError, naming `function`, where something does not fit."""
-        check_tensor(function, "reference.cells", self.cells, ("H", "W", 2), torch.float32, like=like)
-        check_tensor(function, "reference.pose", self.pose, (7,), torch.float32, like=like)
-        check_intrinsics(function, self.intrinsics, "reference.intrinsics")
-        check(self.weight >= 0, function, "reference.weight", "be at least 0", self.weight)
-        check(self.kernel > 0, function, "reference.kernel", "be positive", self.kernel)
-
-    def arguments(self) -> tuple[list[torch.Tensor], list[float]]:
-        """What the schema takes: the enum ReferenceScalar in csrc/bindings/gauss_newton.cpp."""
-        return [self.cells, self.pose], [*self.intrinsics, self.weight, self.kernel]
 
 
 class FrameMotion(NamedTuple):
@@ -60,6 +30,49 @@ class FrameMotion(NamedTuple):
 
 
 NO_MOTION = FrameMotion(-1, 1.0)
+
+
+class ReferenceImage(NamedTuple):
+    """A small gray image of an earlier frame, to compare colors with.
+
+    Attributes:
+        cells: float32 [H, W, 2] intensity in [0, 1] (`LUMA_WEIGHTS`) and depth (m, 0 where unknown). A point is
+            compared where it falls between four cells whose depth agrees with its own to a tenth.
+        pose: float32 [7] T_world_camera of the frame, unit quaternion (w, x, y, z) and translation (m).
+        intrinsics: in cells: those of s x s pixels have focal lengths f / s and principal point (c + 1/2) / s - 1/2.
+        weight: m that an intensity difference of 1 counts as.
+        kernel: width of the robust kernel, intensity.
+        motion: how the camera came to the frame, its row being one of the poses of the depth keyframes: where these
+            have a timing, its colors are of when it took them.
+        log_gain: float32 [1] of the frame, see `Exposure`, for depth keyframes that have one; None takes its brightness
+            as it is.
+    """
+
+    cells: torch.Tensor
+    pose: torch.Tensor
+    intrinsics: Intrinsics
+    weight: float
+    kernel: float
+    motion: FrameMotion = NO_MOTION
+    log_gain: torch.Tensor | None = None
+
+    def check(self, function: str, like: torch.Tensor) -> None:
+        """Raises TypeError or ValueError, naming `function`, where something does not fit."""
+        check_tensor(function, "reference.cells", self.cells, ("H", "W", 2), torch.float32, like=like)
+        check_tensor(function, "reference.pose", self.pose, (7,), torch.float32, like=like)
+        check_intrinsics(function, self.intrinsics, "reference.intrinsics")
+        check(self.weight >= 0, function, "reference.weight", "be at least 0", self.weight)
+        check(self.kernel > 0, function, "reference.kernel", "be positive", self.kernel)
+        _check_motion(function, "reference.motion", self.motion)
+        if self.log_gain is not None:
+            check_tensor(function, "reference.log_gain", self.log_gain, (1,), torch.float32, like=like)
+
+    def arguments(self) -> tuple[list[torch.Tensor], list[float]]:
+        """What the schema takes: the enum ReferenceScalar in csrc/bindings/gauss_newton.cpp."""
+        tensors = [self.cells, self.pose]
+        if self.log_gain is not None:
+            tensors.append(self.log_gain)
+        return tensors, [*self.intrinsics, self.weight, self.kernel, *self.motion]
 
 
 class ColorTiming(NamedTuple):
@@ -82,9 +95,28 @@ class ColorTiming(NamedTuple):
         check_tensor(function, f"{name}.delay", self.delay, (1,), torch.float32, like=like)
         check(len(self.keyframes) == keyframes, function, name, f"have {keyframes} motions", len(self.keyframes))
         for motion in (self.frame, *self.keyframes):
-            fits = motion.row < 0 or (motion.row < poses and 1e-9 <= motion.seconds < 1e9)
-            check(fits, function, name, "name poses that are there and positive times", motion)
-            check(abs(motion.color_offset) < 1e9, function, name, "have finite color offsets", motion)
+            _check_motion(function, name, motion, poses)
+
+
+class Exposure(NamedTuple):
+    """By how much brighter some frames' images are than others', as a camera's automatic exposure makes them.
+
+    A frame's gain is the factor of its brightness against what all frames' would be. An earlier image is compared with
+    a frame as if it were as bright as that one, and at most white. The frame's own gain is an unknown beside its pose.
+
+    Attributes:
+        log_gains: float32 [F, 1] natural logarithms of the gains of the frames that `DepthKeyframes.poses` are of.
+        frame: float32 [1] that of the frame which is compared with them, as far as it is known.
+    """
+
+    log_gains: torch.Tensor
+    frame: torch.Tensor
+
+    def check(self, function: str, like: torch.Tensor, poses: int) -> None:
+        """Raises TypeError or ValueError, naming `function`, where something does not fit."""
+        name = "depth_keyframes.exposure"
+        check_tensor(function, f"{name}.log_gains", self.log_gains, (poses, 1), torch.float32, like=like)
+        check_tensor(function, f"{name}.frame", self.frame, (1,), torch.float32, like=like)
 
 
 class DepthKeyframes(NamedTuple):
@@ -102,6 +134,7 @@ class DepthKeyframes(NamedTuple):
         intensities: uint8 [R, H, W] intensity (`LUMA_WEIGHTS`) in 1/255, compared where the depth is and agrees with
             the point's own to 5 %; None compares none.
         timing: when they were taken; None takes each to be of the moment of its depth image.
+        exposure: how bright they are; None takes all to be as bright as one another.
     """
 
     images: torch.Tensor
@@ -113,6 +146,7 @@ class DepthKeyframes(NamedTuple):
     first_iteration: int = 0
     intensities: torch.Tensor | None = None
     timing: ColorTiming | None = None
+    exposure: Exposure | None = None
 
     def check(self, function: str, like: torch.Tensor) -> None:
         """Raises TypeError or ValueError, naming `function`, where something does not fit."""
@@ -134,6 +168,9 @@ class DepthKeyframes(NamedTuple):
         if self.timing is not None:
             check(self.intensities is not None, function, f"{name}.timing", "come with intensities", "none")
             self.timing.check(function, like, count, len(self.poses))
+        if self.exposure is not None:
+            check(self.intensities is not None, function, f"{name}.exposure", "come with intensities", "none")
+            self.exposure.check(function, like, len(self.poses))
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float], list[int]]:
         """What schemas take: the enums KeyframeScalar and KeyframeInteger in csrc/bindings/depth_keyframes.h."""
@@ -141,6 +178,13 @@ class DepthKeyframes(NamedTuple):
         motions = [NO_MOTION] * (1 + count) if timing is None else [timing.frame, *timing.keyframes]
         frame, *others = ((each.row, round(1e9 * each.seconds), round(1e9 * each.color_offset)) for each in motions)
         places = [place for row, motion in zip(self.rows, others, strict=True) for place in (*row, *motion)]
-        tensors = [self.images, self.poses, self.intensities, None if timing is None else timing.delay]
+        delay = None if timing is None else timing.delay
+        tensors = [self.images, self.poses, self.intensities, delay, *(self.exposure or ())]
         scalars = [*self.intrinsics, self.unit, self.kernel_end]
         return [one for one in tensors if one is not None], scalars, [self.first_iteration, *frame, *places]
+
+
+def _check_motion(function: str, name: str, motion: FrameMotion, poses: float = math.inf) -> None:
+    fits = motion.row < 0 or (motion.row < poses and 1e-9 <= motion.seconds < 1e9)
+    check(fits, function, name, "name poses that are there and positive times", motion)
+    check(abs(motion.color_offset) < 1e9, function, name, "have finite color offsets", motion)

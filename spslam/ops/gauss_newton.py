@@ -20,6 +20,10 @@ distances), and e0 = 0.3 px: images that are worse registered are so alike for n
 
 A reference image adds the photometric residual of direct methods (Kerl et al. 2013) for each pixel: the intensity I of
 an earlier frame at the projection of x, less the pixel's own, times a weight in meters.
+
+Where gains are known (`Exposure`), intensities of an earlier frame of log gain a count exp(b - a) times in both, at
+most 1; b, of the frame itself, is one more unknown, which the normal equations of the pose are solved without (Schur
+complement) and which then takes its own step, of at most 0.2.
 """
 
 import dataclasses
@@ -120,6 +124,7 @@ class GaussNewtonOptions:
 # Names and bounds, in the order of SPS_GAUSS_NEWTON_SCALARS in csrc/include/spslam/gauss_newton.h.
 _SCALARS = {field.name: field.metadata for field in dataclasses.fields(GaussNewtonOptions) if field.metadata}
 _ITERATIONS = 1  # among the integers
+_STATISTICS = 6  # of an iteration: kFrameStatSize of csrc/include/spslam/gauss_newton.h
 
 
 @public_op()
@@ -155,9 +160,10 @@ def track_gauss_newton(
             the statistics and H.
 
     Returns:
-        float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of pixels on
+        float32 [7] pose; float32 [iterations, 6] with the weighted mean squared residual (m^2), the share of pixels on
         mapped surface, the norms of the step in translation (m) and rotation (rad), and the mean weight over all pixels
-        (0 for those off the map), each before the iteration's step and with the weights of `options.score_kernel`;
+        (0 for those off the map), each before the iteration's step and with the weights of `options.score_kernel`, and
+        the log gain after it (0 where depth keyframes have no exposure);
         float32 [6, 6] H of the last iteration, scaled as if pixels weighed on average what those weights are, whatever
         they weigh by their depth and the iteration's kernel. The same to the bit every time on one device, and for any
         number of CPU threads.
@@ -189,7 +195,7 @@ def track_gauss_newton(
     if depth_keyframes is not None:
         depth_keyframes.check(name, like=scene.embeddings)
     found = trusted.track_gauss_newton(scene, pixels, pose, intrinsics, options, noise, reference, depth_keyframes)
-    return found[7:14], found[50:].view(-1, 5), found[14:50].view(6, 6)
+    return found[7:14], found[50:].view(-1, _STATISTICS), found[14:50].view(6, 6)
 
 
 @public_op()
@@ -244,7 +250,7 @@ def _(before, last):
 
 @torch.library.register_fake("spslam::track_gauss_newton")
 def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *_):
-    return frame[1].new_empty(50 + 5 * integers[_ITERATIONS])
+    return frame[1].new_empty(50 + _STATISTICS * integers[_ITERATIONS])
 
 
 @torch.library.register_fake("spslam::gauss_newton_poses")

@@ -74,7 +74,7 @@ def track_gauss_newton(
     """See `spslam.ops.track_gauss_newton`.
 
     Returns:
-        float32 [50 + 5 iterations], so that the host reads all in one go: the pose that tracking started from, the pose
+        float32 [50 + 6 iterations], so that the host reads all in one go: the pose that tracking started from, the pose
         that it found, H and the statistics of each iteration.
     """
     return torch.ops.spslam.track_gauss_newton(

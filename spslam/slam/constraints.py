@@ -77,7 +77,7 @@ class ConstraintSource:
         if keyframes is not None and not self._timing:
             keyframes = keyframes._replace(timing=None)
         if keyframes is not None and not self._color:
-            keyframes = keyframes._replace(intensities=None, timing=None)
+            keyframes = keyframes._replace(intensities=None, timing=None, exposure=None)
         return Constraints(history.noise, self._reference(history), keyframes, from_start, shutter)
 
     def _reference(self, history: FrameHistory) -> ops.ReferenceImage | None:
@@ -85,4 +85,5 @@ class ConstraintSource:
         if mapped is None or self._references is None:
             return None
         row, earlier = mapped
-        return self._references.get(row, earlier.records, earlier.pose)
+        image = self._references.get(row, earlier.records, earlier.pose)
+        return image._replace(motion=history.own_motion(row), log_gain=history.log_gain(row))

@@ -124,7 +124,12 @@ class FrameHistory:
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
         motion = self.motion(len(frames), depth_time, color_offset)
         timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
-        return selected._replace(timing=timing)
+        exposure = ops.Exposure(frames.log_gain_rows, frames.log_gain_rows[len(frames) - 1])
+        return selected._replace(timing=timing, exposure=exposure)
+
+    def log_gain(self, row: int) -> torch.Tensor:
+        """float32 [1] of the frame in a row, see `ops.Exposure`, on the device."""
+        return self._state.frames.log_gain_rows[row]
 
     def own_motion(self, row: int) -> ops.FrameMotion:
         """How the camera came to the frame of a row."""

@@ -40,6 +40,7 @@ class FrameTable:
         self._set_columns(
             {
                 "poses": torch.zeros(0, 7, device=device),
+                "log_gains": torch.zeros(0, 1, device=device),
                 "timestamps": torch.zeros(0, dtype=torch.float64),
                 "depth_times": torch.zeros(0, dtype=torch.float64),
                 "color_offsets": torch.zeros(0, dtype=torch.float64),
@@ -64,6 +65,17 @@ class FrameTable:
     def pose_rows(self) -> torch.Tensor:
         """float32 [F or more, 7] as `poses`, with the rows that are not in use yet: no view has to be made of them."""
         return self._columns["poses"]
+
+    @property
+    def log_gains(self) -> torch.Tensor:
+        """float32 [F, 1] of the frames' brightness, see `ops.Exposure`, on the device; a lost frame has that of the one
+        before."""
+        return self._columns["log_gains"][: self._count]
+
+    @property
+    def log_gain_rows(self) -> torch.Tensor:
+        """float32 [F or more, 1] as `log_gains`, with as many rows as `pose_rows`."""
+        return self._columns["log_gains"]
 
     @property
     def timestamps(self) -> torch.Tensor:
@@ -152,14 +164,22 @@ class FrameTable:
         consistent_frames: int = 0,
         offsets: CaptureOffsets = AT_ONCE,
         copies: RowCopies | None = None,
+        log_gain: torch.Tensor | None = None,
     ) -> None:
-        """Adds a row; with `copies`, what is on the device is written when these are made."""
+        """Adds a row; with `copies`, what is on the device is written when these are made.
+
+        `log_gain` float32 [1]; None takes that of the row before, 0 for the first.
+        """
         if self._count == self._columns["poses"].shape[0]:
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._set_columns({name: _with_capacity(column, capacity) for name, column in self._columns.items()})
         tables = [self._columns["poses"], self._columns["depth_thumbnails"]]
         values = [pose.to(tables[0]), depth_thumbnail.to(tables[1])]
-        write_rows(copies, tables, [self._count] * 2, values)
+        if log_gain is not None or self._count > 0:
+            gains = self._columns["log_gains"]
+            tables.append(gains)
+            values.append(gains[self._count - 1] if log_gain is None else log_gain)
+        write_rows(copies, tables, [self._count] * len(tables), values)
         numbers: dict[str, Any] = {
             "timestamps": timestamp,
             "depth_times": timestamp + offsets.depth,

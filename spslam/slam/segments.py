@@ -111,6 +111,9 @@ class Segments:
         poses = compose(place, inner.frames.matrices())
         rows = slice(segment.first, segment.first + len(poses))
         is_new = ~inner.frames.lost & state.frames.lost[rows]
+        # The newest frame is known to both.
+        gains = inner.frames.log_gains + (state.frames.log_gains[-1] - inner.frames.log_gains[-1])
+        state.frames.log_gains[rows] = gains
         for i in is_new.nonzero()[:, 0].tolist():
             state.frames.poses[segment.first + i] = pose_tensor(poses[i], state.scene.device)
         state.frames.lost[rows] &= ~is_new

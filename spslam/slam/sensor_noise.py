@@ -42,8 +42,17 @@ class SensorNoiseEstimate:
         """float32 [1] from the first row of a frame that is read to the last, s; as `color_delay`."""
         return self._readout
 
-    def measure(self, pixels: FramePixels, pose: torch.Tensor, depth_keyframes: ops.DepthKeyframes) -> None:
-        """Takes account of a frame at a trusted pose, float32 [7]; asynchronously."""
+    def measure(
+        self,
+        pixels: FramePixels,
+        pose: torch.Tensor,
+        depth_keyframes: ops.DepthKeyframes,
+        log_gain: torch.Tensor | None = None,
+    ) -> None:
+        """Takes account of a frame at a trusted pose, float32 [7], and gain, float32 [1]; asynchronously."""
+        exposure = depth_keyframes.exposure
+        if exposure is not None and log_gain is not None:
+            depth_keyframes = depth_keyframes._replace(exposure=exposure._replace(frame=log_gain))
         counts = TIMING_PIXELS, PIXELS
         ops.trusted.measure_frame_(
             self._noise, self._timing, pixels.records, pose, self._intrinsics, depth_keyframes, counts

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -63,25 +64,42 @@ def test_an_unlikely_pose_ends_the_row(recovery):
     assert (result.lost, result.consistent_frames) == (True, 0)
 
 
-def with_features(found, inliers, share=1.0, lost=False):
-    fit = replace(CERTAIN, feature_inliers=inliers, feature_share=share)
+def with_features(found, inliers, share=1.0, lost=False, weight=CERTAIN.mean_robust_weight):
+    fit = replace(CERTAIN, mean_robust_weight=weight, feature_inliers=inliers, feature_share=share)
     return TrackedFrame(torch.zeros(7), 8, fit, error_probability=found, lost=lost)
 
 
 @pytest.mark.parametrize(
-    ("other", "decides"),
+    ("other", "times", "decides"),
     [
-        (with_features(0.1, 130), True),
-        (with_features(0.1, 110), False),  # next to as many agree with both
-        (with_features(0.1, 130, share=math.nan), False),  # colors are not where depth is
-        (with_features(0.9, 130, lost=True), False),
+        (with_features(0.1, 130), 1.2, True),
+        (with_features(0.1, 110), 1.2, False),  # next to as many agree with both
+        (with_features(0.1, 110), 1.0, True),
+        (with_features(0.1, 90), 1.0, False),
+        (with_features(0.1, 110, weight=0.6), 1.0, False),  # surface agrees less than the features more
+        (with_features(0.1, 130, weight=0.6), 1.2, False),
+        (with_features(0.1, 90, weight=0.98), 1.0, True),
+        (with_features(0.1, 130, share=math.nan), 1.0, False),  # colors are not where depth is
+        (with_features(0.9, 130, lost=True), 1.0, False),
     ],
 )
-def test_far_more_image_features_decide_between_trusted_poses(other, decides):
+def test_surface_and_image_features_decide_between_trusted_poses(other, times, decides):
     likeliest = with_features(0.05, 100)
-    assert _by_features(likeliest, [likeliest, other]) is (other if decides else likeliest)
+    assert _by_features(likeliest, [likeliest, other], times) is (other if decides else likeliest)
+
+
+@pytest.mark.parametrize(("share", "taken"), [(1.0, 1), (math.nan, 0)])
+def test_of_results_that_are_one_pose_that_with_most_agreement_stands_for_all(recovery, monkeypatch, share, taken):
+    """Where colors are where depth is; else the one of the best fit."""
+    results = [
+        replace(with_features(0.05, n, share), pose=torch.tensor([1.0, 0, 0, 0, x, 0, 0]))
+        for n, x in ((100, 0.0), (140, 0.002))
+    ]
+    frame = SimpleNamespace(with_features=lambda fit, pose: fit)
+    monkeypatch.setattr(recovery, "_verify", lambda frame, tracked: tracked)
+    assert recovery._likeliest(frame, results).pose is results[taken].pose
 
 
 def test_few_image_features_decide_nothing():
     likeliest, other = with_features(0.05, 20), with_features(0.1, 50)
-    assert _by_features(likeliest, [likeliest, other]) is likeliest
+    assert _by_features(likeliest, [likeliest, other], 1.2) is likeliest

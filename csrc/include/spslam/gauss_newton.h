@@ -12,6 +12,15 @@ namespace spslam {
 
 // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean score weight over all pixels
 constexpr int kTrackingStatSize = 5;
+// Of tracking: these, and the natural logarithm of the frame's gain after the step.
+constexpr int kFrameStatSize = kTrackingStatSize + 1;
+
+// How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown. And by
+// how much later the frame's color was taken than its depth, s, as the stamps of the two say.
+struct FrameMotion {
+  std::int64_t row;
+  float seconds, color_offset;
+};
 
 // A small gray image of an earlier frame, which tracking compares colors with; none where height is 0.
 struct ReferenceImage {
@@ -21,6 +30,10 @@ struct ReferenceImage {
   Intrinsics intrinsics;  // in cells
   float weight;           // m that an intensity difference of 1 counts as
   float kernel;           // width of the robust kernel, intensity
+  // How the camera came to the frame, in rows of the depth keyframes' poses, and the logarithm [1] of the frame's gain:
+  // read where the depth keyframes have a delay, or gains.
+  FrameMotion motion;
+  const float* log_gain;
 };
 
 // The noise of a pixel's depth, and the variance of the difference between its intensity and an earlier image's, where
@@ -30,13 +43,6 @@ struct SensorNoise {
   float intensity_floor, intensity_growth;  // of [0, 1], px^2
 };
 constexpr int kSensorNoiseSize = 4;
-
-// How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown. And by
-// how much later the frame's color was taken than its depth, s, as the stamps of the two say.
-struct FrameMotion {
-  std::int64_t row;
-  float seconds, color_offset;
-};
 
 constexpr int kMaxDepthKeyframes = 8;
 
@@ -55,6 +61,9 @@ struct DepthKeyframes {
   // s, from a frame's depth image to its color image, beside what stamps say; null: they are of one moment.
   const float* color_delay;
   FrameMotion motions[kMaxDepthKeyframes], frame_motion;  // of each keyframe, and of the frame that is aligned
+  // Natural logarithms of gains, by how much brighter a frame's image is than others': [F] by rows of poses, and [1] of
+  // the frame that is aligned, as far as it is known. Null: all are alike.
+  const float *log_gains, *frame_log_gain;
 };
 
 // The scalars of GaussNewtonOptions, type and name, in the order of the fields of ops.GaussNewtonOptions: a line here
@@ -89,7 +98,7 @@ template <class Device>
 std::int64_t gauss_newton_workspace_size(Device device, std::int64_t frames, std::int64_t pixels);
 
 // One frame. pixels [num_records, 3] are drawn from anew in each iteration; pose [7] is read and overwritten; stats
-// [iterations, kTrackingStatSize]; hessian [36] of the last iteration, before damping.
+// [iterations, kFrameStatSize]; hessian [36] of the last iteration, before damping.
 template <class Device>
 void track_gauss_newton(Device device, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
                         const GaussNewtonOptions& options, void* workspace, float* pose, float* stats, float* hessian);

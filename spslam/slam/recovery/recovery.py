@@ -31,10 +31,10 @@ ANCHORS = 2  # stored frames that hold a pose beside the last one
 WEAK_EIGENVALUE = 0.004  # below it surface leaves a direction almost free: poses that slide fit, and are consistent
 UNSURE_EIGENVALUE = 0.01  # below it so may a pose that is far from its prediction
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
-MIN_GAIN = 0.02  # of mean robust weight; smaller differences come from the random choice of pixels
+MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
 MAX_VERIFIED = 4  # poses of a frame
-MORE_AGREEING = 1.2  # times as many image features decide between poses that are trusted
+MORE_AGREEING = 1.2  # times as much agreement decides for a pose that image features alone give
 MIN_DECIDING = 60  # features
 
 
@@ -62,6 +62,7 @@ class Recovery:
             fit,
             **self._judgement(fit),
             information=estimate.information,
+            log_gain=estimate.log_gain,
             on_host=None if numbers is None else (estimate.pose, numbers),
         )
 
@@ -273,19 +274,29 @@ class Recovery:
             seen: the pose of image features alone; as noise moves it by centimeters, it counts only where far more
                 features agree with it than with the likeliest.
         """
+        candidates = [replace(one, fit=frame.with_features(one.fit, one.pose)) for one in candidates]
         distinct: list[TrackedFrame] = []
+        kept: list[int] = []  # their numbers
         weights = [candidate.weight + MIN_GAIN * (i == 0) for i, candidate in enumerate(candidates)]
         for i in sorted(range(len(candidates)), key=lambda i: -weights[i]):
             if distinct and weights[i] < distinct[0].weight - MAX_LOSS:
                 break
-            if not any(candidates[i].is_same(other) for other in distinct):
+            same = next((k for k, other in enumerate(distinct) if candidates[i].is_same(other)), None)
+            if same is None:
                 distinct.append(candidates[i])
+                kept.append(i)
+            elif self._favored(candidates, i) > self._favored(candidates, kept[same]):
+                distinct[same], kept[same] = candidates[i], i
         verified = [self._verify(frame, candidate) for candidate in distinct[:MAX_VERIFIED]]
         found = min(verified, key=lambda tracked: self._rank(tracked, anywhere))
         if anywhere:
             return found
-        others = [] if seen is None else [self._verify(frame, seen)]
-        return _by_features(found, [*verified, *others])
+        found = _by_features(found, verified)
+        return found if seen is None else _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
+
+    @staticmethod
+    def _favored(candidates: Sequence[TrackedFrame], i: int) -> float:
+        return candidates[i].agreement * (1 + MIN_GAIN * (i == 0))
 
     def _rank(self, tracked: TrackedFrame, anywhere: bool) -> float:
         fit = tracked.fit
@@ -333,10 +344,13 @@ class Recovery:
         return replace(tracked, lost=True, consistent_frames=frames)
 
 
-def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame]) -> TrackedFrame:
-    """The likeliest result, or a trusted one that far more image features agree with: on a young map, or far away, one
-    that has slid along a wall fits as well."""
-    least = max(MORE_AGREEING * found.fit.feature_inliers, MIN_DECIDING)
-    agreeing = [other for other in others if not other.lost and other.fit.feature_inliers >= least]
-    known = [other for other in agreeing if not math.isnan(other.fit.feature_share)]
-    return max(known, key=lambda other: other.fit.feature_inliers, default=found)
+def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: float = 1.0) -> TrackedFrame:
+    """The likeliest result, or a trusted one with which surface and image features agree that many times more.
+
+    On a young map, or far away, one that has slid along a wall fits as well; one that stopped half-way may be nearer to
+    the prediction.
+    """
+    known = [other for other in others if not other.lost and not math.isnan(other.fit.feature_share)]
+    seen = [other for other in known if other.fit.feature_inliers >= MIN_DECIDING]
+    best = max(seen, key=lambda other: other.agreement, default=found)
+    return best if best.agreement > times * found.agreement else found

@@ -31,6 +31,7 @@ class TrackedFrame:
             last of them.
         features: of the image, where they were needed.
         information: of the pose, see `PoseEstimate`; None where it was not tracked.
+        log_gain: float32 [1] of the frame, on the device, see `ops.Exposure`; None where it was not tracked.
         on_host: a pose, and its seven numbers, which were read with its fit; of the frame's if it is the same object.
     """
 
@@ -45,6 +46,7 @@ class TrackedFrame:
     consistent_frames: int = 0
     features: ImageFeatures | None = None
     information: np.ndarray | None = field(default=None, compare=False)
+    log_gain: torch.Tensor | None = field(default=None, compare=False)
     on_host: tuple[torch.Tensor, tuple[float, ...]] | None = field(default=None, compare=False)
 
     @classmethod
@@ -69,6 +71,13 @@ class TrackedFrame:
         """Mean robust weight, 0 to 1; that of a pose of NaN is below all others."""
         weight = self.fit.mean_robust_weight
         return -math.inf if math.isnan(weight) else weight
+
+    @property
+    def agreement(self) -> float:
+        """How well surface and, where colors are where depth is, image features agree with the pose: a gain of a tenth
+        of either counts alike."""
+        inliers = 1.0 if math.isnan(self.fit.feature_share) else self.fit.feature_inliers
+        return max(self.weight, 0.0) * inliers
 
     def is_same(self, other: "TrackedFrame") -> bool:
         """Whether another result is the same pose up to noise; waits for the device."""
