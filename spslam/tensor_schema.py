@@ -108,9 +108,11 @@ def _check_graph(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
         frame, reference = tensors["graph.anchors"].amax(0).tolist()
         if frame >= sizes["frames"] or reference >= count:
             raise SpslamError(f"tensor graph.anchors must name frames and keyframes below {count}")
-    done, _ = tensors["graph.numbers"].tolist()
+    done, begun = tensors["graph.numbers"].tolist()
     if not 0 <= done <= count or max(sizes["keyframes_at_start"], sizes["keyframes_moved"]) > count:
         raise SpslamError(f"tensors graph.numbers, graph.start and graph.target must be of {count} keyframes at most")
+    if begun >= 0 and sizes["keyframes_at_start"] == 0:
+        raise SpslamError("tensor graph.start must have poses where graph.numbers has a solution begun")
     for name in ("waiting_measured", "waiting_correction", "start", "target", "anchor_poses"):
         _check_rigid(f"graph.{name}", tensors[f"graph.{name}"])
 

@@ -38,9 +38,11 @@ struct DepthKeyframe {
   float scale;     // its intensities times this are as bright as the frame that is aligned
 };
 
-// By how much brighter than a frame of one log gain is one of another.
+// By how much brighter than a frame of one log gain is one of another. In the dark nothing tells the gain, so that two
+// frames' may differ by any number; the scale stays finite.
+constexpr float kMostLogScale = 20.0f;
 SPS_INLINE float brightness_scale(float log_gain, float own) {
-  return std::exp(own - log_gain);
+  return std::exp(smaller(larger(own - log_gain, -kMostLogScale), kMostLogScale));
 }
 
 // The image in a row, of a frame at a pose.

@@ -182,6 +182,22 @@ def test_white_is_no_darker_than_what_would_be_brighter(device, generator):
     torch.testing.assert_close(poses[0], poses[1], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("frame", [200.0, -200.0])
+def test_black_images_whose_gains_are_any_number_say_nothing(device, generator, frame):
+    records = _painted(corner_pixels(POSE, generator, 400), 1.0).to(device)
+    keyframes = _keyframes([1.0, 1.0], device, frame=frame)
+    keyframes = keyframes._replace(intensities=torch.zeros_like(keyframes.intensities))
+    plain = keyframes._replace(intensities=None, exposure=None)
+    poses = [
+        ops.track_gauss_newton(
+            ops.SceneView.empty(device=device), records, pose7(POSE, device), INTRINSICS, ONE_STEP,
+            noise=noise_model(*NOISE, device=device), depth_keyframes=each,
+        )[0]
+        for each in (keyframes, plain)
+    ]  # fmt: skip
+    torch.testing.assert_close(poses[0], poses[1], rtol=0, atol=1e-6)
+
+
 def test_noise_is_measured_as_bright_as_the_frame(device, generator):
     records = _painted(corner_pixels(POSE, generator, 3000), 1.5).to(device)
     models = {}

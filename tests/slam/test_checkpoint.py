@@ -66,6 +66,14 @@ def refused(load, change, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_solution_that_was_begun_from_no_poses_is_refused(load):
+    def change(tensors, header):
+        tensors["graph.numbers"][1] = 1
+        tensors["graph.start"] = tensors["graph.start"][:0].clone()
+
+    refused(load, change, "graph.start must have poses")
+
+
 def test_an_unchanged_checkpoint_is_read(load, checkpoint):
     source, state = load(lambda tensors, header: None)
     assert source == SOURCE
