@@ -19,7 +19,7 @@ from tests.fuzz.worker import run_cases
 
 ROOT = Path(__file__).parents[2]
 NAMES = list(all_formats())
-CASES = 250  # of each format
+CASES = 200  # of each format
 HELD: list[bytearray] = []
 
 

@@ -193,7 +193,8 @@ def test_full_sizes_give_as_good_a_path(view):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("view", ["depth", pytest.param("color", marks=pytest.mark.sweep)])
+@pytest.mark.sweep
+@pytest.mark.parametrize("view", ["depth", "color"])
 def test_a_phone_gives_as_good_a_path(view):
     color = Lens(wide(1920, 1440))
     check("1920x1440, depth 256x192, one view", color, Lens(color.camera.resized(256, 192)), np.eye(4), view)
