@@ -133,7 +133,7 @@ def uses_process(reader: str, device: torch.device) -> bool:
 
 
 def automatic_workers(device: torch.device) -> int:
-    """Number of reading threads for a run on `device`: three of four cores for a GPU, one of four beside CPU kernels."""
+    """Number of reading threads for a run on `device`: three of four cores for a GPU, one of four beside kernels."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = 3 * cores // 4 if device.type == "cuda" else cores // 4
     return min(max(wanted, MIN_WORKERS), MAX_WORKERS)
