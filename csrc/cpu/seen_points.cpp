@@ -106,30 +106,22 @@ class DrawnDepth {
     }
   }
 
-  // What is nearer than its 3 x 3 neighbors hides what lies between them: an erosion and a dilation of what is far.
   void close_gaps() {
     for_each_row([this](std::int64_t row) {
-      const float *above = drawn_ + (row - 1) * stride_, *own = above + stride_, *below = own + stride_;
+      const float* own = drawn_ + row * stride_;
       float* to = lowest_ + row * stride_;
-      SPS_SIMD for (std::int32_t u = 1; u <= frame_.width; ++u) {
-        to[u] = smaller(least(above + u), smaller(least(own + u), least(below + u)));
-      }
+      SPS_SIMD for (std::int32_t u = 1; u <= frame_.width; ++u) to[u] = least_around(own + u, stride_);
     });
     for_each_row([this](std::int64_t row) {
-      const float *above = lowest_ + (row - 1) * stride_, *own = above + stride_, *below = own + stride_;
+      const float* own = lowest_ + row * stride_;
       float* to = drawn_ + row * stride_;
-      SPS_SIMD for (std::int32_t u = 1; u <= frame_.width; ++u) {
-        to[u] = smaller(to[u], larger(most(above + u), larger(most(own + u), most(below + u))));
-      }
+      SPS_SIMD for (std::int32_t u = 1; u <= frame_.width; ++u) to[u] = smaller(to[u], most_around(own + u, stride_));
     });
   }
 
   float front(std::int32_t place) const { return drawn_[place]; }
 
  private:
-  static SPS_INLINE float least(const float* at) { return smaller(at[-1], smaller(at[0], at[1])); }
-  static SPS_INLINE float most(const float* at) { return larger(at[-1], larger(at[0], at[1])); }
-
   template <class F>
   void for_each_row(const F& f) {
     parallel_for(frame_.height, kRowGrain, [&](std::int64_t begin, std::int64_t end) {

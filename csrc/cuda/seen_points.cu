@@ -2,28 +2,6 @@
 #include "launch/seen_points.h"
 
 namespace spslam {
-namespace {
-
-// The depth of the nearest points around a pixel of the depth buffer with its border: the least of 3 x 3.
-__device__ float lowest_drawn(const float* drawn, std::int64_t stride) {
-  float lowest = kNothingDrawn;
-  for (int row = -1; row <= 1; ++row) {
-    for (int column = -1; column <= 1; ++column) lowest = smaller(drawn[row * stride + column], lowest);
-  }
-  return lowest;
-}
-
-// The drawn depth at a pixel with gaps closed: the largest of the lowest ones around, if that is nearer.
-__device__ float closed_front(const float* drawn, const float* lowest, std::int64_t stride) {
-  float closed = 0.0f;
-  for (int row = -1; row <= 1; ++row) {
-    for (int column = -1; column <= 1; ++column) closed = larger(lowest[row * stride + column], closed);
-  }
-  return smaller(*drawn, closed);
-}
-
-}  // namespace
-
 template <>
 void see_points<Cuda>(Cuda device, const SeenSurface& surface, const SeenFrame& frame, std::uint8_t* colors,
                       float* weights, void* workspace) {
@@ -46,7 +24,7 @@ void see_points<Cuda>(Cuda device, const SeenSurface& surface, const SeenFrame& 
   });
   for_each(device, std::int64_t{frame.width} * frame.height, [=] __device__(std::int64_t i) {
     const std::int64_t place = (i / frame.width + 1) * stride + i % frame.width + 1;
-    lowest[place] = lowest_drawn(drawn + place, stride);
+    lowest[place] = least_around(drawn + place, stride);
   });
   for_each(device, surface.count, [=] __device__(std::int64_t i) {
     float weight = 0.0f;
@@ -59,7 +37,7 @@ void see_points<Cuda>(Cuda device, const SeenSurface& surface, const SeenFrame& 
       const std::int32_t pixel = nearest_pixel(frame, at.u, at.v, at.z, frame.width);
       if (pixel >= 0) {
         const std::int64_t place = (pixel / frame.width + 1) * stride + pixel % frame.width + 1;
-        const float front = closed_front(drawn + place, lowest + place, stride);
+        const float front = smaller(drawn[place], most_around(lowest + place, stride));
         const float measured = frame.depth[pixel];
         weight = seen_weight(frame, at.z, seen_cosine(pose, world, {n[0], n[1], n[2]}), front, measured);
         if (weight > 0.0f) seen_color(frame, at.u, at.v, color);

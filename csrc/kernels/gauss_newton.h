@@ -23,7 +23,7 @@ constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms + kAllGainTerms;
 // Beyond this the decoder's tanh is saturated and its slope says nothing about where the surface is.
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
-constexpr double kMaxGainStep = 0.2;       // of the logarithm: exposure changes by less from one frame to the next
+constexpr double kMaxGainStep = 0.2;       // of the logarithm, in one iteration
 
 // The earlier frames that a call compares with and the sensor's noise, read once.
 struct EarlierFrames {

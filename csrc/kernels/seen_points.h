@@ -74,6 +74,22 @@ SPS_INLINE bool sphere_in_view(const SeenFrame& frame, const Pose<float>& pose, 
   return !((at.z + radius <= kNearestSeen) | (outside & (at.z >= kAroundRadii * radius)));
 }
 
+// The least and the most of the 3 x 3 numbers around one in a buffer with so many columns. Points' depths are drawn
+// into a depth buffer; what is nearer than its neighbors hides what lies between them: of the least ones the most, an
+// erosion and a dilation of what is far.
+SPS_INLINE float least_of_three(const float* at) {
+  return smaller(at[-1], smaller(at[0], at[1]));
+}
+SPS_INLINE float most_of_three(const float* at) {
+  return larger(at[-1], larger(at[0], at[1]));
+}
+SPS_INLINE float least_around(const float* at, std::int64_t columns) {
+  return smaller(least_of_three(at - columns), smaller(least_of_three(at), least_of_three(at + columns)));
+}
+SPS_INLINE float most_around(const float* at, std::int64_t columns) {
+  return larger(most_of_three(at - columns), larger(most_of_three(at), most_of_three(at + columns)));
+}
+
 // Cosine of the angle between a point's normal and the way to the camera.
 SPS_INLINE float seen_cosine(const Pose<float>& pose, const Vec3<float>& world, const Vec3<float>& normal) {
   const Vec3<float> ray = world - pose.translation;

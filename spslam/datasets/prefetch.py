@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -13,6 +14,11 @@ from spslam.errors import DatasetError
 
 Frame = TypeVar("Frame")
 ReadFrame = TypeVar("ReadFrame", covariant=True)
+
+
+def usable_cores() -> int:
+    """Number of cores that this process may run on, at least 1."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Readable(Protocol[ReadFrame]):

@@ -1,6 +1,5 @@
 """Asynchronous reading: frames are read, decoded, sampled and uploaded ahead of need, here or in another process."""
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -10,7 +9,7 @@ import torch
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.prefetch import Prefetcher, prefetch
+from spslam.datasets.prefetch import Prefetcher, prefetch, usable_cores
 from spslam.errors import DatasetError
 from spslam.run.frozen_frames import FrozenFrames
 from spslam.run.reader_launch import has_standby
@@ -134,6 +133,6 @@ def uses_process(reader: str, device: torch.device) -> bool:
 
 def automatic_workers(device: torch.device) -> int:
     """Number of reading threads for a run on `device`: three of four cores for a GPU, one of four beside kernels."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     wanted = 3 * cores // 4 if device.type == "cuda" else cores // 4
     return min(max(wanted, MIN_WORKERS), MAX_WORKERS)

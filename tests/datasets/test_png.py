@@ -125,8 +125,23 @@ def test_everything_else_is_left_to_opencv(content):
     assert decode_png(content, 1) is None
 
 
-def test_ignored_chunks():
-    assert np.array_equal(decode_png(png(IMAGE, [4] * 6, extra=chunk(b"gAMA", bytes(4))), 1), IMAGE)
+IGNORED = {
+    b"cHRM": struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000),
+    b"gAMA": struct.pack(">I", 45455),
+    b"sRGB": b"\0",
+    b"pHYs": struct.pack(">IIB", 2835, 2835, 1),
+    b"tEXt": b"Software\0a camera",
+    b"tIME": struct.pack(">HBBBBB", 2026, 11, 25, 12, 0, 0),
+    b"bKGD": struct.pack(">H", 7),
+    b"eXIf": b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0",  # to be turned by 90 degrees
+}
+
+
+@pytest.mark.parametrize("name", IGNORED)
+def test_chunks_that_opencv_ignores_too(name):
+    content = png(IMAGE, [4] * 6, extra=chunk(name, IGNORED[name]))
+    assert np.array_equal(decode_png(content, 1), IMAGE)
+    assert np.array_equal(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED), IMAGE)
 
 
 def outcome(read, content):

@@ -1,5 +1,7 @@
 """Asynchronous reading of frames: order, content, times and upload."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,6 @@ import torch
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.frozen_depth import FROZEN
 from spslam.errors import DatasetError
-from spslam.run import frame_feed
 from spslam.run.frame_feed import FrameFeed, automatic_workers
 from spslam.slam.image_features import extract_features
 from spslam.slam.pixels import sample_frame
@@ -96,5 +97,5 @@ def test_upload_does_not_synchronize():
     [(1, "cpu", 2), (2, "cpu", 2), (16, "cpu", 4), (1, "cuda", 2), (64, "cuda", 16), (16, "cuda", 12)],
 )
 def test_number_of_threads_depends_on_cores_and_device(monkeypatch, cores, kind, workers):
-    monkeypatch.setattr(frame_feed.os, "sched_getaffinity", lambda _: range(cores), raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(cores), raising=False)
     assert automatic_workers(torch.device(kind)) == workers
