@@ -6,9 +6,10 @@
 54,000 frames are half an hour at 30 Hz. Without --rate each frame comes when the one before is tracked, so that none is
 dropped, whatever else the machine does.
 
-Each row is the time since the first frame, frames tracked and dropped up to then, latency (p99 of the last frames), the
-process's memory (resident; of that what is no file's), and what grows or could: map, stored pixels, keyframes and edges
-of the graph, frames whose image features are kept, and the frames' own rows.
+Each row is the time since the first frame, frames tracked and dropped up to then, latency (p99 of the last frames),
+processor time per frame since the row before (which other programs disturb less than latency), the process's memory
+(resident; of that what is no file's), and what grows or could: map, stored pixels, keyframes and edges of the graph,
+frames whose image features are kept, and the frames' own rows.
 """
 
 from __future__ import annotations
@@ -57,15 +58,19 @@ class MemoryLog(RunObserver):
 
     def begin(self, run: ObservedRun, state: SlamState) -> None:
         self._state, self._began = state, time.monotonic()
+        self._processor_s = time.process_time()
 
     def observe(self, report: FrameReport, frame: RgbdFrame | None = None) -> None:
         if (report.frame + 1) % self._every:
             return
+        processor_s, before = time.process_time(), self._processor_s
+        self._processor_s = processor_s
         row = {
             "minutes": (time.monotonic() - self._began) / 60,
             "frames": self.status.frames,
             "dropped": self.status.dropped,
             "p99_ms": self.status.latencies.recent_p99(),
+            "processor_ms": 1e3 * (processor_s - before) / self._every,
             **memory_mb(),
             **held(self._state),
         }

@@ -15,6 +15,11 @@ class GraphOptions(Section):
         "register keyframes with one another, close loops, and make the map again where poses moved",
         needs=(need(is_("prior.enabled", True)),),
     )
+    loops: bool = option(
+        "close loops that image features find; without, only keyframes that share surface where they are known are "
+        "registered",
+        needs=(_GRAPH,),
+    )
     every: int = option("frames between two solutions of the graph", "frames", needs=(_GRAPH,), ge=1)
     max_translation_m: float = option(
         "distance from the last keyframe at which a frame becomes one; less where the surface is near: 0.15 of its "

@@ -294,7 +294,7 @@ class GlobalMapping:
             for keyframe in keyframes[len(self._surfaces) :]:
                 self._surfaces.add(keyframe)
             graph = KeyframeGraph(registrar, self._surfaces, content)
-            update = graph.update(keyframes, links, poses, spacing)
+            update = graph.update(keyframes, links, poses, spacing, options.loops)
             registrar.forget()  # else Python's garbage collector does, minutes later
             return content, update
 

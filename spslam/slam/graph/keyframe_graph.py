@@ -93,7 +93,12 @@ class KeyframeGraph:
         self._loops = LoopFinder(registrar)
 
     def update(
-        self, keyframes: Sequence[Keyframe], links: Sequence[Link], poses: np.ndarray, spacing: tuple[float, float]
+        self,
+        keyframes: Sequence[Keyframe],
+        links: Sequence[Link],
+        poses: np.ndarray,
+        spacing: tuple[float, float],
+        with_loops: bool = True,
     ) -> GraphUpdate:
         """Takes in new keyframes, solves, and leaves out what shows nothing new.
 
@@ -102,10 +107,11 @@ class KeyframeGraph:
             links: of each keyframe to the one before.
             poses: float64 [K, 4, 4] T_world_camera as they are known.
             spacing: of two keyframes that follow each other, m (less where surface is near) and rad.
+            with_loops: whether loops are looked for.
         """
         first = self.content.done
         self._join(keyframes, first, links, poses)
-        loops, decisions = self.find_loops(keyframes, first, poses)
+        loops, decisions = self.find_loops(keyframes, first, poses) if with_loops else ([], [])
         self.content.done = len(keyframes)
         poses, refused = self.close(keyframes, poses, loops)
         decisions = after_refusal(decisions, refused)
