@@ -20,6 +20,8 @@ LATE_S = 0.02
 # Of the features that agree with the earlier frame seen best: those of a frame that shares fewer contradict no pose, as
 # where the camera has turned away from it they lie at the edge of both images.
 FEW_FEATURES = 0.3
+MIN_TELLING = 60  # matches with an earlier frame
+MIN_AGREEING = 0.25  # of them; a pose with which fewer agree has slid away from where they are
 MAX_TURN_DEG_S = 300.0  # of a camera; what moves faster in the image has jumped
 
 
@@ -76,6 +78,16 @@ class DoubtfulFrame:
             within = [self.image.inliers(one, pose, self.late_px) for one in telling]
             shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, telling, strict=True)]
         return replace(fit, feature_inliers=max(inliers, default=0), feature_share=min(shares, default=math.nan))
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether earlier frames have many matches, and with the pose that these were counted at agree only a few."""
+        telling = [one for one in self.matches if len(one) >= MIN_TELLING]
+        return (
+            self.colors_are_registered
+            and len(telling) > 0
+            and all(one.agreeing < MIN_AGREEING * len(one) for one in telling)
+        )
 
     @property
     def colors_are_registered(self) -> bool:

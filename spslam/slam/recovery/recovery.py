@@ -29,7 +29,10 @@ LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
 OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
 ANCHORS = 2  # stored frames that hold a pose beside the last one
 WEAK_EIGENVALUE = 0.004  # below it surface leaves a direction almost free: poses that slide fit, and are consistent
-UNSURE_EIGENVALUE = 0.01  # below it so may a pose that is far from its prediction
+UNSURE_EIGENVALUE = 0.01  # below it so may a pose that was not predicted well
+# Farther from the prediction, the brightness of earlier images, whose basin is a pixel or two, may not bring the pose
+# back in a direction that surface leaves free.
+UNSURE_CM, UNSURE_DEG = 1.0, 0.7
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
@@ -123,9 +126,10 @@ class Recovery:
 
     def _may_have_slid(self, tracked: TrackedFrame) -> bool:
         """Whether surface leaves a direction so free that image features are asked."""
-        tracking = self._config.tracking
-        least = UNSURE_EIGENVALUE if tracked.fit.is_far_from_prediction else WEAK_EIGENVALUE
-        return tracking.features and tracking.recovery and tracked.fit.min_eigenvalue < least
+        tracking, fit = self._config.tracking, tracked.fit
+        is_unsure = fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG
+        least = UNSURE_EIGENVALUE if is_unsure else WEAK_EIGENVALUE
+        return tracking.features and tracking.recovery and fit.min_eigenvalue < least
 
     def _held(
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
@@ -147,7 +151,7 @@ class Recovery:
         frame = replace(frame, matches=tuple(image.counted(one, pose) for one in matches))
         held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.read)
         held = self._judged(held)
-        if held.weight > tracked.weight - MAX_LOSS:
+        if held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted:
             return held
         return self._recover(problem, tracked, pixels, history, image)
 
