@@ -21,6 +21,7 @@ from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report, p
 from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
 from spslam.slam.interpreter import interpreter_shared
+from spslam.slam.localizer import Localizer
 from spslam.slam.mapper import Mapper, MappingTask
 from spslam.slam.multi_map import MultiMap
 from spslam.slam.pixels import FramePixels
@@ -87,6 +88,7 @@ class FramePipeline:
         confidence = PoseConfidenceModel.load()
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
         self.recovery = Recovery(config, camera, self.tracker, confidence)
+        self._localizer = Localizer(self.tracker, self.recovery, self._rectifier)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
         self.first_pose = np.eye(4)
         self._prior = prior
@@ -153,7 +155,7 @@ class FramePipeline:
             predicted, shutter, pixels = self._predict(read, frame.depth_time)
             times = frame.depth_time, frame.offsets.color
             constraints = self.constraints.gather(self.history, pixels, *times, shutter)
-        tracked = self._track(pixels, predicted, constraints, number, events)
+        tracked = self._track(pixels, predicted, constraints, number, events, read)
         shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
         pixels = read if shutter is None else self._rectifier.frame(read, shutter)
         self._store(frame, pixels, constraints, tracked)
@@ -219,6 +221,7 @@ class FramePipeline:
         number: int,
         to_be_mapped: bool = False,
         constraints: Constraints | None = None,
+        read: FramePixels | None = None,
     ) -> TrackedFrame:
         """The pose of a frame against the map and the frames before it; changes nothing.
 
@@ -228,13 +231,14 @@ class FramePipeline:
             number: of the frame; keys its random draws.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted; it is then checked for occlusion.
             constraints: beside the map's; None gathers them.
+            read: the frame as it was read, where `pixels` are as of predicted motion.
         """
         if self._has_too_little_depth(pixels):
             return TrackedFrame.untracked(predicted.clone(), lost=True)
         constraints = self.constraints.gather(self.history, pixels) if constraints is None else constraints
         problem = TrackingProblem(self.state.scene, pixels.records, predicted, number, constraints)
-        estimate = self.tracker.track(problem, self.while_tracking)
-        return self.recovery.resolve(problem, estimate, pixels, self.history, to_be_mapped)
+        read = pixels if read is None else read
+        return self._localizer.localize(problem, pixels, read, self.history, to_be_mapped, self.while_tracking)
 
     @property
     def _has_map(self) -> bool:
@@ -290,6 +294,7 @@ class FramePipeline:
         constraints: Constraints,
         number: int,
         events: FrameEvents,
+        read: FramePixels,
     ) -> TrackedFrame:
         """Finds the pose; `predicted` is None where there is no map yet."""
         if predicted is None:
@@ -300,7 +305,7 @@ class FramePipeline:
             has_depth = not self._has_too_little_depth(pixels)
             tracked = self._other_maps.find_camera(pixels, number, self.history.noise, has_depth)
         else:
-            tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints)
+            tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints, read)
         events.tracking = (begin, self._record())
         return tracked
 

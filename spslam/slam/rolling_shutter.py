@@ -1,5 +1,6 @@
 """Frames of a rolling shutter, as of their middle row's moment; see `spslam.ops.rolling_shutter`."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from spslam.slam.state import SlamState
 # rad, m, during the readout, as in csrc/kernels/rolling_shutter.h: what moves by more has jumped.
 MAX_READOUT_MOTION = 0.15
 MIN_DEPTH_M = 0.05  # of a point that is projected
+BENT_PX = 0.25  # by which rows of an image must be off to matter, the first and the last
 
 
 class ShutterRectifier:
@@ -81,6 +83,14 @@ class ShutterRectifier:
             self._unit,
         )
         return pixels.having(records=records, depth_image=depth, intensity_image=intensity)
+
+    def bends(self, motion: ops.ShutterMotion, turn_deg: float) -> bool:
+        """Whether a frame rectified by a motion is bent where the camera turned by so much more or less; may wait for
+        the device."""
+        turn_px = self._image_intrinsics.fy * math.radians(turn_deg)
+        if not turn_px > 2 * BENT_PX:  # a readout takes no longer than a frame
+            return False
+        return turn_px * abs(float(motion.readout)) > 2 * BENT_PX * motion.seconds
 
     def features(self, features: ImageFeatures, motion: ops.ShutterMotion) -> ImageFeatures:
         """Image features of the frame as it was read, rectified; waits for the device."""

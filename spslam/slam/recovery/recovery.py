@@ -11,7 +11,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
-from spslam.slam.image_features import extract_features
+from spslam.slam.image_features import ImageFeatures, extract_features
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches, joined_too
@@ -36,6 +36,7 @@ UNSURE_CM, UNSURE_DEG = 1.0, 0.7
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
+MAX_NOISE = 0.1  # of mean robust weight, that noise of image features takes from the right pose
 MAX_VERIFIED = 4  # poses of a frame
 MORE_AGREEING = 1.2  # times as much agreement decides for a pose that image features alone give
 MIN_DECIDING = 60  # features
@@ -76,6 +77,7 @@ class Recovery:
         pixels: FramePixels,
         history: FrameHistory,
         to_be_mapped: bool,
+        read: ImageFeatures | None = None,
     ) -> TrackedFrame:
         """The frame's best pose: the estimate or, if it is doubtful, the best one from other initial poses.
 
@@ -85,13 +87,14 @@ class Recovery:
             pixels: of the frame.
             history: the frames before.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
+            read: its image features as they were read; None extracts them where they are needed.
         """
         tracked = self.judge(estimate)
         if history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked):
-            tracked = self._recover(problem, tracked, pixels, history)
+            tracked = self._recover(problem, tracked, pixels, history, self._features(problem, pixels, history, read))
         else:
             if self._may_have_slid(tracked):
-                tracked = self._held(problem, tracked, pixels, history)
+                tracked = self._held(problem, tracked, pixels, history, read)
             is_unchecked = math.isnan(tracked.fit.occluded_share)
             if to_be_mapped and is_unchecked and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT:
                 tracked = self._check_occlusion(problem, tracked, pixels, history)
@@ -132,10 +135,15 @@ class Recovery:
         return tracking.features and tracking.recovery and fit.min_eigenvalue < least
 
     def _held(
-        self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
+        self,
+        problem: TrackingProblem,
+        tracked: TrackedFrame,
+        pixels: FramePixels,
+        history: FrameHistory,
+        read: ImageFeatures | None,
     ) -> TrackedFrame:
         """The pose held by image features in directions that surface leaves free, where there are enough of them."""
-        row, image = history.last_row(), self._features(problem, pixels, history)
+        row, image = history.last_row(), self._features(problem, pixels, history, read)
         if row is None or image is None or tracked.information is None:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
@@ -174,7 +182,7 @@ class Recovery:
         first: TrackedFrame,
         pixels: FramePixels,
         history: FrameHistory,
-        image: FeatureAlignment | None = None,
+        image: FeatureAlignment | None,
     ) -> TrackedFrame:
         """The best result from the prediction and the last trusted frame; if that is lost, also from similar frames.
 
@@ -183,9 +191,8 @@ class Recovery:
             first: the result from the prediction.
             pixels: of the frame.
             history: the frames before.
-            image: its image features; None extracts them.
+            image: its image features; None where these are not used.
         """
-        image = self._features(problem, pixels, history) if image is None else image
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
         frame, starts = self._starts_at_last(frame, first)
         candidates, iterations = self._track_from(frame, first, starts), 0
@@ -207,12 +214,14 @@ class Recovery:
         return replace(found, iterations=iterations, features=frame.image.read if frame.image else None)
 
     def _features(
-        self, problem: TrackingProblem, pixels: FramePixels, history: FrameHistory
+        self, problem: TrackingProblem, pixels: FramePixels, history: FrameHistory, read: ImageFeatures | None
     ) -> FeatureAlignment | None:
+        """The frame's image features where they are used; extracts those that were not `read`."""
         tracking = self._config.tracking
         if not (tracking.features and tracking.recovery):
             return None
-        features = read = extract_features(pixels, self._camera, self._config.dataset.max_depth_m)
+        read = extract_features(pixels, self._camera, self._config.dataset.max_depth_m) if read is None else read
+        features = read
         if problem.constraints.shutter is not None:
             features = self._rectifier.features(read, problem.constraints.shutter)
         keyframes = problem.constraints.depth_keyframes
@@ -276,7 +285,7 @@ class Recovery:
             candidates: the first is taken among equals.
             anywhere: whether the camera may be anywhere, so that the predicted pose says nothing.
             seen: the pose of image features alone; as noise moves it by centimeters, it counts only where far more
-                features agree with it than with the likeliest.
+                features agree with it than with the likeliest, and surface does not contradict it.
         """
         candidates = [replace(one, fit=frame.with_features(one.fit, one.pose)) for one in candidates]
         distinct: list[TrackedFrame] = []
@@ -296,7 +305,9 @@ class Recovery:
         if anywhere:
             return found
         found = _by_features(found, verified)
-        return found if seen is None else _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
+        if seen is None or seen.weight < found.weight - MAX_NOISE:
+            return found
+        return _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
 
     @staticmethod
     def _favored(candidates: Sequence[TrackedFrame], i: int) -> float:
@@ -332,14 +343,17 @@ class Recovery:
 
         The error probability is computed without the prediction error. It must be at most
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
-        frames with consistent poses.
+        frames with consistent poses. Where surface leaves a direction free, a pose that slid fits as well, and only
+        image features tell at once.
         """
         is_consistent = (
             tracked.fit.prediction_error_cm < CONSISTENT_CM and tracked.fit.prediction_error_deg < CONSISTENT_DEG
         )
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
         tracked = self._judged(replace(tracked, fit=fit))
-        if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
+        is_held = fit.min_eigenvalue >= UNSURE_EIGENVALUE or fit.feature_inliers >= MIN_DECIDING
+        is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
+        if is_certain and is_held and not tracked.lost:
             return replace(tracked, consistent_frames=0)
         is_likely = tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
         frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(is_consistent))

@@ -1,7 +1,7 @@
 """A frame's pose as tracking and recovery leave it."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -65,6 +65,16 @@ class TrackedFrame:
         if self.on_host is not None and self.is_on_host:
             return pose7_to_matrix(np.array(self.on_host[1]))
         return pose7_to_matrix(self.pose.cpu().double().numpy())
+
+    def after(self, first: "TrackedFrame") -> "TrackedFrame":
+        """This result with what was done for another one of the same frame before."""
+        return replace(
+            self,
+            iterations=first.iterations + self.iterations,
+            recovered=first.recovered or self.recovered,
+            relocalized=first.relocalized or self.relocalized,
+            features=first.features if self.features is None else self.features,
+        )
 
     @property
     def weight(self) -> float:
