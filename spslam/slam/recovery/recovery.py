@@ -32,7 +32,7 @@ WEAK_EIGENVALUE = 0.004  # below it surface leaves a direction almost free: pose
 UNSURE_EIGENVALUE = 0.01  # below it so may a pose that was not predicted well
 # Farther from the prediction, the brightness of earlier images, whose basin is a pixel or two, may not bring the pose
 # back in a direction that surface leaves free.
-UNSURE_CM, UNSURE_DEG = 1.0, 0.7
+UNSURE_CM, UNSURE_DEG = 0.5, 0.35
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
@@ -285,7 +285,7 @@ class Recovery:
             candidates: the first is taken among equals.
             anywhere: whether the camera may be anywhere, so that the predicted pose says nothing.
             seen: the pose of image features alone; as noise moves it by centimeters, it counts only where far more
-                features agree with it than with the likeliest, and surface does not contradict it.
+                features agree with it than with the likeliest, and a trusted one fits surface hardly better.
         """
         candidates = [replace(one, fit=frame.with_features(one.fit, one.pose)) for one in candidates]
         distinct: list[TrackedFrame] = []
@@ -305,7 +305,7 @@ class Recovery:
         if anywhere:
             return found
         found = _by_features(found, verified)
-        if seen is None or seen.weight < found.weight - MAX_NOISE:
+        if seen is None or not (found.lost or seen.weight > found.weight - MAX_NOISE):
             return found
         return _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
 
@@ -343,17 +343,14 @@ class Recovery:
 
         The error probability is computed without the prediction error. It must be at most
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
-        frames with consistent poses. Where surface leaves a direction free, a pose that slid fits as well, and only
-        image features tell at once.
+        frames with consistent poses.
         """
         is_consistent = (
             tracked.fit.prediction_error_cm < CONSISTENT_CM and tracked.fit.prediction_error_deg < CONSISTENT_DEG
         )
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
         tracked = self._judged(replace(tracked, fit=fit))
-        is_held = fit.min_eigenvalue >= UNSURE_EIGENVALUE or fit.feature_inliers >= MIN_DECIDING
-        is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
-        if is_certain and is_held and not tracked.lost:
+        if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
             return replace(tracked, consistent_frames=0)
         is_likely = tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
         frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(is_consistent))
