@@ -36,9 +36,10 @@ def surface_counts(
     depth_thumbnails: torch.Tensor,
     camera: Camera,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How many surface points of other frames a frame sees, looks through, and has occluded by something nearer.
+    """How many surface points of other frames a frame sees, looks through, and has occluded by something nearer that
+    they do not know.
 
-    Points are counted in the `BEST_FRAMES` that share most surface with it.
+    A column before a wall hides another part of it from each frame, and is no occlusion. Points are counted in the `BEST_FRAMES` that share most surface with it.
 
     Args:
         vertices: float32 [H, W, 3], m, the frame's vertex map in its own axes; z = 0 where unknown.
@@ -62,10 +63,25 @@ def surface_counts(
     depth = torch.where(inside, vertices[..., 2].flatten()[cell], 0)
     tolerance = TOLERANCE_M + TOLERANCE_SHARE * z
     behind = (depth - z) / tolerance
-    kinds = torch.stack([behind.abs() < 1, behind > CLEAR_TOLERANCES, behind < -CLEAR_TOLERANCES]) & (depth > 0)
-    counts = kinds.sum(2)
+    is_seen = (behind.abs() < 1) & (depth > 0)
+    before = behind < -CLEAR_TOLERANCES
+    kinds = torch.stack([is_seen, behind > CLEAR_TOLERANCES, before & ~_is_known(is_seen, cell, (rows, columns))])
+    counts = (kinds & (depth > 0)).sum(2)
     best = (counts[0] + counts[1]).argsort(descending=True, stable=True)[:BEST_FRAMES]
     return counts[:, best].sum(1), best
+
+
+def _is_known(is_seen: torch.Tensor, cell: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Whether what the frame shows at each point's cell, or next to it, is surface that another point lies on.
+
+    Args:
+        is_seen: bool [F, N], points on the frame's surface.
+        cell: int64 [F, N] in the frame's vertex map, of `size`.
+    """
+    count = torch.zeros(size[0] * size[1], dtype=torch.int32, device=cell.device)
+    count = count.scatter_add(0, cell.flatten(), is_seen.flatten().int()).view(1, 1, *size)
+    near = torch.nn.functional.max_pool2d((count > 0).float(), 3, 1, 1)
+    return near.flatten()[cell] > 0
 
 
 def _thumbnail_points(depth_thumbnails: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
