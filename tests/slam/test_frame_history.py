@@ -1,5 +1,7 @@
 """What tracking asks of the frames before: which are alike, and whether a pose looks through known surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -166,13 +168,35 @@ def test_what_hides_surface_is_told_from_a_wrong_pose(dataset, pixels):
     assert occluded_share > 0.3
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_column_that_is_known_hides_nothing(dataset, is_known):
+    """A column before a wall: seen from 4 cm further on in each frame, it is in front of another part of the wall."""
+    camera = dataset.camera
+    k = np.arange(6)
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = 0.04 * k
+
+    def seen(number, has_column):
+        at = camera.cx + camera.fx * (0.3 - 0.04 * number)
+        is_column = has_column & (np.abs(np.arange(camera.width) - at) < 0.15 * camera.fx)
+        depth = np.tile(np.where(is_column, 1.0, 2.0), (camera.height, 1)).astype(np.float32)
+        return sample_frame(replace(dataset[0], depth=depth), camera, settings())
+
+    vertices, _, intrinsics = surface_maps(seen(5, True), camera)
+    thumbnails = torch.stack([seen(number, is_known).depth_thumbnail for number in k[:5]])
+    known = torch.from_numpy(matrix_to_pose7(poses[:5])).float()
+    counts, _ = surface_counts(vertices, intrinsics, pose_tensor(poses[5], CPU), known, thumbnails, camera)
+    occluded_share = surface_shares(*counts.tolist(), UNKNOWN_SHARE)[1]
+    assert occluded_share < 0.02 if is_known else occluded_share > 0.15
+
+
 def test_counts_by_the_formula(dataset, pixels, device):
     """Point by point in NumPy."""
     camera, rows = dataset.camera, [0, 5, 10]
     pose = dataset.poses()[12]
     pose[:3, 3] += [0.1, -0.1, 0.2]
     vertices, _, k = surface_maps(pixels[12], camera)
-    counts = [0, 0, 0]
+    counts, hidden, known = [0, 0, 0], [], np.zeros(vertices.shape[:2], bool)
     for row in rows:
         into = np.linalg.inv(pose) @ dataset.poses()[row]
         depth_thumbnail = pixels[row].depth_thumbnail.double().numpy()
@@ -186,7 +210,11 @@ def test_counts_by_the_formula(dataset, pixels, device):
             behind, tolerance = float(vertices[i, j, 2]) - z, 0.05 + 0.02 * z
             counts[0] += abs(behind) < tolerance
             counts[1] += behind > 1.5 * tolerance
-            counts[2] += behind < -1.5 * tolerance
+            known[i, j] |= abs(behind) < tolerance
+            if behind < -1.5 * tolerance:
+                hidden.append((i, j))
+    # What is nearer hides only where it is not known itself.
+    counts[2] = sum(not known[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].any() for i, j in hidden)
     found, best = surface_counts(
         vertices.to(device),
         k,

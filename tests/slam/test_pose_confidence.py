@@ -90,6 +90,20 @@ def test_image_features_hold_what_surface_leaves_free():
     assert error_probability(GOOD, **{**wall, "feature_share": math.nan}, feature_inliers=200) > 0.5
 
 
+def test_features_that_hold_a_pose_speak_for_it():
+    """Where the motion model was wrong, and where images are blurred."""
+    far = dict(prediction_error_cm=20.0, prediction_error_deg=8.0, brightness_correlation=0.45)
+    held = dict(feature_inliers=100, feature_share=0.9)
+    assert error_probability(GOOD, **far) > 0.5
+    assert error_probability(GOOD, **far, **held) == pytest.approx(
+        error_probability(GOOD, **held, prediction_error_cm=0.0, prediction_error_deg=0.0)
+    )
+    for unsure in ({"feature_inliers": 40}, {"feature_share": 0.7}):
+        assert error_probability(GOOD, **far, **{**held, **unsure}) > 0.1
+    anywhere = dict(prediction_error_cm=math.nan, prediction_error_deg=math.nan, brightness_correlation=0.45)
+    assert error_probability(GOOD, **anywhere, **held) > 0.5
+
+
 def test_an_unknown_measure_counts_between_right_and_wrong():
     for name, wrong in (("free_space_violation", 0.3), ("prediction_error_cm", 50.0)):
         unknown = error_probability(GOOD, **{name: math.nan})

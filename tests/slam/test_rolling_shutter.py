@@ -1,5 +1,6 @@
 """Late colors and rolling shutters through the whole system: their times are found, and poses are those of depth."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from spslam import ops
+from spslam.camera import Camera
 from spslam.config import load_config
 from spslam.datasets.clock import CaptureOffsets
 from spslam.datasets.registry import open_sequence
@@ -184,3 +186,21 @@ def test_times_are_found_and_heeded():
 def test_a_camera_of_one_moment_is_found_to_be_one():
     noise = turning(0, 0).system.state.noise
     assert float(noise.color_delay) == float(noise.readout) == 0.0
+
+
+@pytest.mark.slow
+def test_a_turn_that_was_not_predicted_is_tracked_again(monkeypatch):
+    again = turning(0, 20)
+    monkeypatch.setattr("spslam.slam.rolling_shutter.BENT_PX", 1e9)
+    assert again.ate_cm < 0.95 * turning(0, 20).ate_cm
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "readout_s", "is_bent"),
+    [(1, 0.02, True), (1, -0.02, True), (0.2, 0.02, False), (1, 0.002, False), (1, 0.0, False), (math.nan, 0.02, False)],
+)
+def test_a_frame_is_bent_by_a_turn_that_was_not_predicted(turn_deg, readout_s, is_bent):
+    """A degree in 33 ms turns the first row of 20 ms by 0.3 degrees, that is 0.7 px of this camera."""
+    rectifier = ShutterRectifier(Camera(160, 120, 138.0, 138.0, 79.5, 59.5), 10.0)
+    still = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
+    assert rectifier.bends(ops.ShutterMotion(still, still, 1 / 30, torch.tensor([readout_s])), turn_deg) == is_bent

@@ -132,7 +132,7 @@ class PoseConfidenceModel:
         )
         if math.isnan(error):
             return self.unknown_prediction_error
-        if self._is_held_by_features(fit):
+        if self._is_held_by_features(fit) and fit.inlier_share > 0:
             return 0.0
         # Features that agree with the pose say nothing of the motion model, which may then be wrong.
         is_confirmed = fit.feature_inliers >= self.min_feature_inliers

@@ -59,6 +59,15 @@ def test_what_is_seen_again_removes_drift(there_and_back, drift):
     assert drift < 0.01 or any(decision.accepted for decision in update.decisions)
 
 
+def test_loops_are_left_out_where_they_are_not_wanted(there_and_back):
+    frames, truth = there_and_back
+    graph, start = graph_of(frames), drifted(truth, 0.015)
+    update = graph.update(frames, links(start), start, SPACING, with_loops=False)
+    assert update.decisions == ()
+    kinds = {edge.kind for edge in graph.content.edges}
+    assert "covisible" in kinds and "loop" not in kinds
+
+
 def test_loops_are_decided_on_with_reasons(there_and_back):
     frames, truth = there_and_back
     graph = graph_of(frames)
