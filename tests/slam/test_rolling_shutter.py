@@ -197,10 +197,10 @@ def test_a_turn_that_was_not_predicted_is_tracked_again(monkeypatch):
 
 @pytest.mark.parametrize(
     ("turn_deg", "readout_s", "is_bent"),
-    [(1, 0.02, True), (1, -0.02, True), (0.2, 0.02, False), (1, 0.002, False), (1, 0.0, False), (math.nan, 0.02, False)],
+    [(1, 0.02, True), (1, -0.02, True), (0.2, 0.02, False), (1, 0.002, False), (1, 0, False), (math.nan, 0.02, False)],
 )
 def test_a_frame_is_bent_by_a_turn_that_was_not_predicted(turn_deg, readout_s, is_bent):
     """A degree in 33 ms turns the first row of 20 ms by 0.3 degrees, that is 0.7 px of this camera."""
     rectifier = ShutterRectifier(Camera(160, 120, 138.0, 138.0, 79.5, 59.5), 10.0)
-    still = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
-    assert rectifier.bends(ops.ShutterMotion(still, still, 1 / 30, torch.tensor([readout_s])), turn_deg) == is_bent
+    still, readout = torch.tensor([1.0, 0, 0, 0, 0, 0, 0]), torch.tensor([float(readout_s)])
+    assert rectifier.bends(ops.ShutterMotion(still, still, 1 / 30, readout), turn_deg) == is_bent

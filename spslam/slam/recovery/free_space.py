@@ -39,7 +39,8 @@ def surface_counts(
     """How many surface points of other frames a frame sees, looks through, and has occluded by something nearer that
     they do not know.
 
-    A column before a wall hides another part of it from each frame, and is no occlusion. Points are counted in the `BEST_FRAMES` that share most surface with it.
+    A column before a wall hides another part of it from each frame, and is no occlusion. Points are counted in the
+    `BEST_FRAMES` that share most surface with it.
 
     Args:
         vertices: float32 [H, W, 3], m, the frame's vertex map in its own axes; z = 0 where unknown.

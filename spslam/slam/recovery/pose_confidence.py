@@ -139,7 +139,7 @@ class PoseConfidenceModel:
         return min(error, self.unknown_prediction_error) if is_confirmed else error
 
     def _missing_correlation(self, fit: Fit) -> float:
-        # Images that are blurred while the camera turns correlate less; features that hold the pose tell more than they.
+        # Images that are blurred while the camera turns correlate less; features that hold the pose tell more.
         if math.isnan(fit.brightness_correlation) or self._is_held_by_features(fit):
             return 0.0
         return max(self.min_brightness_correlation - fit.brightness_correlation, 0.0)
