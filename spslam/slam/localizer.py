@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from spslam import ops
 from spslam.slam.fit import prediction_error
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
@@ -50,38 +51,33 @@ class Localizer:
             to_be_mapped: whether the frame is to be mapped if its pose is trusted; it is then checked for occlusion.
             meanwhile: as of `Tracker.track`.
         """
+        shutter = problem.constraints.shutter
         estimate = self._tracker.track(problem, meanwhile)
-        if self._is_bent(problem, estimate.fit.prediction_error_deg):
-            problem, pixels = self._rectified(problem, read, estimate.pose)
+        if shutter is not None and self._rectifier.bends(shutter, estimate.fit.prediction_error_deg):
+            problem, pixels = self._rectified(problem, read, shutter._replace(pose=estimate.pose))
             again = self._tracker.track_from(problem, estimate.pose)
             estimate = replace(again, iterations=estimate.iterations + again.iterations)
         tracked = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped)
-        if tracked.lost or not self._is_bent(problem, _turn_deg(problem, tracked)):
+        shutter = problem.constraints.shutter
+        # The pose that the frame was rectified by is the one that was tracked, unless it was recovered from elsewhere.
+        if shutter is None or tracked.lost or not tracked.recovered:
             return tracked
-        problem, pixels = self._rectified(problem, read, tracked.pose)
+        if not self._rectifier.bends(shutter, _turn_deg(shutter.pose, tracked.pose)):
+            return tracked
+        problem, pixels = self._rectified(problem, read, shutter._replace(pose=tracked.pose))
         estimate = self._tracker.track_from(problem, tracked.pose)
         found = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped, tracked.features)
         return tracked if found.lost else found.after(tracked)
 
-    def _is_bent(self, problem: TrackingProblem, turn_deg: float) -> bool:
-        """Whether the frame was rectified by a motion from which the one found differs by a turn that shows."""
-        shutter = problem.constraints.shutter
-        return shutter is not None and self._rectifier.bends(shutter, turn_deg)
-
     def _rectified(
-        self, problem: TrackingProblem, read: FramePixels, pose: torch.Tensor
+        self, problem: TrackingProblem, read: FramePixels, motion: ops.ShutterMotion
     ) -> tuple[TrackingProblem, FramePixels]:
-        """The frame as the motion to a pose float32 [7] has it."""
-        assert problem.constraints.shutter is not None
-        shutter = problem.constraints.shutter._replace(pose=pose)
-        pixels = self._rectifier.frame(read, shutter)
-        constraints = replace(problem.constraints, shutter=shutter)
+        """The frame as a motion has it."""
+        pixels = self._rectifier.frame(read, motion)
+        constraints = replace(problem.constraints, shutter=motion)
         return replace(problem, records=pixels.records, constraints=constraints), pixels
 
 
-def _turn_deg(problem: TrackingProblem, tracked: TrackedFrame) -> float:
-    """Between the pose that a frame was rectified by and one found from other starts, degrees; waits for the device."""
-    shutter = problem.constraints.shutter
-    if shutter is None or not tracked.recovered:
-        return 0.0
-    return prediction_error(shutter.pose.tolist(), tracked.pose.tolist())[1]
+def _turn_deg(pose: torch.Tensor, other: torch.Tensor) -> float:
+    """Between two poses float32 [7], degrees; waits for the device."""
+    return prediction_error(pose.tolist(), other.tolist())[1]

@@ -188,13 +188,6 @@ def test_a_camera_of_one_moment_is_found_to_be_one():
     assert float(noise.color_delay) == float(noise.readout) == 0.0
 
 
-@pytest.mark.slow
-def test_a_turn_that_was_not_predicted_is_tracked_again(monkeypatch):
-    again = turning(0, 20)
-    monkeypatch.setattr("spslam.slam.rolling_shutter.BENT_PX", 1e9)
-    assert again.ate_cm < 0.95 * turning(0, 20).ate_cm
-
-
 @pytest.mark.parametrize(
     ("turn_deg", "readout_s", "is_bent"),
     [(1, 0.02, True), (1, -0.02, True), (0.2, 0.02, False), (1, 0.002, False), (1, 0, False), (math.nan, 0.02, False)],
