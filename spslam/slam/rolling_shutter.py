@@ -85,8 +85,12 @@ class ShutterRectifier:
         return pixels.having(records=records, depth_image=depth, intensity_image=intensity)
 
     def bends(self, motion: ops.ShutterMotion, turn_deg: float) -> bool:
-        """Whether a frame rectified by a motion is bent where the camera turned by so much more or less; may wait for
-        the device."""
+        """Whether a frame that was rectified by a motion is bent; may wait for the device.
+
+        Args:
+            motion: that motion.
+            turn_deg: by how much the camera turned otherwise since the frame before, degrees; NaN bends nothing.
+        """
         turn_px = self._image_intrinsics.fy * math.radians(turn_deg)
         if not turn_px > 2 * BENT_PX:  # a readout takes no longer than a frame
             return False

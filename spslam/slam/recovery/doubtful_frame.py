@@ -20,8 +20,8 @@ LATE_S = 0.02
 # Of the features that agree with the earlier frame seen best: those of a frame that shares fewer contradict no pose, as
 # where the camera has turned away from it they lie at the edge of both images.
 FEW_FEATURES = 0.3
-MIN_TELLING = 60  # matches with an earlier frame
-MIN_AGREEING = 0.25  # of them; a pose with which fewer agree has slid away from where they are
+MIN_DECIDING = 60  # features, or matches with an earlier frame: fewer decide nothing
+MIN_AGREEING = 0.25  # of such matches; a pose with which fewer agree has slid away from where they are
 MAX_TURN_DEG_S = 300.0  # of a camera; what moves faster in the image has jumped
 
 
@@ -82,7 +82,7 @@ class DoubtfulFrame:
     @property
     def is_contradicted(self) -> bool:
         """Whether earlier frames have many matches, and with the pose that these were counted at agree only a few."""
-        telling = [one for one in self.matches if len(one) >= MIN_TELLING]
+        telling = [one for one in self.matches if len(one) >= MIN_DECIDING]
         return (
             self.colors_are_registered
             and len(telling) > 0

@@ -77,7 +77,11 @@ def _is_known(is_seen: torch.Tensor, cell: torch.Tensor, size: tuple[int, int]) 
 
     Args:
         is_seen: bool [F, N], points on the frame's surface.
-        cell: int64 [F, N] in the frame's vertex map, of `size`.
+        cell: int64 [F, N] in the frame's vertex map.
+        size: rows and columns of that map.
+
+    Returns:
+        bool [F, N].
     """
     count = torch.zeros(size[0] * size[1], dtype=torch.int32, device=cell.device)
     count = count.scatter_add(0, cell.flatten(), is_seen.flatten().int()).view(1, 1, *size)

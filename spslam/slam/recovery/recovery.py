@@ -13,7 +13,7 @@ from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import ImageFeatures, extract_features
 from spslam.slam.pixels import FramePixels
-from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
+from spslam.slam.recovery.doubtful_frame import MIN_DECIDING, DoubtfulFrame
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches, joined_too
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
@@ -36,10 +36,9 @@ UNSURE_CM, UNSURE_DEG = 0.5, 0.35
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
-MAX_NOISE = 0.1  # of mean robust weight, that noise of image features takes from the right pose
+MAX_FEATURE_NOISE = 0.1  # of mean robust weight, that noise of image features takes from the right pose
 MAX_VERIFIED = 4  # poses of a frame
 MORE_AGREEING = 1.2  # times as much agreement decides for a pose that image features alone give
-MIN_DECIDING = 60  # features
 
 
 class Recovery:
@@ -305,7 +304,7 @@ class Recovery:
         if anywhere:
             return found
         found = _by_features(found, verified)
-        if seen is None or not (found.lost or seen.weight > found.weight - MAX_NOISE):
+        if seen is None or not (found.lost or seen.weight > found.weight - MAX_FEATURE_NOISE):
             return found
         return _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
 
