@@ -16,6 +16,7 @@ from spslam.ops.depth_image_alignment import (
     compare_depth_images,
 )
 from spslam.ops.depth_planes import measure_planes
+from spslam.ops.descriptors import nearest_descriptors
 from spslam.ops.earlier_frames import (
     LUMA_WEIGHTS,
     NO_MOTION,
@@ -129,6 +130,7 @@ __all__ = [
     "mlp_num_params",
     "mlp_params_from",
     "mlp_to_sequential",
+    "nearest_descriptors",
     "neus_alpha",
     "new_gradient_sums",
     "new_voxel_hash",

@@ -222,6 +222,11 @@ def _random_embeddings(generator, device, n):
     return on_device(device, dict(voxel_coords=random_coords(generator, n), seed=5))
 
 
+def _descriptors(generator, device, n):
+    drawn = (torch.randint(0, 256, (count, 32), generator=generator) for count in (n, 70))
+    return on_device(device, {name: each.to(torch.uint8) for name, each in zip(("descriptors", "others"), drawn)})
+
+
 def _marching_cubes(generator, device, n):
     side = torch.arange(max(n, 1), dtype=torch.int32)
     coords = torch.stack([side, side // 2, side // 3], 1)[:n]
@@ -287,6 +292,7 @@ CASES = {
     "track_adam": Case(scene_cases.track_adam),
     "optimize_map_": Case(scene_cases.optimize_map),
     "predict_pose": Case(scene_cases.predict),
+    "nearest_descriptors": Case(_descriptors),
     "copy_rows_": Case(scene_cases.copy_rows),
     "projective_icp": Case(scene_cases.icp),
     "frame_overlap": Case(scene_cases.overlap),

@@ -98,6 +98,7 @@ ELSEWHERE = {
     "add_color_detail_": "test_seen_points.test_detail_of_edges",
     "align_depth_images": "test_depth_image_alignment.test_pairs_without_images_and_poses_that_are_not_finite_stay",
     "compare_depth_images": "test_depth_image_alignment.test_pairs_without_images_and_poses_that_are_not_finite_stay",
+    "nearest_descriptors": "test_descriptors.test_nearest_are_those_of_numpy",
     "copy_rows_": "test_copy_rows.test_as_single_assignments",
     "projective_icp": "test_projective_icp.test_holes_and_strangers_take_no_part",
 }

@@ -90,8 +90,9 @@ def test_matches_are_those_of_a_plain_search():
     distances = np.unpackbits(descriptors[:, None] ^ earlier[None], axis=2).sum(2)
     two = np.sort(distances, 1)[:, :2]
     expected = [(i, distances[i].argmin()) for i in range(30) if two[i, 0] < 0.8 * two[i, 1]]
-    np.testing.assert_array_equal(ratio_matches(descriptors, earlier), expected)
-    assert len(ratio_matches(descriptors, earlier[:1])) == len(ratio_matches(descriptors[:0], earlier)) == 0
+    tensor = torch.from_numpy(descriptors)
+    np.testing.assert_array_equal(ratio_matches(tensor, earlier), expected)
+    assert len(ratio_matches(tensor, earlier[:1])) == len(ratio_matches(tensor[:0], earlier)) == 0
 
 
 @pytest.mark.parametrize("apart", [4, 12])  # 6 cm and 7 degrees, 19 cm and 22 degrees

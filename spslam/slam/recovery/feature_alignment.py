@@ -7,11 +7,13 @@ three-point solver within RANSAC (OpenCV's `solvePnPRansac`), refined on all inl
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 import torch
 
+from spslam import ops
 from spslam.camera import Camera
 from spslam.geometry import inverse
 from spslam.pose_graph import cross_matrices, rotation_matrices, rotation_vectors
@@ -26,7 +28,8 @@ MIN_ERROR_PX = 1.0  # which features of a small image have anyway
 MIN_INLIERS = 20  # fewer may agree by chance, or lie on one small thing
 RANSAC_ITERATIONS = 500
 RANSAC_CONFIDENCE = 0.999
-HELD_ITERATIONS = 6
+HELD_ITERATIONS = 6  # at most; none after one that moved the pose by less than SMALL_STEP
+SMALL_STEP = 1e-5  # m and rad, a hundredth of what either matters
 INDEPENDENT_FEATURES = 50  # as many a frame's are worth: those of one earlier frame are off by the same
 WIDE = 3.0  # times the error of an inlier, the width of the robust kernel
 MIN_DEPTH_M = 0.05
@@ -63,6 +66,7 @@ class FeatureAlignment:
         motion: from the frame's depth to its color image; None where they are of one moment. Poses that are taken and
             returned are those of depth.
         read: the features as they were read, where `features` are rectified.
+        device: that compares descriptors.
 
     Attributes:
         features: see the argument.
@@ -77,7 +81,9 @@ class FeatureAlignment:
         camera: Camera,
         motion: ColorMotion | None = None,
         read: ImageFeatures | None = None,
+        device: torch.device | str = "cpu",
     ):
+        self._device = torch.device(device)
         self.features, self.read = features, features if read is None else read
         self._motion = motion
         k = depth_image_intrinsics(camera)
@@ -87,7 +93,7 @@ class FeatureAlignment:
 
     def matches(self, earlier: ImageFeatures, pose: torch.Tensor) -> FeatureMatches:
         """Matches with the features of an earlier frame whose color image is of a pose float32 [7]."""
-        pairs = ratio_matches(self.features.descriptors, earlier.descriptors)
+        pairs = ratio_matches(self._descriptors, earlier.descriptors)
         to_world = pose_matrix(pose)
         local, positions = (
             one.astype(np.float64) for one in (earlier.points[pairs[:, 1]], self.features.positions[pairs[:, 0]])
@@ -159,12 +165,15 @@ class FeatureAlignment:
             share = min(1.0, INDEPENDENT_FEATURES / agreeing) / error_px**2
             weights = share / (1 + ratio / WIDE**2) ** 2
             change = np.r_[at[:3, 3] - before[:3, 3], rotation_vectors(at[:3, :3] @ before[:3, :3].T)]
-            normal = information + np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians)
-            gradient = information @ change + np.einsum("n,nki,nk->i", weights, jacobians, residuals)
+            weighted = weights[:, None, None] * jacobians
+            normal = information + np.einsum("nki,nkj->ij", weighted, jacobians)
+            gradient = information @ change + np.einsum("nki,nk->i", weighted, residuals)
             step = -np.linalg.solve(normal + np.eye(6), gradient)
             at = at.copy()
             at[:3, 3] += step[:3]
             at[:3, :3] = rotation_matrices(step[3:]) @ at[:3, :3]
+            if np.abs(step).max() < SMALL_STEP:
+                break
         return pose_tensor(at, pose.device)
 
     def _reprojection(
@@ -203,8 +212,12 @@ class FeatureAlignment:
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""
-        count = len(ratio_matches(self.features.descriptors[:COMPARED], earlier.descriptors[:COMPARED]))
+        count = len(ratio_matches(self._descriptors[:COMPARED], earlier.descriptors[:COMPARED]))
         return count if count >= MIN_ALIKE else 0
+
+    @cached_property
+    def _descriptors(self) -> torch.Tensor:
+        return _tensor(self.features.descriptors).to(self._device)
 
 
 def joined_too(matches: Sequence[FeatureMatches]) -> list[FeatureMatches]:
@@ -216,11 +229,19 @@ def joined_too(matches: Sequence[FeatureMatches]) -> list[FeatureMatches]:
     return [*matches, FeatureMatches(points, positions)]
 
 
-def ratio_matches(descriptors: np.ndarray, earlier: np.ndarray) -> np.ndarray:
-    """Rows of descriptors uint8 [N, 32] and [M, 32] that match plainly better than any others: int64 [K, 2]."""
+def ratio_matches(descriptors: torch.Tensor, earlier: np.ndarray) -> np.ndarray:
+    """Rows of descriptors uint8 [N, 32] that match plainly better than any others of [M, 32]: int64 [K, 2].
+
+    The descriptors' device compares them, and is waited for.
+    """
     if len(descriptors) == 0 or len(earlier) < 2:
         return np.zeros((0, 2), np.int64)
-    # Arrays: the thousand objects of a matcher's answer would keep other threads from the interpreter.
-    distances, columns = cv2.batchDistance(descriptors, earlier, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
+    found = ops.nearest_descriptors(descriptors, _tensor(earlier).to(descriptors.device))
+    nearest, distances = (each.cpu().numpy() for each in found)
     rows = np.flatnonzero(distances[:, 0] < MAX_RATIO * distances[:, 1])
-    return np.stack([rows, columns[rows, 0]], 1).astype(np.int64)
+    return np.stack([rows, nearest[rows]], 1)
+
+
+def _tensor(descriptors: np.ndarray) -> torch.Tensor:
+    """The same memory, or a copy of what may not be written to, as in a file that is mapped."""
+    return torch.from_numpy(np.require(descriptors, requirements=["C", "W"]))

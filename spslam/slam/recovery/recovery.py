@@ -226,7 +226,7 @@ class Recovery:
         keyframes = problem.constraints.depth_keyframes
         timing = None if keyframes is None else keyframes.timing
         motion = None if timing is None else history.color_motion(timing.frame)
-        return FeatureAlignment(features, self._camera, motion, read)
+        return FeatureAlignment(features, self._camera, motion, read, problem.predicted.device)
 
     def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
         """Poses against the last trusted frame: by image features, by ICP from the predicted pose and from its own."""
