@@ -12,7 +12,7 @@ import cv2
 import torch
 
 from experiments import timing
-from experiments.arguments import add_sequence, make_parser
+from experiments.arguments import add_changes, add_sequence, make_parser
 from spslam.cli.arguments import frame_range
 from spslam.config import Config, load_config
 from spslam.datasets import open_sequence
@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="cuda includes the upload")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=3)
+    add_changes(parser)
     parser.add_argument("--json", type=Path, help="file to write the results to")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -36,7 +37,7 @@ def main() -> None:
     device = resolve_device(args.device)
     rows = []
     for workers in args.workers:
-        config = load_config(args.config, None, [f"run.prefetch_workers={workers}"])
+        config = load_config(args.config, None, [f"run.prefetch_workers={workers}", *args.set])
         dataset = open_sequence(config.dataset, args.data, args.frames)
         rounds = [read_all(dataset, config, device) for _ in range(args.rounds)]
         rows.append({"workers": workers, **{name: statistics.median(r[name] for r in rounds) for name in rounds[0]}})

@@ -104,6 +104,8 @@ class RgbdDataset(ABC):
         border_px: depth within so many pixels of the image's border comes as 0.
         is_registered: whether depth is meant to be registered to color; where it is known not to be, checks of the data
             do not expect it.
+        is_random_access: whether each frame is read by itself, so that several processes may share the frames; frames
+            of a video, or of a bag, are read best in order.
     """
 
     name: str
@@ -111,6 +113,7 @@ class RgbdDataset(ABC):
     depth_range: tuple[float, float] = (0.0, float("inf"))
     border_px: int = 0
     is_registered: bool = True
+    is_random_access: bool = False
 
     @abstractmethod
     def __len__(self) -> int:
@@ -195,6 +198,7 @@ class Subset(RgbdDataset):
         self.depth_range = dataset.depth_range
         self.border_px = dataset.border_px
         self.is_registered = dataset.is_registered
+        self.is_random_access = dataset.is_random_access
 
     def __len__(self) -> int:
         return len(self._indices)

@@ -53,6 +53,7 @@ class FileDataset(RgbdDataset):
         resize_color: bring each color image, of whatever size, to its depth image's size.
         registration: brings the color image, which another camera took, to the depth camera's view.
         is_registered: see `RgbdDataset`.
+        is_random_access: see `RgbdDataset`.
     """
 
     name: str
@@ -67,6 +68,7 @@ class FileDataset(RgbdDataset):
     depth_range: tuple[float, float] = field(default=(0.0, float("inf")))
     border_px: int = 0
     is_registered: bool = True
+    is_random_access: bool = True
 
     def __post_init__(self) -> None:
         if self.gt_poses is not None and not np.isfinite(self.gt_poses).any():

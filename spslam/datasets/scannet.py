@@ -66,6 +66,8 @@ class SensDataset(RgbdDataset):
         DatasetError: the file has no whole frame, or no intrinsics of depth.
     """
 
+    is_random_access = True
+
     def __init__(self, file: SensFile) -> None:
         header, index = file.header, file.index
         if not len(index):

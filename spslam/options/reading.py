@@ -180,7 +180,7 @@ class RunOptions(Section):
         "GPU if the command line starts the run and the process can read the dataset"
     )
     prefetch_ahead: int | None = option(
-        "maximum number of frames read ahead; null is two per thread, at least 8", "frames", ge=1
+        "maximum number of frames read ahead; null is three per thread, at least 8", "frames", ge=1
     )
     data_check: Literal["stop", "warn", "skip"] = option(
         "what to do if the first frames plainly do not fit together (intrinsics, scale, pairing, order): `stop` ends "

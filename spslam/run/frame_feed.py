@@ -12,7 +12,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.prefetch import Prefetcher, prefetch, usable_cores
 from spslam.errors import DatasetError
 from spslam.run.frozen_frames import FrozenFrames
-from spslam.run.reader_launch import has_standby
+from spslam.run.reader_launch import AHEAD_PER_WORKER, has_standby
 from spslam.run.reader_process import ReaderProcess, ReaderUnavailableError
 from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
@@ -52,7 +52,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         self._frozen = FrozenFrames(dataset, start)
         run, processed = config.run, start if processed is None else processed
         workers = automatic_workers(device) if run.prefetch_workers is None else run.prefetch_workers
-        ahead = max(2 * workers, MIN_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
+        ahead = max(AHEAD_PER_WORKER * workers, MIN_AHEAD) if run.prefetch_ahead is None else run.prefetch_ahead
         uploader = Uploader(device) if device.type == "cuda" else None
         self._threads = prefetch(FramePreparation(dataset, config, start, uploader), workers, ahead)
         self._may_fall_back = run.reader == "auto"

@@ -17,8 +17,14 @@ from spslam.config import Config
 SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.reader_service", "serve"
 # Device files of NVIDIA's driver: under Linux, and under Linux inside Windows (WSL).
 _GPU_DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/dxg"))
+# Frames at a time: one that is read, one that waits for one before it, and one that is sent.
+AHEAD_PER_WORKER = 3
 _ENVIRONMENT = {
     "CUDA_VISIBLE_DEVICES": "",
+    # NumPy's library would start threads, which a process that forks workers must not have.
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
     # glibc keeps the memory of freed images; otherwise each image would page-fault its memory anew.
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(256 << 20),

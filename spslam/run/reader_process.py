@@ -22,7 +22,7 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.clock import CaptureOffsets
 from spslam.errors import DatasetError, SpslamError, brief
-from spslam.run.reader_launch import launch, take_standby
+from spslam.run.reader_launch import AHEAD_PER_WORKER, launch, take_standby
 from spslam.run.reader_service import DISCONNECTED, Message, Work, mapped, slot_message
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
@@ -94,7 +94,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         Raises:
             ReaderUnavailableError: the dataset can't be pickled, or the process can't be started.
         """
-        slots = max(ahead // 2, 1)
+        slots = max(ahead // AHEAD_PER_WORKER, 1)
         blank = blank_pixels(dataset.camera, config)
         words = len(blank.buffer)
         start, processed = begin
@@ -167,6 +167,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             self._has_started = True
         self._return_slots()
         message = Message(*self._connection.recv())
+        if message.ended is not None:
+            raise SpslamError(_describe_exit(message.ended))
         if message.failure is not None:
             raise RuntimeError(f"reading frames failed:\n{message.failure}")
         self.read_seconds += message.read_ms / 1e3

@@ -5,6 +5,7 @@ import mmap
 import pickle
 import traceback
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import NamedTuple, cast
@@ -17,17 +18,15 @@ from spslam import ops
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.clock import AT_ONCE
-from spslam.datasets.prefetch import prefetch
+from spslam.datasets.prefetch import Readable, prefetch
 from spslam.errors import DatasetError
 from spslam.run.frozen_frames import FrozenFrames
+from spslam.run.reader_workers import DISCONNECTED, ForkedPreparation, WorkerEndedError
 from spslam.slam.image_features import ImageFeatures
-from spslam.slam.pixels import FramePixels
-from spslam.slam.prepared_frame import FramePreparation
+from spslam.slam.pixels import FramePixels, blank_pixels
+from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
 _SLOT_BYTES = 4  # of a slot's number
-
-# Raised by a connection whose other end is closed.
-DISCONNECTED = (EOFError, ConnectionError)
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Work:
         dataset: the frames.
         config: how they are sampled.
         start: position of the first frame.
-        workers: number of reading threads.
+        workers: number of reading threads, or of processes that each have one.
         ahead: number of frames kept ready beyond those in the slots.
         slots: number of slots in the shared memory.
         words: size of a slot in 32-bit words.
@@ -68,6 +67,7 @@ class Message(NamedTuple):
         offsets: as in `PreparedFrame`, in the order of its fields; None for those of images taken at once.
         error: of a frame that can't be read.
         failure: traceback of an exception that is not the data's fault; the process then ends.
+        ended: exit code of a process that prepared frames, if one ended before its time.
     """
 
     read_ms: float = 0.0
@@ -81,6 +81,7 @@ class Message(NamedTuple):
     offsets: tuple[float, float] | None = None
     error: DatasetError | None = None
     failure: str | None = None
+    ended: int | None = None
 
 
 def mapped(shared: int, slots: int, words: int) -> torch.Tensor:
@@ -129,6 +130,8 @@ def serve(socket: int, shared: int) -> None:
             _send_frames(work, mapped(shared, work.slots, work.words), connection)
         except DISCONNECTED:
             raise
+        except WorkerEndedError as error:
+            _send(connection, Message(ended=error.code))
         except Exception:
             _send(connection, Message(failure=traceback.format_exc()))
         # Stay until the loop closes the connection: it still returns slots, and what was sent to it is lost where this
@@ -141,7 +144,7 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
     preparation = FramePreparation(work.dataset, work.config, work.start)
     free, before, number = deque(range(work.slots)), 0.0, work.processed
     frozen = FrozenFrames(work.dataset, work.start)
-    with prefetch(preparation, work.workers, work.ahead) as frames:
+    with _shared_out(work, preparation, connection) as source, prefetch(source, work.workers, work.ahead) as frames:
         for item in frames:
             read_ms, before = 1e3 * (frames.read_seconds - before), frames.read_seconds
             frame = frozen.checked(item)
@@ -156,6 +159,19 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
             offsets = None if frame.offsets == AT_ONCE else (frame.offsets.depth, frame.offsets.color)
             _send(connection, Message(read_ms, slot, *described, frame.features is not None, offsets))
     _send(connection, Message())
+
+
+@contextlib.contextmanager
+def _shared_out(
+    work: Work, preparation: FramePreparation, connection: Connection
+) -> Iterator[Readable[PreparedFrame]]:
+    """The frames of a preparation, by a process for each thread where the data can be shared out."""
+    if work.workers == 1 or not work.dataset.is_random_access:
+        yield preparation
+        return
+    blank = blank_pixels(work.dataset.camera, work.config)
+    with contextlib.closing(ForkedPreparation(preparation, blank, work.workers, connection)) as forked:
+        yield forked
 
 
 def _send(connection: Connection, message: Message) -> None:

@@ -32,7 +32,10 @@ class Recorded(RgbdDataset):
 
     name = "recorded"
 
-    def __init__(self, count: int, change: Change | None = None, known_poses: bool = True) -> None:
+    def __init__(
+        self, count: int, change: Change | None = None, known_poses: bool = True, is_random_access: bool = False
+    ) -> None:
+        self.is_random_access = is_random_access
         self.room, frames = _rendered(max(count, 25))
         self.frames, self.change, self.known_poses = frames[:count], change, known_poses
         self.camera = self.room.camera

@@ -1,0 +1,173 @@
+"""Frames prepared by processes that the reading process forks.
+
+Threads of one process can't decode much more than 600 frames of 640x480 a second, however many cores there are: each of
+some thirty calls per frame gives Python's global interpreter lock away and waits for it again. Here a thread only waits
+for its process, and copies the pixels that it has left in memory that both map.
+"""
+
+import mmap
+import os
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any, NamedTuple, cast
+
+import torch
+
+from spslam.datasets.clock import CaptureOffsets
+from spslam.datasets.frozen_depth import FrameSignature
+from spslam.errors import DatasetError
+from spslam.slam.image_features import ImageFeatures
+from spslam.slam.pixels import WORD_BYTES, FramePixels
+from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
+
+_POSITION_BYTES = 8  # of a frame's position
+
+# Raised by a connection whose other end is closed.
+DISCONNECTED = (EOFError, ConnectionError)
+
+
+class WorkerEndedError(Exception):
+    """A worker process has ended before its time.
+
+    Attributes:
+        code: of its exit; negative for a signal.
+    """
+
+    def __init__(self, code: int):
+        super().__init__(f"a process that prepares frames ended with code {code}")
+        self.code = code
+
+
+class _Reply(NamedTuple):
+    """Of a worker: a frame, but for its pixels, or why there is none."""
+
+    index: int = 0
+    timestamp: float = 0.0
+    decode_ms: float = 0.0
+    valid_depth_share: float = 0.0
+    features: ImageFeatures | None = None
+    signature: FrameSignature | None = None
+    offsets: tuple[float, float] = (0.0, 0.0)
+    error: DatasetError | None = None
+    failure: str | None = None
+
+    def frame(self, pixels: FramePixels) -> PreparedFrame:
+        """The frame with these pixels."""
+        offsets = CaptureOffsets(*self.offsets)
+        rest = {"signature": self.signature, "features": self.features, "offsets": offsets}
+        return PreparedFrame(self.index, self.timestamp, pixels, self.decode_ms, **cast(dict[str, Any], rest))
+
+
+@dataclass
+class _Worker:
+    pid: int
+    connection: Connection
+    memory: torch.Tensor  # int32 [words] that both processes map
+    code: int | None = None  # of its exit
+
+    def ended(self) -> WorkerEndedError:
+        """What is to be raised once its connection is closed; waits for its end."""
+        if self.code is None:
+            self.code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        return WorkerEndedError(self.code)
+
+
+class ForkedPreparation:
+    """The frames of a preparation, by position, each prepared by one of several forked processes.
+
+    May be asked from any thread; those that find all processes at work wait for one. The processes end when this is
+    closed, or when the process ends that made it. That one must not have started threads before.
+
+    Args:
+        preparation: of a dataset that is `is_random_access`, without an uploader.
+        blank: pixels of a frame without content, for the shapes.
+        workers: number of processes, at least 1.
+        inherited: a connection that they close, as it is the parent's.
+    """
+
+    def __init__(self, preparation: FramePreparation, blank: FramePixels, workers: int, inherited: Connection):
+        self._length, self._blank = len(preparation), blank
+        self._free: SimpleQueue[_Worker] = SimpleQueue()
+        self._workers: list[_Worker] = []
+        for _ in range(workers):
+            inherited_ends = [inherited, *(worker.connection for worker in self._workers)]
+            self._workers.append(_fork(preparation, len(blank.buffer), inherited_ends))
+            self._free.put(self._workers[-1])
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, i: int) -> PreparedFrame:
+        """Frame `i`, as the preparation makes it.
+
+        Raises:
+            DatasetError: the frame can't be read.
+            WorkerEndedError: the process has ended that was to prepare it.
+            RuntimeError: preparing it failed for another reason, with the traceback.
+        """
+        worker = self._free.get()
+        try:
+            worker.connection.send_bytes(i.to_bytes(_POSITION_BYTES, "little"))
+            reply = _Reply(*worker.connection.recv())
+            if reply.failure is not None:
+                raise RuntimeError(reply.failure)
+            if reply.error is not None:
+                raise reply.error
+            pixels = replace(self._blank, valid_depth_share=reply.valid_depth_share, features=reply.features)
+            return reply.frame(pixels.holding(worker.memory.clone()))
+        except DISCONNECTED:
+            raise worker.ended() from None
+        finally:
+            self._free.put(worker)
+
+    def close(self) -> None:
+        """Ends the processes; nothing can be asked any more."""
+        for worker in self._workers:
+            worker.connection.close()
+
+
+def _fork(preparation: FramePreparation, words: int, inherited: Sequence[Connection]) -> _Worker:
+    own, other = Pipe()
+    shared = mmap.mmap(-1, max(words, 1) * WORD_BYTES)  # anonymous, and shared with what is forked
+    memory = torch.frombuffer(shared, dtype=torch.int32)[:words]
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            # Else an end that is closed elsewhere stays open here, and nobody notices.
+            for connection in (own, *inherited):
+                connection.close()
+            _work(preparation, other, memory)
+            code = 0
+        finally:
+            os._exit(code)  # what the parent would do on leaving is the parent's
+    other.close()
+    return _Worker(pid, own, memory)
+
+
+def _work(preparation: FramePreparation, connection: Connection, memory: torch.Tensor) -> None:
+    """What a worker does until its connection is closed."""
+    try:
+        while True:
+            position = int.from_bytes(connection.recv_bytes(), "little")
+            connection.send(tuple(_prepare(preparation, position, memory)))
+    except DISCONNECTED:
+        return
+
+
+def _prepare(preparation: FramePreparation, position: int, memory: torch.Tensor) -> _Reply:
+    try:
+        frame = preparation[position]
+        pixels = cast(FramePixels, frame.pixels)
+        memory.copy_(pixels.buffer)
+        described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
+        offsets = (frame.offsets.depth, frame.offsets.color)
+        return _Reply(*described, frame.features, frame.signature, offsets)
+    except DatasetError as error:
+        return _Reply(error=error)
+    except Exception:
+        return _Reply(failure=traceback.format_exc())

@@ -1,0 +1,118 @@
+"""Frames prepared by processes that the reading process forks: the same frames, and what happens when one ends."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from spslam.errors import DatasetError, SpslamError
+from spslam.run.frame_feed import FrameFeed
+from tests.run.test_reader_process import PATIENCE_S, ROOT, fail, has_ended
+from tests.system.sequences import Recorded, settings
+
+FRAMES = 34  # image features of the first and the 31st are extracted ahead
+WORKERS = 3
+
+
+def feed_of(change=None, reader="process", start=0) -> FrameFeed:
+    config = settings(f"run.reader={reader}", f"run.prefetch_workers={WORKERS}")
+    return FrameFeed(Recorded(FRAMES, change, is_random_access=True), config, torch.device("cpu"), start)
+
+
+def refuse_some(frame):
+    if frame.index in (3, 12):
+        raise DatasetError(f"frame {frame.index}: torn")
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def wait_until_ended(pids):
+    deadline = time.monotonic() + PATIENCE_S
+    while not all(has_ended(pid) for pid in pids):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("change", [None, refuse_some])
+@pytest.mark.parametrize("start", [0, 7])
+def test_frames_are_those_of_threads(change, start):
+    with feed_of(change, start=start) as feed:
+        shared = list(feed)
+    with feed_of(change, "threads", start) as feed:
+        alone = list(feed)
+    assert len(shared) == len(alone) == FRAMES - start
+    for one, other in zip(shared, alone, strict=True):
+        if isinstance(other, DatasetError):
+            assert isinstance(one, DatasetError) and str(one) == str(other)
+            continue
+        assert (one.index, one.timestamp, one.offsets) == (other.index, other.timestamp, other.offsets)
+        assert torch.equal(one.pixels.buffer, other.pixels.buffer)
+        assert one.pixels.valid_depth_share == other.pixels.valid_depth_share
+        assert (one.features is None) == (other.features is None)
+        if other.features is not None:
+            assert (one.features.descriptors == other.features.descriptors).all()
+    assert any(not isinstance(one, DatasetError) and one.features is not None for one in shared)
+
+
+def test_every_thread_has_a_process_which_end_with_the_feed():
+    with feed_of() as feed:
+        next(feed)
+        workers = children(feed.prepare()._process.pid)
+        assert len(workers) == WORKERS
+    wait_until_ended(workers)
+
+
+def test_workers_end_when_the_reading_process_is_killed():
+    with feed_of() as feed:
+        next(feed)
+        process = feed.prepare()._process
+        workers = children(process.pid)
+        process.send_signal(signal.SIGKILL)
+        with pytest.raises(SpslamError, match="^the process that reads frames ended by SIGKILL"):
+            list(feed)
+    wait_until_ended(workers)
+
+
+def test_workers_end_when_the_loop_is_killed():
+    script = (
+        "import time\nfrom tests.run.test_reader_workers import children, feed_of\n"
+        "feed = feed_of()\nnext(feed)\npid = feed.prepare()._process.pid\n"
+        "print(pid, *children(pid), flush=True)\ntime.sleep(600)"
+    )
+    loop = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    pids = [int(pid) for pid in loop.stdout.readline().split()]
+    assert len(pids) == 1 + WORKERS
+    os.kill(loop.pid, signal.SIGKILL)
+    loop.wait()
+    loop.stdout.close()
+    wait_until_ended(pids)
+
+
+def kill_itself(frame):
+    if frame.index == 20:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_is_reported_in_one_line():
+    with feed_of(kill_itself) as feed:
+        frames = []
+        with pytest.raises(SpslamError, match=r"^the process that reads frames ended by SIGKILL; .*run.reader=threads"):
+            for frame in feed:
+                frames.append(frame)
+        pid = feed._process._process.pid
+    assert [frame.index for frame in frames] == list(range(20))
+    with contextlib.suppress(ProcessLookupError):
+        assert has_ended(pid)
+
+
+def test_exception_in_a_dataset_keeps_its_traceback():
+    with feed_of(fail) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
+        next(feed)
