@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 
@@ -43,13 +43,14 @@ class WorkerEndedError(Exception):
 
 
 class _Reply(NamedTuple):
-    """Of a worker: a frame, but for its pixels, or why there is none."""
+    """Of a worker: a frame, but for its pixels, or why there is none; see `reader_service.Message`."""
 
     index: int = 0
     timestamp: float = 0.0
     decode_ms: float = 0.0
     valid_depth_share: float = 0.0
     features: ImageFeatures | None = None
+    keeps_features: bool = False
     signature: FrameSignature | None = None
     offsets: tuple[float, float] = (0.0, 0.0)
     error: DatasetError | None = None
@@ -57,9 +58,10 @@ class _Reply(NamedTuple):
 
     def frame(self, pixels: FramePixels) -> PreparedFrame:
         """The frame with these pixels."""
-        offsets = CaptureOffsets(*self.offsets)
-        rest = {"signature": self.signature, "features": self.features, "offsets": offsets}
-        return PreparedFrame(self.index, self.timestamp, pixels, self.decode_ms, **cast(dict[str, Any], rest))
+        features = self.features if self.keeps_features else None
+        frame = PreparedFrame(self.index, self.timestamp, pixels, self.decode_ms, features=features)
+        frame.signature, frame.offsets = self.signature, CaptureOffsets(*self.offsets)
+        return frame
 
 
 @dataclass
@@ -164,9 +166,9 @@ def _prepare(preparation: FramePreparation, position: int, memory: torch.Tensor)
         frame = preparation[position]
         pixels = cast(FramePixels, frame.pixels)
         memory.copy_(pixels.buffer)
-        described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share)
+        described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, pixels.features)
         offsets = (frame.offsets.depth, frame.offsets.color)
-        return _Reply(*described, frame.features, frame.signature, offsets)
+        return _Reply(*described, frame.features is not None, frame.signature, offsets)
     except DatasetError as error:
         return _Reply(error=error)
     except Exception:

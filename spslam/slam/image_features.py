@@ -4,6 +4,7 @@ ORB: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -41,6 +42,24 @@ class ImageFeatures:
         """Those of which the depth is known."""
         known = self.points[:, 2] > 0
         return ImageFeatures(self.descriptors[known], self.positions[known], self.points[known])
+
+
+class FrameFeatures:
+    """The image features of one frame, extracted where they are first asked for.
+
+    Args:
+        pixels: of the frame as it was read: features are rectified by themselves, not their images.
+        camera: of all frames.
+        max_depth_m: the largest depth that images hold.
+    """
+
+    def __init__(self, pixels: FramePixels, camera: Camera, max_depth_m: float):
+        self._pixels, self._camera, self._max_depth_m = pixels, camera, max_depth_m
+
+    @cached_property
+    def extracted(self) -> ImageFeatures:
+        """The features; waits for the device."""
+        return extract_features(self._pixels, self._camera, self._max_depth_m)
 
 
 def extract_features(pixels: FramePixels, camera: Camera, max_depth_m: float) -> ImageFeatures:

@@ -57,7 +57,8 @@ class Localizer:
             problem, pixels = self._rectified(problem, read, shutter._replace(pose=estimate.pose))
             again = self._tracker.track_from(problem, estimate.pose)
             estimate = replace(again, iterations=estimate.iterations + again.iterations)
-        tracked = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped)
+        features = self._recovery.features_of(read)
+        tracked = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped, features)
         shutter = problem.constraints.shutter
         # The pose that the frame was rectified by is the one that was tracked, unless it was recovered from elsewhere.
         if shutter is None or tracked.lost or not tracked.recovered:
@@ -66,7 +67,7 @@ class Localizer:
             return tracked
         problem, pixels = self._rectified(problem, read, shutter._replace(pose=tracked.pose))
         estimate = self._tracker.track_from(problem, tracked.pose)
-        found = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped, tracked.features)
+        found = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped, features)
         return tracked if found.lost else found.after(tracked)
 
     def _rectified(

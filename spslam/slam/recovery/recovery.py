@@ -11,7 +11,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
-from spslam.slam.image_features import ImageFeatures, extract_features
+from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.doubtful_frame import MIN_DECIDING, DoubtfulFrame
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches, joined_too
@@ -76,7 +76,7 @@ class Recovery:
         pixels: FramePixels,
         history: FrameHistory,
         to_be_mapped: bool,
-        read: ImageFeatures | None = None,
+        features: FrameFeatures | None = None,
     ) -> TrackedFrame:
         """The frame's best pose: the estimate or, if it is doubtful, the best one from other initial poses.
 
@@ -86,14 +86,15 @@ class Recovery:
             pixels: of the frame.
             history: the frames before.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
-            read: its image features as they were read; None extracts them where they are needed.
+            features: of the frame as it was read; None are those of `pixels`.
         """
+        features = self.features_of(pixels) if features is None else features
         tracked = self.judge(estimate)
         if history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked):
-            tracked = self._recover(problem, tracked, pixels, history, self._features(problem, pixels, history, read))
+            tracked = self._recover(problem, tracked, pixels, history, self._image(problem, history, features))
         else:
             if self._may_have_slid(tracked):
-                tracked = self._held(problem, tracked, pixels, history, read)
+                tracked = self._held(problem, tracked, pixels, history, features)
             is_unchecked = math.isnan(tracked.fit.occluded_share)
             if to_be_mapped and is_unchecked and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT:
                 tracked = self._check_occlusion(problem, tracked, pixels, history)
@@ -139,10 +140,10 @@ class Recovery:
         tracked: TrackedFrame,
         pixels: FramePixels,
         history: FrameHistory,
-        read: ImageFeatures | None,
+        features: FrameFeatures,
     ) -> TrackedFrame:
         """The pose held by image features in directions that surface leaves free, where there are enough of them."""
-        row, image = history.last_row(), self._features(problem, pixels, history, read)
+        row, image = history.last_row(), self._image(problem, history, features)
         if row is None or image is None or tracked.information is None:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
@@ -212,21 +213,24 @@ class Recovery:
         iterations += sum(candidate.iterations for candidate in candidates)
         return replace(found, iterations=iterations, features=frame.image.read if frame.image else None)
 
-    def _features(
-        self, problem: TrackingProblem, pixels: FramePixels, history: FrameHistory, read: ImageFeatures | None
+    def features_of(self, read: FramePixels) -> FrameFeatures:
+        """The image features of a frame as it was read."""
+        return FrameFeatures(read, self._camera, self._config.dataset.max_depth_m)
+
+    def _image(
+        self, problem: TrackingProblem, history: FrameHistory, features: FrameFeatures
     ) -> FeatureAlignment | None:
-        """The frame's image features where they are used; extracts those that were not `read`."""
+        """The frame's image features, as of its motion; None where they are not used."""
         tracking = self._config.tracking
         if not (tracking.features and tracking.recovery):
             return None
-        read = extract_features(pixels, self._camera, self._config.dataset.max_depth_m) if read is None else read
-        features = read
+        read = rectified = features.extracted
         if problem.constraints.shutter is not None:
-            features = self._rectifier.features(read, problem.constraints.shutter)
+            rectified = self._rectifier.features(read, problem.constraints.shutter)
         keyframes = problem.constraints.depth_keyframes
         timing = None if keyframes is None else keyframes.timing
         motion = None if timing is None else history.color_motion(timing.frame)
-        return FeatureAlignment(features, self._camera, motion, read, problem.predicted.device)
+        return FeatureAlignment(rectified, self._camera, motion, read, problem.predicted.device)
 
     def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
         """Poses against the last trusted frame: by image features, by ICP from the predicted pose and from its own."""
