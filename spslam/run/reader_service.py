@@ -27,6 +27,9 @@ from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
 _SLOT_BYTES = 4  # of a slot's number
+# So many processes extract the image features of all frames, which takes as long as all else; the loop, that may need
+# those of one frame in ten, then waits for none. Fewer would hold it up.
+MIN_EXTRACTING = 4
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def serve(socket: int, shared: int) -> None:
 
 
 def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
-    preparation = FramePreparation(work.dataset, work.config, work.start)
+    preparation = FramePreparation(work.dataset, work.config, work.start, extracts_all=_is_shared_out(work, MIN_EXTRACTING))
     free, before, number = deque(range(work.slots)), 0.0, work.processed
     frozen = FrozenFrames(work.dataset, work.start)
     with _shared_out(work, preparation, connection) as source, prefetch(source, work.workers, work.ahead) as frames:
@@ -161,12 +164,17 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
     _send(connection, Message())
 
 
+def _is_shared_out(work: Work, least: int = 2) -> bool:
+    """Whether processes prepare the frames, at least so many."""
+    return work.workers >= least and work.dataset.is_random_access
+
+
 @contextlib.contextmanager
 def _shared_out(
     work: Work, preparation: FramePreparation, connection: Connection
 ) -> Iterator[Readable[PreparedFrame]]:
     """The frames of a preparation, by a process for each thread where the data can be shared out."""
-    if work.workers == 1 or not work.dataset.is_random_access:
+    if not _is_shared_out(work):
         yield preparation
         return
     blank = blank_pixels(work.dataset.camera, work.config)

@@ -18,16 +18,17 @@ MAX_FRAMES = 2048  # with features, 90 MB; then every second of the older half g
 
 def keeps_features(config: Config, number: int) -> bool:
     """Whether the image features of frame number `number` are kept, however well it is tracked."""
-    return _uses_features(config) and number % INTERVAL == 0
+    return uses_features(config) and number % INTERVAL == 0
 
 
 def needs_features(config: Config, number: int) -> bool:
     """Whether the image features of frame number `number` are needed in any case: the second has no speed to be
     predicted by, so that they find its pose."""
-    return keeps_features(config, number) or (_uses_features(config) and number == 1)
+    return keeps_features(config, number) or (uses_features(config) and number == 1)
 
 
-def _uses_features(config: Config) -> bool:
+def uses_features(config: Config) -> bool:
+    """Whether the image features of any frame may be asked for."""
     return config.tracking.features and config.tracking.recovery
 
 

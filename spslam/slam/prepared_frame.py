@@ -10,7 +10,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.slam.device_events import DeviceEvent
-from spslam.slam.feature_store import keeps_features, needs_features
+from spslam.slam.feature_store import keeps_features, needs_features, uses_features
 from spslam.slam.image_features import ImageFeatures, extract_features
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.upload import Upload, Uploader
@@ -61,10 +61,25 @@ class FramePreparation:
     """The frames of a dataset from a position on, each read, decoded, sampled and, with an uploader, sent off.
 
     Image features that are kept in any case are extracted too.
+
+    Args:
+        dataset: the frames.
+        config: how they are sampled.
+        start: position of the first one.
+        uploader: sends them to a device.
+        extracts_all: extract the image features of every frame: whoever takes them waits for none that it asks for.
     """
 
-    def __init__(self, dataset: RgbdDataset, config: Config, start: int = 0, uploader: Uploader | None = None):
+    def __init__(
+        self,
+        dataset: RgbdDataset,
+        config: Config,
+        start: int = 0,
+        uploader: Uploader | None = None,
+        extracts_all: bool = False,
+    ):
         self._dataset, self._config, self._start, self._uploader = dataset, config, start, uploader
+        self._extracts_all = extracts_all and uses_features(config)
 
     def __len__(self) -> int:
         return len(self._dataset) - self._start
@@ -73,10 +88,11 @@ class FramePreparation:
         began = time.perf_counter()
         frame, config = self._dataset[i + self._start], self._config
         prepared = PreparedFrame.of(frame, self._dataset.camera, config)
-        if keeps_features(config, i + self._start):
-            pixels = cast(FramePixels, prepared.pixels)
-            prepared.features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
-            prepared.pixels = replace(pixels, features=prepared.features)
+        is_kept = keeps_features(config, i + self._start)
+        if is_kept or self._extracts_all:
+            self._extract(prepared)
+        if is_kept:
+            prepared.features = cast(FramePixels, prepared.pixels).features
         prepared.signature = FrameSignature.of(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         if self._uploader:
@@ -88,7 +104,11 @@ class FramePreparation:
 
         That number differs from the frame's position where frames could not be read.
         """
-        config, pixels = self._config, cast(FramePixels, frame.pixels)
-        if needs_features(config, number):
-            features = extract_features(pixels, self._dataset.camera, config.dataset.max_depth_m)
-            frame.pixels = replace(pixels, features=features)
+        if needs_features(self._config, number):
+            self._extract(frame)
+
+    def _extract(self, frame: PreparedFrame) -> None:
+        """Extracts the image features of a frame on the CPU, unless that was done."""
+        pixels = cast(FramePixels, frame.pixels)
+        features = extract_features(pixels, self._dataset.camera, self._config.dataset.max_depth_m)
+        frame.pixels = replace(pixels, features=features)
