@@ -259,7 +259,7 @@ CHECKPOINT = TensorSchema(
         "frames.lost": TensorRule(torch.bool, ("frames",)),
         "frames.consistent_frames": TensorRule(torch.int64, ("frames",), low=0),
         "frames.depth_thumbnails": TensorRule(torch.float16, ("frames", "thumbnail_rows", "thumbnail_columns"), low=0),
-        "frames.log_gains": TensorRule(torch.float32, ("frames", 1)),
+        "frames.gains": TensorRule(torch.float32, ("frames", 2)),
         "pixels.records": TensorRule(torch.int32, ("frames", "pixels", 3)),
         "pixels.has_pixels": TensorRule(torch.bool, ("frames",)),
         "unjoined.rows": TensorRule(torch.int64, ("unjoined",), low=0),

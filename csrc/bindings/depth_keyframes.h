@@ -25,7 +25,8 @@ inline FrameMotion load_motion(const char* name, const std::int64_t* integers, s
 }
 
 // Of the images, the poses and, if any, the intensities, and after them the delay of colors, if any, and the log gains
-// of all frames and of the one compared, if any; none without tensors. They must outlive the launch.
+// of all frames and of the one compared, if any, there perhaps with a variance; none without tensors. They must outlive
+// the launch.
 inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<Tensor>& tensors,
                                            const std::vector<double>& numbers,
                                            const std::vector<std::int64_t>& integers) {
@@ -37,8 +38,10 @@ inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<T
   const std::size_t size = tensors.size();
   const bool has_delay = size == 4 || size == 6, has_gains = size >= 5;
   SPS_CHECK(!has_delay || tensors[3].numel() == 1, name, ": color_delay must have one element");
-  SPS_CHECK(!has_gains || (tensors[size - 2].numel() == tensors[1].size(0) && tensors[size - 1].numel() == 1), name,
-            ": log_gains must be those of the poses' frames and of one more");
+  const std::int64_t own = has_gains ? tensors[size - 1].numel() : 0;
+  SPS_CHECK(!has_gains || (has_shape(tensors[size - 2], {tensors[1].size(0), 1}) && (own == 1 || own == 2) &&
+                           tensors[size - 1].is_contiguous()),
+            name, ": log_gains must be those of the poses' frames and of one more");
   SPS_CHECK(scalars[KeyframeScalar::kUnit] > 0.0 && scalars[KeyframeScalar::kKernelEnd] > 0.0, name,
             ": depth_keyframes must have a positive unit and kernel_end");
   constexpr std::size_t kFirst = static_cast<std::size_t>(KeyframeInteger::kCount),
@@ -52,6 +55,8 @@ inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<T
   keyframes.color_delay = has_delay ? data<float>(tensors[3]) : nullptr;
   keyframes.log_gains = has_gains ? data<float>(tensors[size - 2]) : nullptr;
   keyframes.frame_log_gain = has_gains ? data<float>(tensors[size - 1]) : nullptr;
+  keyframes.log_gain_stride = has_gains ? tensors[size - 2].stride(0) : 0;
+  keyframes.gain_variance = own == 2 ? keyframes.frame_log_gain + 1 : nullptr;
   keyframes.poses = data<float>(tensors[1]);
   keyframes.height = tensors[0].size(1);
   keyframes.width = tensors[0].size(2);

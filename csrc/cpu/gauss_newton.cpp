@@ -107,9 +107,11 @@ void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pi
     tracking_fit(terms, options.num_pixels, own_stats);
     const double* keyframe_terms = terms + kTrackingTerms;
     join_keyframe_terms(terms, keyframe_terms, keyframe_terms + kKeyframeTerms, measure.num_keyframes, joint);
-    float* log_gain = options.depth_keyframes.log_gains ? &frames.log_gain : nullptr;
-    tracking_step(terms, joint, options.damping, held_damping(measure, terms), pose, own_stats + 2, hessian, log_gain);
-    own_stats[kTrackingStatSize] = frames.log_gain;
+    FrameGain* gain = options.depth_keyframes.log_gains ? &frames.gain : nullptr;
+    const float variance = gain ? gain_variance(joint, *gain) : 0.0f;
+    tracking_step(terms, joint, options.damping, held_damping(measure, terms), pose, own_stats + 2, hessian, gain);
+    own_stats[kTrackingStatSize] = frames.gain.log_gain;
+    own_stats[kTrackingStatSize + 1] = variance;
   }
 }
 

@@ -178,10 +178,11 @@ __global__ void __launch_bounds__(kThreads, 1)
     add_partials(shared_sums, gridDim.x, terms);
     if (threadIdx.x == 0) {
       join_keyframe_terms(terms, terms + kPaddedTerms, terms + 2 * kPaddedTerms, measure.num_keyframes, joint);
-      float* log_gain = options.depth_keyframes.log_gains ? &frames.log_gain : nullptr;
+      FrameGain* gain = options.depth_keyframes.log_gains ? &frames.gain : nullptr;
+      own_stats[kTrackingStatSize + 1] = gain ? gain_variance(joint, *gain) : 0.0f;
       tracking_step(terms, joint, options.damping, held_damping(measure, terms), own_pose, own_stats + 2, own_hessian,
-                    log_gain);
-      own_stats[kTrackingStatSize] = log_gain ? frames.log_gain : 0.0f;
+                    gain);
+      own_stats[kTrackingStatSize] = gain ? gain->log_gain : 0.0f;
     }
     if (threadIdx.x == kWarp) tracking_fit(terms, options.num_pixels, own_stats);
     __syncthreads();

@@ -57,7 +57,7 @@ SPS_INLINE DepthKeyframe load_depth_keyframe(const DepthKeyframes& keyframes, in
   DepthKeyframe keyframe = keyframe_image(keyframes, keyframes.image_rows[k], load_pose(pose));
   keyframe.color = color_pose(keyframes.poses, keyframes.motions[k], keyframes.color_delay, pose);
   if (keyframes.log_gains) {
-    keyframe.log_gain = keyframes.log_gains[keyframes.pose_rows[k]];
+    keyframe.log_gain = keyframes.log_gains[keyframes.log_gain_stride * keyframes.pose_rows[k]];
     keyframe.scale = brightness_scale(keyframe.log_gain, *keyframes.frame_log_gain);
   }
   return keyframe;

@@ -24,6 +24,18 @@ constexpr int kJointTerms = kTrackingTerms + kKeyframeTerms + kAllGainTerms;
 constexpr float kSaturatedSdf = 0.98f;
 constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
 constexpr double kMaxGainStep = 0.2;       // of the logarithm, in one iteration
+// As many a frame's pixels are worth for its gain: what is wrong with their brightness is alike for neighbors.
+constexpr double kIndependentPixels = 300.0;
+constexpr double kGainEvidence = 1.0 / 16;       // share of a frame in the variance of the steps of the gain
+constexpr double kLeastGainVariance = 1e-8;      // 0.01 %, less than any pixel shows
+
+// The gain of the frame that is tracked, and what is known of it without its own pixels.
+struct FrameGain {
+  float log_gain;   // as the running iteration has it
+  float before;     // where it is expected
+  float variance;   // of the step from there
+  double unit;      // (m^2) the information of a residual's square over its variance; 0: the gain may be any
+};
 
 // The earlier frames that a call compares with and the sensor's noise, read once.
 struct EarlierFrames {
@@ -33,9 +45,22 @@ struct EarlierFrames {
   DepthKeyframe keyframes[kMaxDepthKeyframes];
   // Of the frame itself, as the running iteration has them.
   ColorPose color;
-  float log_gain;
+  FrameGain gain;
 };
 constexpr int kMaxEarlierFrames = 1 + kMaxDepthKeyframes;
+
+// Where the noise of intensities is not known, nothing says how much the frame's pixels are worth against a variance.
+SPS_INLINE FrameGain load_frame_gain(const GaussNewtonOptions& options) {
+  const DepthKeyframes& keyframes = options.depth_keyframes;
+  const float expected = *keyframes.frame_log_gain;
+  if (!keyframes.gain_variance) return {expected, expected, 0.0f, 0.0};
+  double unit = 0.0;
+  if (options.noise) {
+    const double meters = static_cast<double>(intensity_meters(load_sensor_noise(options.noise)));
+    unit = meters * meters * static_cast<double>(options.num_pixels) / kIndependentPixels;
+  }
+  return {expected, expected, *keyframes.gain_variance, unit};
+}
 
 // Reads number i of kMaxEarlierFrames, if there is one: the reference image is 0, the depth keyframes follow.
 SPS_INLINE void load_earlier_frame(const GaussNewtonOptions& options, int i, EarlierFrames& frames) {
@@ -45,8 +70,8 @@ SPS_INLINE void load_earlier_frame(const GaussNewtonOptions& options, int i, Ear
     frames.reference = color_pose(keyframes.poses, reference.motion, keyframes.color_delay, reference.pose).pose;
     frames.reference_scale = 1.0f;
   }
-  if (i == 0 && keyframes.log_gains) frames.log_gain = *keyframes.frame_log_gain;
   if (i == 0 && options.noise) frames.noise = load_sensor_noise(options.noise);
+  if (i == 0 && keyframes.log_gains) frames.gain = load_frame_gain(options);
   if (i > 0 && i <= keyframes.count) frames.keyframes[i - 1] = load_depth_keyframe(keyframes, i - 1);
 }
 
@@ -56,10 +81,10 @@ SPS_INLINE void load_colors(const GaussNewtonOptions& options, const float* pose
   frames.color = color_pose(keyframes.poses, keyframes.frame_motion, keyframes.color_delay, pose);
   if (!keyframes.log_gains) return;
   for (int k = 0; k < keyframes.count; ++k) {
-    frames.keyframes[k].scale = brightness_scale(frames.keyframes[k].log_gain, frames.log_gain);
+    frames.keyframes[k].scale = brightness_scale(frames.keyframes[k].log_gain, frames.gain.log_gain);
   }
   if (options.reference.log_gain) {
-    frames.reference_scale = brightness_scale(*options.reference.log_gain, frames.log_gain);
+    frames.reference_scale = brightness_scale(*options.reference.log_gain, frames.gain.log_gain);
   }
 }
 
@@ -159,37 +184,63 @@ SPS_INLINE double held_damping(const Measurement& measure, const double* terms) 
   return waits ? options.held_information * terms[kNormalTerms + 2] : 0.0;
 }
 
-// What the equations of the frame's gain leave of those of the pose, and the gain's step once the pose's is known.
+// What the equations of the frame's gain, and where it is expected, leave of those of the pose; the gain's step once the
+// pose's is known.
 struct GainEquations {
-  const double* terms;  // [kGainTerms]
-  double inverse;       // of the gain's information; 0 where nothing tells the gain
+  const double* terms;               // [kGainTerms] of the pixels
+  double gradient, inverse;          // with what is expected; the inverse of the information is 0 where there is none
+  double innovation, own_variance;   // by how much the pixels alone would have it otherwise, and how well they know
 
-  SPS_INLINE explicit GainEquations(const double* of) : terms(of), inverse(of[6] > 1e-12 ? 1.0 / of[6] : 0.0) {}
+  SPS_INLINE GainEquations(const double* of, const FrameGain& gain)
+      : terms(of), gradient(of[7]), inverse(0.0), innovation(0.0), own_variance(0.0) {
+    const double information = of[6], moved = static_cast<double>(gain.log_gain) - static_cast<double>(gain.before);
+    double expected = 0.0;
+    if (information > kLeastInformation) {
+      innovation = moved - of[7] / information;
+      own_variance = gain.unit / information;
+      // A step that is far larger than those before counts for itself: exposure may change at once.
+      const double variance = static_cast<double>(gain.variance) + kGainEvidence * innovation * innovation;
+      expected = gain.unit / (variance > kLeastGainVariance ? variance : kLeastGainVariance);
+      inverse = 1.0 / (information + expected);
+    }
+    gradient += expected * moved;
+  }
 
   SPS_INLINE void eliminate(double (&h)[36], double (&g)[6]) const {
     for (int a = 0; a < 6; ++a) {
       for (int b = 0; b < 6; ++b) h[6 * a + b] -= inverse * terms[a] * terms[b];
-      g[a] -= inverse * terms[a] * terms[7];
+      g[a] -= inverse * terms[a] * gradient;
     }
   }
 
   SPS_INLINE double step(const float* pose_step) const {
-    double gradient = terms[7];
-    for (int a = 0; a < 6; ++a) gradient += terms[a] * static_cast<double>(pose_step[a]);
-    const double wanted = -inverse * gradient;
+    double left = gradient;
+    for (int a = 0; a < 6; ++a) left += terms[a] * static_cast<double>(pose_step[a]);
+    const double wanted = -inverse * left;
     return wanted > kMaxGainStep ? kMaxGainStep : wanted > -kMaxGainStep ? wanted : -kMaxGainStep;
   }
+
+  // The variance of steps, this one included: of its square what is more than the pixels' noise.
+  SPS_INLINE float variance_after(const FrameGain& gain) const {
+    const double before = static_cast<double>(gain.variance), square = innovation * innovation - own_variance;
+    if (inverse == 0.0 || gain.unit == 0.0) return gain.variance;
+    const double after = before + kGainEvidence * ((square > 0.0 ? square : 0.0) - before);
+    return static_cast<float>(after > kLeastGainVariance ? after : kLeastGainVariance);
+  }
+
+ private:
+  static constexpr double kLeastInformation = 1e-12;
 };
 
 // Solves the joint normal equations, with `held` added to the diagonal, and moves the pose and, unless it is null, the
-// log gain, whose equations `joint` then has too. `steps` gets |dt| (m) and
+// gain, whose equations `joint` then has too. `steps` gets |dt| (m) and
 // |domega| (rad). `hessian` gets the map's matrix as if pixels had on average their score weights and no certainties:
 // it says how firmly the surface holds the pose, whatever its distance and the width of the kernel.
 SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, double held, float* pose,
-                              float* steps, float* hessian, float* log_gain = nullptr) {
+                              float* steps, float* hessian, FrameGain* gain = nullptr) {
   double h[36], g[6], cost, delta[6];
   store_normal_terms<double>(joint, h, g, &cost);
-  if (log_gain) GainEquations(joint + kNormalTerms).eliminate(h, g);
+  if (gain) GainEquations(joint + kNormalTerms, *gain).eliminate(h, g);
   double trace = 0.0;
   for (int a = 0; a < 6; ++a) trace += h[a * 7];
   // The absolute part keeps directions that no pixel sees from moving.
@@ -199,7 +250,7 @@ SPS_INLINE void tracking_step(const double* terms, const double* joint, double d
   norm = std::sqrt(norm);
   const float scale = norm > kMaxTrackingStep ? kMaxTrackingStep / norm : 1.0f;
   for (int a = 0; a < 6; ++a) step[a] *= scale;
-  if (log_gain) *log_gain += static_cast<float>(GainEquations(joint + kNormalTerms).step(step));
+  if (gain) gain->log_gain += static_cast<float>(GainEquations(joint + kNormalTerms, *gain).step(step));
   const Vec3<float> dt{step[0], step[1], step[2]}, domega{step[3], step[4], step[5]};
   const Quaternion<float> q =
       normalized(quaternion_exp(domega) * Quaternion<float>{pose[0], pose[1], pose[2], pose[3]});
@@ -210,6 +261,12 @@ SPS_INLINE void tracking_step(const double* terms, const double* joint, double d
   const double certain = terms[kNormalTerms + 2], share = certain > 0.0 ? terms[kNormalTerms] / certain : 1.0;
   store_normal_terms<double>(terms, h, g, &cost);
   for (int i = 0; i < 36; ++i) hessian[i] = static_cast<float>(share * h[i]);
+}
+
+// The last two statistics of an iteration: the log gain, and the variance of its steps by the equations that moved it.
+// Before the step.
+SPS_INLINE float gain_variance(const double* joint, const FrameGain& gain) {
+  return GainEquations(joint + kNormalTerms, gain).variance_after(gain);
 }
 
 // Cost, inlier share and mean score weight of the pose before its step: columns 0, 1 and 4 of its statistics.

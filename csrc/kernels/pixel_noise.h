@@ -42,13 +42,25 @@ SPS_INLINE float intensity_share(const SensorNoise& noise) {
   return kRegistered / larger(noise.intensity_growth, kRegistered);
 }
 
+// m^2, the variance of the nearest pixels of a keyframe's surface.
+SPS_INLINE float surface_variance(const SensorNoise& noise) {
+  constexpr float kMost = kSurfaceDeviation * kSurfaceDeviation,
+                  kLeast = kLeastSurfaceDeviation * kLeastSurfaceDeviation;
+  return smaller(kLeast + noise.depth.floor, kMost);
+}
+
+// m that a difference of intensities of one deviation counts as.
+SPS_INLINE float intensity_meters(const SensorNoise& noise) {
+  return kIntensityGain * std::sqrt(surface_variance(noise) * intensity_share(noise));
+}
+
 // Of a pixel of one depth and intensity: inverse variances of its residuals, against the map as a share of that without
 // noise, against a keyframe as a share of that of the nearest pixels.
 struct PixelNoise {
   const SensorNoise* sensor;  // null where the noise is not known
   float map_certainty, keyframe_certainty;
   float intensity;
-  float intensity_meters;  // that a difference of intensities of one deviation counts as
+  float intensity_meters;
 };
 
 SPS_INLINE PixelNoise pixel_noise(const SensorNoise* sensor, float depth, float intensity) {
@@ -56,9 +68,9 @@ SPS_INLINE PixelNoise pixel_noise(const SensorNoise* sensor, float depth, float 
   constexpr float kMost = kSurfaceDeviation * kSurfaceDeviation,
                   kLeast = kLeastSurfaceDeviation * kLeastSurfaceDeviation;
   const float variance = depth_variance(sensor->depth, depth);
-  const float surface = smaller(kLeast + sensor->depth.floor, kMost);
+  const float surface = surface_variance(*sensor);
   return {sensor, kMost / (kMost + variance), surface / larger(kLeast + variance, surface), intensity,
-          kIntensityGain * std::sqrt(surface * intensity_share(*sensor))};
+          intensity_meters(*sensor)};
 }
 
 }  // namespace spslam

@@ -104,9 +104,15 @@ class Exposure(NamedTuple):
     A frame's gain is the factor of its brightness against what all frames' would be. An earlier image is compared with
     a frame as if it were as bright as that one, and at most white. The frame's own gain is an unknown beside its pose.
 
+    Where an even exposure is known to be one, the unknown must not take what brightness says of the pose: with a
+    variance v the frame's log gain is expected at a0, in the unit of the pixels' equations as strongly as
+    1 / (v + d^2 / 16), d being by how much the pixels would have it otherwise: so what changes plainly is free at once.
+
     Attributes:
-        log_gains: float32 [F, 1] natural logarithms of the gains of the frames that `DepthKeyframes.poses` are of.
-        frame: float32 [1] that of the frame which is compared with them, as far as it is known.
+        log_gains: float32 [F, 1] natural logarithms of the gains of the frames that `DepthKeyframes.poses` are of; may
+            be a column of a wider table.
+        frame: float32 [1] that of the frame which is compared with them, a0, as far as it is known; or [2], and the
+            variance v of the step from there. It takes effect where the noise of intensities is known.
     """
 
     log_gains: torch.Tensor
@@ -116,7 +122,8 @@ class Exposure(NamedTuple):
         """Raises TypeError or ValueError, naming `function`, where something does not fit."""
         name = "depth_keyframes.exposure"
         check_tensor(function, f"{name}.log_gains", self.log_gains, (poses, 1), torch.float32, like=like)
-        check_tensor(function, f"{name}.frame", self.frame, (1,), torch.float32, like=like)
+        size = 2 if getattr(self.frame, "numel", lambda: 0)() == 2 else 1
+        check_tensor(function, f"{name}.frame", self.frame, (size,), torch.float32, like=like)
 
 
 class DepthKeyframes(NamedTuple):

@@ -124,7 +124,7 @@ class GaussNewtonOptions:
 # Names and bounds, in the order of SPS_GAUSS_NEWTON_SCALARS in csrc/include/spslam/gauss_newton.h.
 _SCALARS = {field.name: field.metadata for field in dataclasses.fields(GaussNewtonOptions) if field.metadata}
 _ITERATIONS = 1  # among the integers
-_STATISTICS = 6  # of an iteration: kFrameStatSize of csrc/include/spslam/gauss_newton.h
+_STATISTICS = 7  # of an iteration: kFrameStatSize of csrc/include/spslam/gauss_newton.h
 
 
 @public_op()
@@ -160,10 +160,11 @@ def track_gauss_newton(
             the statistics and H.
 
     Returns:
-        float32 [7] pose; float32 [iterations, 6] with the weighted mean squared residual (m^2), the share of pixels on
+        float32 [7] pose; float32 [iterations, 7] with the weighted mean squared residual (m^2), the share of pixels on
         mapped surface, the norms of the step in translation (m) and rotation (rad), and the mean weight over all pixels
         (0 for those off the map), each before the iteration's step and with the weights of `options.score_kernel`, and
-        the log gain after it (0 where depth keyframes have no exposure);
+        the log gain after it (0 where depth keyframes have no exposure), with the variance of its steps, this one
+        included, v + (max(d^2 - own variance, 0) - v) / 16 (see `Exposure`);
         float32 [6, 6] H of the last iteration, scaled as if pixels weighed on average what those weights are, whatever
         they weigh by their depth and the iteration's kernel. The same to the bit every time on one device, and for any
         number of CPU threads.

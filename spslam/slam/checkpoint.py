@@ -20,7 +20,7 @@ from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
 from spslam.tensor_schema import CHECKPOINT
 
-FORMAT = "spslam-checkpoint-9"
+FORMAT = "spslam-checkpoint-10"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
 # The ops number iterations up to 2^30; this many leave room to continue.
 _MOST_ITERATIONS = 2**29

@@ -124,7 +124,7 @@ class FrameHistory:
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
         motion = self.motion(len(frames), depth_time, color_offset)
         timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
-        exposure = ops.Exposure(frames.log_gain_rows, frames.log_gain_rows[len(frames) - 1])
+        exposure = ops.Exposure(frames.log_gain_rows, frames.gains[-1])
         return selected._replace(timing=timing, exposure=exposure)
 
     def log_gain(self, row: int) -> torch.Tensor:

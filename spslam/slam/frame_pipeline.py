@@ -323,12 +323,12 @@ class FramePipeline:
             tracked.consistent_frames,
             frame.offsets,
             copies,
-            None if tracked.lost else tracked.log_gain,
+            None if tracked.lost else tracked.gain,
         )
         state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records, copies)
         if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:
             if constraints.depth_keyframes is not None:
-                state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes, tracked.log_gain)
+                state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes, tracked.gain)
             state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image, copies)
         copies.make()
 

@@ -15,6 +15,8 @@ from spslam.slam.pixels import THUMBNAIL_STEP_PX
 from spslam.slam.row_copies import RowCopies, write_rows
 
 _FIRST_CAPACITY = 64
+# A frame's log gain and the variance of its steps before any is known: 1 % a frame, which automatic exposure takes.
+_UNKNOWN_GAIN = (0.0, 1e-4)
 _ON_HOST = ("timestamps", "depth_times", "color_offsets", "indices", "lost", "consistent_frames")
 
 
@@ -37,10 +39,11 @@ class FrameTable:
         self.camera = camera
         self.opened = 0
         self._count = 0
+        self._unknown_gain = torch.tensor(_UNKNOWN_GAIN, device=device)
         self._set_columns(
             {
                 "poses": torch.zeros(0, 7, device=device),
-                "log_gains": torch.zeros(0, 1, device=device),
+                "gains": torch.zeros(0, 2, device=device),
                 "timestamps": torch.zeros(0, dtype=torch.float64),
                 "depth_times": torch.zeros(0, dtype=torch.float64),
                 "color_offsets": torch.zeros(0, dtype=torch.float64),
@@ -53,6 +56,7 @@ class FrameTable:
 
     def _set_columns(self, columns: dict[str, torch.Tensor]) -> None:
         self._columns = columns
+        self._log_gain_rows = columns["gains"][:, :1]
         # Views of the columns on the CPU: a frame asks for tens of their elements, each of which would be a tensor.
         self._numbers = {name: columns[name].numpy() for name in _ON_HOST}
 
@@ -67,15 +71,15 @@ class FrameTable:
         return self._columns["poses"]
 
     @property
-    def log_gains(self) -> torch.Tensor:
-        """float32 [F, 1] of the frames' brightness, see `ops.Exposure`, on the device; a lost frame has that of the one
-        before."""
-        return self._columns["log_gains"][: self._count]
+    def gains(self) -> torch.Tensor:
+        """float32 [F, 2] of the frames' brightness the log gain and the variance of its steps, see `ops.Exposure`, on the
+        device; a lost frame has those of the one before."""
+        return self._columns["gains"][: self._count]
 
     @property
     def log_gain_rows(self) -> torch.Tensor:
-        """float32 [F or more, 1] as `log_gains`, with as many rows as `pose_rows`."""
-        return self._columns["log_gains"]
+        """float32 [F or more, 1], the first column of `gains`, with as many rows as `pose_rows`."""
+        return self._log_gain_rows
 
     @property
     def timestamps(self) -> torch.Tensor:
@@ -164,21 +168,19 @@ class FrameTable:
         consistent_frames: int = 0,
         offsets: CaptureOffsets = AT_ONCE,
         copies: RowCopies | None = None,
-        log_gain: torch.Tensor | None = None,
+        gain: torch.Tensor | None = None,
     ) -> None:
         """Adds a row; with `copies`, what is on the device is written when these are made.
 
-        `log_gain` float32 [1]; None takes that of the row before, 0 for the first.
+        `gain` float32 [2], as a row of `gains`; None takes that of the row before.
         """
         if self._count == self._columns["poses"].shape[0]:
             capacity = max(2 * self._count, _FIRST_CAPACITY)
             self._set_columns({name: _with_capacity(column, capacity) for name, column in self._columns.items()})
-        tables = [self._columns["poses"], self._columns["depth_thumbnails"]]
-        values = [pose.to(tables[0]), depth_thumbnail.to(tables[1])]
-        if log_gain is not None or self._count > 0:
-            gains = self._columns["log_gains"]
-            tables.append(gains)
-            values.append(gains[self._count - 1] if log_gain is None else log_gain)
+        tables = [self._columns["poses"], self._columns["depth_thumbnails"], self._columns["gains"]]
+        if gain is None:
+            gain = tables[2][self._count - 1] if self._count > 0 else self._unknown_gain
+        values = [pose.to(tables[0]), depth_thumbnail.to(tables[1]), gain]
         write_rows(copies, tables, [self._count] * len(tables), values)
         numbers: dict[str, Any] = {
             "timestamps": timestamp,

@@ -112,8 +112,9 @@ class Segments:
         rows = slice(segment.first, segment.first + len(poses))
         is_new = ~inner.frames.lost & state.frames.lost[rows]
         # The newest frame is known to both.
-        gains = inner.frames.log_gains + (state.frames.log_gains[-1] - inner.frames.log_gains[-1])
-        state.frames.log_gains[rows] = gains
+        gains = inner.frames.gains.clone()
+        gains[:, 0] += state.frames.gains[-1, 0] - inner.frames.gains[-1, 0]
+        state.frames.gains[rows] = gains
         for i in is_new.nonzero()[:, 0].tolist():
             state.frames.poses[segment.first + i] = pose_tensor(poses[i], state.scene.device)
         state.frames.lost[rows] &= ~is_new

@@ -47,12 +47,12 @@ class SensorNoiseEstimate:
         pixels: FramePixels,
         pose: torch.Tensor,
         depth_keyframes: ops.DepthKeyframes,
-        log_gain: torch.Tensor | None = None,
+        gain: torch.Tensor | None = None,
     ) -> None:
-        """Takes account of a frame at a trusted pose, float32 [7], and gain, float32 [1]; asynchronously."""
+        """Takes account of a frame at a trusted pose, float32 [7], and gain, float32 [2]; asynchronously."""
         exposure = depth_keyframes.exposure
-        if exposure is not None and log_gain is not None:
-            depth_keyframes = depth_keyframes._replace(exposure=exposure._replace(frame=log_gain))
+        if exposure is not None and gain is not None:
+            depth_keyframes = depth_keyframes._replace(exposure=exposure._replace(frame=gain))
         counts = TIMING_PIXELS, PIXELS
         ops.trusted.measure_frame_(
             self._noise, self._timing, pixels.records, pose, self._intrinsics, depth_keyframes, counts

@@ -53,7 +53,7 @@ class PoseEstimate:
         information: float64 [6, 6], inverse covariance of (translation m, rotation rad about the camera's center) in
             world axes, as surface alone determines the pose.
         numbers: of the pose, read with its fit; None where they were not.
-        log_gain: float32 [1] of the frame at that pose, see `ops.Exposure`; on the device.
+        gain: float32 [2] of the frame at that pose, as `FrameTable.gains`; on the device.
     """
 
     pose: torch.Tensor
@@ -61,7 +61,7 @@ class PoseEstimate:
     fit: Fit
     information: np.ndarray
     numbers: tuple[float, ...] | None = None
-    log_gain: torch.Tensor | None = None
+    gain: torch.Tensor | None = None
 
 
 class Tracker:
@@ -171,7 +171,7 @@ class Tracker:
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
         start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], np.array(numbers[14:50]).reshape(6, 6)
         size = found.numel()
-        mean_square, inlier_share, _, _, mean_robust_weight, _ = numbers[size - 6 : size]
+        mean_square, inlier_share, _, _, mean_robust_weight, _, _ = numbers[size - 7 : size]
         predicted = start_numbers if is_predicted else numbers[size:]
         error_cm, error_deg = prediction_error(predicted, pose_numbers)
         fit = Fit(
@@ -183,4 +183,4 @@ class Tracker:
             prediction_error_deg=error_deg,
         )
         variance = max(mean_square, LEAST_DEVIATION_M**2) * tracking.pixels / INDEPENDENT_PIXELS
-        return PoseEstimate(found[7:14], iterations, fit, hessian / variance, tuple(pose_numbers), found[-1:])
+        return PoseEstimate(found[7:14], iterations, fit, hessian / variance, tuple(pose_numbers), found[-2:])

@@ -167,6 +167,71 @@ def test_gains_that_are_all_alike_change_nothing_but_by_the_unknown(device, gene
     torch.testing.assert_close(poses[0][1][:, 5] + 0.7, poses[1][1][:, 5], rtol=0, atol=1e-5)
 
 
+def _tracked(records, device, keyframes, **changes):
+    """Pose float32 [7] and statistics [iterations, 7] from a start that is off."""
+    start = pose7(moved_pose(POSE, np.array([0.004, -0.003, 0.002]), 0.004), device)
+    options = replace(OPTIONS, **{"iterations": 20, "kernel_end": 0.03, **changes})
+    pose, stats, _ = ops.track_gauss_newton(
+        ops.SceneView.empty(device=device), records, start, INTRINSICS, options,
+        noise=noise_model(*NOISE, device=device), depth_keyframes=keyframes,
+    )  # fmt: skip
+    return pose, stats
+
+
+def _expecting(keyframes, log_gain, variance):
+    """The keyframes, the frame's gain being expected there with a variance of its step."""
+    frame = torch.tensor([log_gain, variance], device=keyframes.poses.device)
+    return keyframes._replace(exposure=keyframes.exposure._replace(frame=frame))
+
+
+def test_an_expected_gain_of_no_variance_is_none_to_be_found(device, generator):
+    records = _painted(corner_pixels(POSE, generator, 4000), 1.0).to(device)
+    known, _ = _tracked(records, device, _keyframes([1.0, 1.0], device, known=False))
+    free, free_stats = _tracked(records, device, _keyframes([1.0, 1.0], device))
+    held, held_stats = _tracked(records, device, _expecting(_keyframes([1.0, 1.0], device), 0.0, 0.0))
+    assert abs(float(held_stats[-1, 5])) < 0.1 * abs(float(free_stats[-1, 5])) + 1e-6
+    assert (held - known).abs().max() < 0.2 * (free - known).abs().max() + 2e-6
+    anything, stats = _tracked(records, device, _expecting(_keyframes([1.0, 1.0], device), 0.0, np.inf))
+    torch.testing.assert_close(anything, free, rtol=0, atol=0)
+    torch.testing.assert_close(stats[:, 5], free_stats[:, 5], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.3])
+def test_a_gain_that_changes_at_once_is_found_though_none_was_expected(device, generator, gain):
+    records = _painted(corner_pixels(POSE, generator, 4000), gain).to(device)
+    pose, stats = _tracked(records, device, _expecting(_keyframes([1.0, 1.0], device), 0.0, 0.0))
+    assert float(stats[-1, 5]) == pytest.approx(np.log(gain), abs=0.01)
+    assert float(stats[-1, 6]) == pytest.approx(np.log(gain) ** 2 / 16, rel=0.1)
+    found = pose7_to_matrix(pose.cpu().double().numpy())
+    assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 1e-3
+
+
+def test_the_variance_of_an_even_exposure_fades(device, generator):
+    records = _painted(corner_pixels(POSE, generator, 4000), 1.0).to(device)
+    variances = [1e-3]
+    for _ in range(100):
+        _, stats = _tracked(records, device, _expecting(_keyframes([1.0, 1.0], device), 0.0, variances[-1]))
+        variances.append(float(stats[-1, 6]))
+    assert variances[1] == pytest.approx(variances[0] * 15 / 16, rel=0.01)
+    assert min(variances) >= 0.99e-8 and variances[-1] < 1e-5
+
+
+def test_without_noise_nothing_is_expected(device, generator):
+    """Nothing says how much pixels are worth against a variance."""
+    records = _painted(corner_pixels(POSE, generator, 400), 1.1).to(device)
+    reference, results = _reference(EARLIER[0], 1.0, device), []
+    keyframes = _keyframes([1.0, 1.0], device)._replace(rows=())
+    for each in (keyframes, _expecting(keyframes, 0.0, 0.01)):
+        results.append(
+            ops.track_gauss_newton(
+                ops.SceneView.empty(device=device), records, pose7(POSE, device), INTRINSICS, OPTIONS,
+                reference=reference, depth_keyframes=each,
+            )
+        )  # fmt: skip
+    assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1][:, :6], results[1][1][:, :6])
+    assert (results[1][1][:, 6] == 0.01).all() and not results[0][1][:, 6].any()
+
+
 def _poses_with_and_without(keyframes, records):
     """float32 [7] after one step, and the same without the images' brightness."""
     plain = keyframes._replace(intensities=None, exposure=None)
@@ -262,6 +327,10 @@ def test_bad_exposures_are_named(generator):
         (
             good._replace(exposure=exposure._replace(log_gains=exposure.log_gains[:1])),
             r"depth_keyframes.exposure.log_gains must have shape \[2, 1\]",
+        ),
+        (
+            good._replace(exposure=exposure._replace(frame=torch.zeros(3))),
+            r"depth_keyframes.exposure.frame must have shape \[1\]",
         ),
         (
             good._replace(exposure=exposure._replace(frame=exposure.frame.double())),

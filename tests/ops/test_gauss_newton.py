@@ -45,7 +45,7 @@ def test_recovers_the_pose(device, generator, shift_m, angle_deg):
     found = pose7_to_matrix(pose.cpu().double().numpy())
     assert np.linalg.norm(found[:3, 3] - POSE[:3, 3]) < 2e-3
     assert np.degrees(rotation_angle(found[:3, :3].T @ POSE[:3, :3])) < 0.1
-    assert stats.shape == (8, 6) and float(stats[-1, 1]) > 0.8
+    assert stats.shape == (8, 7) and float(stats[-1, 1]) > 0.8
     assert torch.linalg.eigvalsh(hessian.cpu().double()).min() > 0
 
 

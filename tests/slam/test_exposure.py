@@ -33,15 +33,15 @@ def run(dataset, *overrides, lost_from=COUNT):
 
 def test_gains_are_found_and_kept_with_the_frames(tmp_path):
     system = run(Recorded(COUNT, darkened))
-    found = system.state.frames.log_gains[:, 0].exp()
+    found = system.state.frames.gains[:, 0].exp()
     torch.testing.assert_close(found, torch.tensor(GAINS), rtol=0, atol=0.02)
     history = system.history
-    assert torch.equal(history.log_gain(7), system.state.frames.log_gains[7])
+    assert torch.equal(history.log_gain(7), system.state.frames.gains[7, :1])
     exposure = history.depth_keyframes().exposure
-    assert torch.equal(exposure.frame, system.state.frames.log_gains[-1])
+    assert torch.equal(exposure.frame, system.state.frames.gains[-1])
     assert len(exposure.log_gains) == len(system.state.frames.pose_rows)
     system.save(tmp_path / "saved")
-    assert torch.equal(SlamSystem.load(tmp_path / "saved").state.frames.log_gains, system.state.frames.log_gains)
+    assert torch.equal(SlamSystem.load(tmp_path / "saved").state.frames.gains, system.state.frames.gains)
 
 
 def test_poses_are_as_right_as_with_an_even_exposure():
@@ -59,12 +59,12 @@ def test_noise_of_brightness_is_not_that_of_exposure():
 
 
 def test_an_even_exposure_has_no_gain():
-    assert run(Recorded(COUNT)).state.frames.log_gains.abs().max() < 0.01
+    assert run(Recorded(COUNT)).state.frames.gains[:, 0].abs().max() < 0.01
 
 
 def test_a_lost_frame_has_the_gain_of_the_one_before():
     system = run(Recorded(COUNT, darkened), lost_from=9)
-    gains = system.state.frames.log_gains[:, 0]
+    gains = system.state.frames.gains[:, 0]
     assert system.state.frames.lost[9:].all()
     assert float(gains[8].exp()) == pytest.approx(GAINS[8], abs=0.02)
     assert (gains[9:] == gains[8]).all()
@@ -73,13 +73,13 @@ def test_a_lost_frame_has_the_gain_of_the_one_before():
 @pytest.mark.parametrize("overrides", [["tracking.color=false"], ["tracking.depth_keyframes=false"]])
 def test_without_brightness_there_are_no_gains(overrides):
     system = run(Recorded(6, darkened), *overrides)
-    assert not system.state.frames.log_gains.any()
+    assert not system.state.frames.gains[:, 0].any()
 
 
 def test_rows_of_a_table_carry_gains_on(device):
     table = FrameTable(Camera(64, 48, 50.0, 50.0, 31.5, 23.5), device)
     pose, thumbnail = torch.tensor([1.0, 0, 0, 0, 0, 0, 0]), torch.zeros(3, 4, dtype=torch.float16)
     for number, gain in enumerate((None, 0.25, None, None, -0.5, None)):
-        log_gain = None if gain is None else torch.tensor([gain], device=device)
-        table.append(pose, 0.1 * number, number, gain is None, thumbnail, log_gain=log_gain)
-    assert table.log_gains[:, 0].tolist() == [0.0, 0.25, 0.25, 0.25, -0.5, -0.5]
+        known = None if gain is None else torch.tensor([gain, 0.1], device=device)
+        table.append(pose, 0.1 * number, number, gain is None, thumbnail, gain=known)
+    assert table.log_gain_rows[:6, 0].tolist() == [0.0, 0.25, 0.25, 0.25, -0.5, -0.5]

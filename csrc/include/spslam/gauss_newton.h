@@ -12,8 +12,8 @@ namespace spslam {
 
 // cost (m^2), inlier share, |translation step| (m), |rotation step| (rad), mean score weight over all pixels
 constexpr int kTrackingStatSize = 5;
-// Of tracking: these, and the natural logarithm of the frame's gain after the step.
-constexpr int kFrameStatSize = kTrackingStatSize + 1;
+// Of tracking: these, and after the step the natural logarithm of the frame's gain and the variance of its steps.
+constexpr int kFrameStatSize = kTrackingStatSize + 2;
 
 // How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown. And by
 // how much later the frame's color was taken than its depth, s, as the stamps of the two say.
@@ -61,9 +61,11 @@ struct DepthKeyframes {
   // s, from a frame's depth image to its color image, beside what stamps say; null: they are of one moment.
   const float* color_delay;
   FrameMotion motions[kMaxDepthKeyframes], frame_motion;  // of each keyframe, and of the frame that is aligned
-  // Natural logarithms of gains, by how much brighter a frame's image is than others': [F] by rows of poses, and [1] of
-  // the frame that is aligned, as far as it is known. Null: all are alike.
+  // Natural logarithms of gains, by how much brighter a frame's image is than others': of row f of the poses at f times
+  // the stride, and [1] of the frame that is aligned, as far as it is known. Null: all are alike.
   const float *log_gains, *frame_log_gain;
+  std::int64_t log_gain_stride;
+  const float* gain_variance;  // [1] of the step from there to the frame's own gain; null: it may be any
 };
 
 // The scalars of GaussNewtonOptions, type and name, in the order of the fields of ops.GaussNewtonOptions: a line here

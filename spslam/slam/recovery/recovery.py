@@ -65,7 +65,7 @@ class Recovery:
             fit,
             **self._judgement(fit),
             information=estimate.information,
-            log_gain=estimate.log_gain,
+            gain=estimate.gain,
             on_host=None if numbers is None else (estimate.pose, numbers),
         )
 

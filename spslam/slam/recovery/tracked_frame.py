@@ -31,7 +31,7 @@ class TrackedFrame:
             last of them.
         features: of the image, where they were needed.
         information: of the pose, see `PoseEstimate`; None where it was not tracked.
-        log_gain: float32 [1] of the frame, on the device, see `ops.Exposure`; None where it was not tracked.
+        gain: float32 [2] of the frame, on the device, as `FrameTable.gains`; None where it was not tracked.
         on_host: a pose, and its seven numbers, which were read with its fit; of the frame's if it is the same object.
     """
 
@@ -46,7 +46,7 @@ class TrackedFrame:
     consistent_frames: int = 0
     features: ImageFeatures | None = None
     information: np.ndarray | None = field(default=None, compare=False)
-    log_gain: torch.Tensor | None = field(default=None, compare=False)
+    gain: torch.Tensor | None = field(default=None, compare=False)
     on_host: tuple[torch.Tensor, tuple[float, ...]] | None = field(default=None, compare=False)
 
     @classmethod
