@@ -43,6 +43,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
 }
 #endif
 
-SPS_LIBRARY_IMPL(m) { m.impl("nearest_descriptors", TORCH_BOX(&nearest_descriptors)); }
+SPS_LIBRARY_IMPL(m) {
+  m.impl("nearest_descriptors", TORCH_BOX(&nearest_descriptors));
+}
 
 }  // namespace spslam::bindings

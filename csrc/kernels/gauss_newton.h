@@ -26,15 +26,15 @@ constexpr float kMaxTrackingStep = 0.15f;  // norm of (dt in m, domega in rad)
 constexpr double kMaxGainStep = 0.2;       // of the logarithm, in one iteration
 // As many a frame's pixels are worth for its gain: what is wrong with their brightness is alike for neighbors.
 constexpr double kIndependentPixels = 300.0;
-constexpr double kGainEvidence = 1.0 / 16;       // share of a frame in the variance of the steps of the gain
-constexpr double kLeastGainVariance = 1e-8;      // 0.01 %, less than any pixel shows
+constexpr double kGainEvidence = 1.0 / 16;   // share of a frame in the variance of the steps of the gain
+constexpr double kLeastGainVariance = 1e-8;  // 0.01 %, less than any pixel shows
 
 // The gain of the frame that is tracked, and what is known of it without its own pixels.
 struct FrameGain {
-  float log_gain;   // as the running iteration has it
-  float before;     // where it is expected
-  float variance;   // of the step from there
-  double unit;      // (m^2) the information of a residual's square over its variance; 0: the gain may be any
+  float log_gain;  // as the running iteration has it
+  float before;    // where it is expected
+  float variance;  // of the step from there
+  double unit;     // m^2; over it, the pixels' sum of squares is an information. 0: the gain may be any
 };
 
 // The earlier frames that a call compares with and the sensor's noise, read once.
@@ -184,12 +184,12 @@ SPS_INLINE double held_damping(const Measurement& measure, const double* terms) 
   return waits ? options.held_information * terms[kNormalTerms + 2] : 0.0;
 }
 
-// What the equations of the frame's gain, and where it is expected, leave of those of the pose; the gain's step once the
-// pose's is known.
+// What the equations of the frame's gain, and where it is expected, leave of those of the pose; the gain's step once
+// the pose's is known.
 struct GainEquations {
-  const double* terms;               // [kGainTerms] of the pixels
-  double gradient, inverse;          // with what is expected; the inverse of the information is 0 where there is none
-  double innovation, own_variance;   // by how much the pixels alone would have it otherwise, and how well they know
+  const double* terms;              // [kGainTerms] of the pixels
+  double gradient, inverse;         // with what is expected; the inverse of the information is 0 where there is none
+  double innovation, own_variance;  // by how much the pixels alone would have it otherwise, and how well they know
 
   SPS_INLINE GainEquations(const double* of, const FrameGain& gain)
       : terms(of), gradient(of[7]), inverse(0.0), innovation(0.0), own_variance(0.0) {
@@ -233,9 +233,9 @@ struct GainEquations {
 };
 
 // Solves the joint normal equations, with `held` added to the diagonal, and moves the pose and, unless it is null, the
-// gain, whose equations `joint` then has too. `steps` gets |dt| (m) and
-// |domega| (rad). `hessian` gets the map's matrix as if pixels had on average their score weights and no certainties:
-// it says how firmly the surface holds the pose, whatever its distance and the width of the kernel.
+// gain, whose equations `joint` then has too. `steps` gets |dt| (m) and |domega| (rad). `hessian` gets the map's matrix
+// as if pixels had on average their score weights and no certainties: it says how firmly the surface holds the pose,
+// whatever its distance and the width of the kernel.
 SPS_INLINE void tracking_step(const double* terms, const double* joint, double damping, double held, float* pose,
                               float* steps, float* hessian, FrameGain* gain = nullptr) {
   double h[36], g[6], cost, delta[6];

@@ -144,7 +144,9 @@ def serve(socket: int, shared: int) -> None:
 
 
 def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
-    preparation = FramePreparation(work.dataset, work.config, work.start, extracts_all=_is_shared_out(work, MIN_EXTRACTING))
+    preparation = FramePreparation(
+        work.dataset, work.config, work.start, extracts_all=_is_shared_out(work, MIN_EXTRACTING)
+    )
     free, before, number = deque(range(work.slots)), 0.0, work.processed
     frozen = FrozenFrames(work.dataset, work.start)
     with _shared_out(work, preparation, connection) as source, prefetch(source, work.workers, work.ahead) as frames:
@@ -170,9 +172,7 @@ def _is_shared_out(work: Work, least: int = 2) -> bool:
 
 
 @contextlib.contextmanager
-def _shared_out(
-    work: Work, preparation: FramePreparation, connection: Connection
-) -> Iterator[Readable[PreparedFrame]]:
+def _shared_out(work: Work, preparation: FramePreparation, connection: Connection) -> Iterator[Readable[PreparedFrame]]:
     """The frames of a preparation, by a process for each thread where the data can be shared out."""
     if not _is_shared_out(work):
         yield preparation

@@ -45,7 +45,7 @@ class WorkerEndedError(Exception):
 class _Reply(NamedTuple):
     """Of a worker: a frame, but for its pixels, or why there is none; see `reader_service.Message`."""
 
-    index: int = 0
+    dataset_index: int = 0
     timestamp: float = 0.0
     decode_ms: float = 0.0
     valid_depth_share: float = 0.0
@@ -59,7 +59,7 @@ class _Reply(NamedTuple):
     def frame(self, pixels: FramePixels) -> PreparedFrame:
         """The frame with these pixels."""
         features = self.features if self.keeps_features else None
-        frame = PreparedFrame(self.index, self.timestamp, pixels, self.decode_ms, features=features)
+        frame = PreparedFrame(self.dataset_index, self.timestamp, pixels, self.decode_ms, features=features)
         frame.signature, frame.offsets = self.signature, CaptureOffsets(*self.offsets)
         return frame
 

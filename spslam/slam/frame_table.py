@@ -73,7 +73,7 @@ class FrameTable:
 
     @property
     def gains(self) -> torch.Tensor:
-        """float32 [F, 2] of the frames' brightness the log gain and the variance of its steps, see `ops.Exposure`, on the
+        """float32 [F, 2] log gain of the frames' brightness and the variance of its steps, see `ops.Exposure`, on the
         device; a lost frame has those of the one before."""
         return self._columns["gains"][: self._count]
 

@@ -223,8 +223,9 @@ def _random_embeddings(generator, device, n):
 
 
 def _descriptors(generator, device, n):
-    drawn = (torch.randint(0, 256, (count, 32), generator=generator) for count in (n, 70))
-    return on_device(device, {name: each.to(torch.uint8) for name, each in zip(("descriptors", "others"), drawn)})
+    counts = {"descriptors": n, "others": 70}
+    drawn = {name: torch.randint(0, 256, (rows, 32), generator=generator) for name, rows in counts.items()}
+    return on_device(device, {name: each.to(torch.uint8) for name, each in drawn.items()})
 
 
 def _marching_cubes(generator, device, n):
