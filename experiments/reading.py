@@ -1,4 +1,6 @@
-"""Speed of reading alone, by number of threads: decoding, sampling and, for a GPU, the upload.
+"""Speed of reading alone, by number of threads, or of processes: decoding, sampling and, for a GPU, the upload.
+
+With processes (`--set run.reader=process`) the processor time is only of the process that takes the frames.
 
 python -m experiments.reading --config 7scenes --data path/to/redkitchen --frames 0:300 --workers 1 2 4 8 16
 """
@@ -46,8 +48,9 @@ def main() -> None:
 
 def read_all(dataset: RgbdDataset, config: Config, device: torch.device) -> dict[str, float]:
     """Frames/s, and ms/frame: of the reading threads, and of the processors in user and system mode."""
-    started, before = time.perf_counter(), os.times()
     with FrameFeed(dataset, config, device) as feed:
+        feed.prepare()  # the start of a process is none of it
+        started, before = time.perf_counter(), os.times()
         for _ in feed:
             pass
         if device.type == "cuda":

@@ -176,8 +176,9 @@ class RunOptions(Section):
         "threads that read and decode images; null chooses by the number of cores and the device", "threads", ge=1
     )
     reader: Literal["auto", "process", "threads"] = option(
-        "where these threads run: in a separate `process`, or as `threads` of the run's own; `auto` is `process` for a "
-        "GPU if the command line starts the run and the process can read the dataset"
+        "where these threads run: in a separate `process`, which forks one for each thread where frames are files of "
+        "their own, or as `threads` of the run's own; `auto` is `process` for a GPU if the command line starts the run "
+        "and the process can read the dataset"
     )
     prefetch_ahead: int | None = option(
         "maximum number of frames read ahead; null is three per thread, at least 8", "frames", ge=1

@@ -366,9 +366,11 @@ def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: flo
     """The likeliest result, or a trusted one with which surface and image features agree that many times more.
 
     On a young map, or far away, one that has slid along a wall fits as well; one that stopped half-way may be nearer to
-    the prediction.
+    the prediction. So many more features than agree by chance: in a plain corridor as many agree 14 cm farther on.
     """
     known = [other for other in others if not other.lost and not math.isnan(other.fit.feature_share)]
     seen = [other for other in known if other.fit.feature_inliers >= MIN_DECIDING]
     best = max(seen, key=lambda other: other.agreement, default=found)
-    return best if best.agreement > times * found.agreement else found
+    count = found.fit.feature_inliers
+    by_chance = 1 + 1 / math.sqrt(count) if count > 0 else 1.0
+    return best if best.agreement > max(times, by_chance) * found.agreement else found
