@@ -74,11 +74,12 @@ def with_features(found, inliers, share=1.0, lost=False, weight=CERTAIN.mean_rob
     [
         (with_features(0.1, 130), 1.2, True),
         (with_features(0.1, 110), 1.2, False),  # next to as many agree with both
-        (with_features(0.1, 110), 1.0, True),
+        (with_features(0.1, 109), 1.0, False),  # no more than agree by chance
+        (with_features(0.1, 112), 1.0, True),
         (with_features(0.1, 90), 1.0, False),
-        (with_features(0.1, 110, weight=0.6), 1.0, False),  # surface agrees less than the features more
+        (with_features(0.1, 112, weight=0.6), 1.0, False),  # surface agrees less than the features more
         (with_features(0.1, 130, weight=0.6), 1.2, False),
-        (with_features(0.1, 90, weight=0.98), 1.0, True),
+        (with_features(0.1, 98, weight=0.98), 1.0, True),
         (with_features(0.1, 130, share=math.nan), 1.0, False),  # colors are not where depth is
         (with_features(0.9, 130, lost=True), 1.0, False),
     ],
