@@ -10,6 +10,7 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 
+import cv2
 import torch
 
 from experiments import composable_ops, map_ops, room, timing
@@ -18,6 +19,7 @@ from spslam import ops
 
 SIDE, POINTS, CHANNELS = 64, 88_064, 8  # a dense volume, and as many points in it as a mapping iteration has samples
 DECODER = (11, 32, 1)
+DESCRIPTORS, DESCRIPTOR_BYTES = 1000, 32
 Contenders = dict[str, Callable]
 
 
@@ -191,6 +193,19 @@ def without_gradient(generator: torch.Generator, device: torch.device) -> dict[s
         "normal equations and solution": map_ops.gauss_newton_step(generator, device),
         **map_ops.hash_contenders(generator, device),
         "marching_cubes, sphere in 256^3": map_ops.marching_cubes(device),
+        f"nearest_descriptors, {DESCRIPTORS} x {DESCRIPTORS}": descriptors(generator, device),
+    }
+
+
+def descriptors(generator: torch.Generator, device: torch.device) -> dict[str, Callable]:
+    """ORB descriptors of two images; OpenCV has those of a GPU on the host as well."""
+    one, other = (
+        torch.randint(0, 256, (DESCRIPTORS, DESCRIPTOR_BYTES), generator=generator).to(torch.uint8) for _ in range(2)
+    )
+    arrays, tensors = (one.numpy(), other.numpy()), (one.to(device), other.to(device))
+    return {
+        "spslam": lambda: ops.nearest_descriptors(*tensors),
+        "cv2.batchDistance": lambda: cv2.batchDistance(*arrays, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2),
     }
 
 
