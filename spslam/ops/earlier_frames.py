@@ -122,8 +122,8 @@ class Exposure(NamedTuple):
         """Raises TypeError or ValueError, naming `function`, where something does not fit."""
         name = "depth_keyframes.exposure"
         check_tensor(function, f"{name}.log_gains", self.log_gains, (poses, 1), torch.float32, like=like)
-        size = 2 if getattr(self.frame, "numel", lambda: 0)() == 2 else 1
-        check_tensor(function, f"{name}.frame", self.frame, (size,), torch.float32, like=like)
+        check_tensor(function, f"{name}.frame", self.frame, ("1 or 2",), torch.float32, like=like)
+        check(len(self.frame) in (1, 2), function, f"{name}.frame", "have shape [1] or [2]", list(self.frame.shape))
 
 
 class DepthKeyframes(NamedTuple):

@@ -178,7 +178,12 @@ def _shared_out(work: Work, preparation: FramePreparation, connection: Connectio
         yield preparation
         return
     blank = blank_pixels(work.dataset.camera, work.config)
-    with contextlib.closing(ForkedPreparation(preparation, blank, work.workers, connection)) as forked:
+    try:
+        forked = ForkedPreparation(preparation, blank, work.workers, connection)
+    except OSError:  # no more processes, or no memory for them: threads need neither
+        yield preparation
+        return
+    with contextlib.closing(forked):
         yield forked
 
 

@@ -89,16 +89,23 @@ class ForkedPreparation:
         blank: pixels of a frame without content, for the shapes.
         workers: number of processes, at least 1.
         inherited: a connection that they close, as it is the parent's.
+
+    Raises:
+        OSError: the system lets no more processes start; none is left.
     """
 
     def __init__(self, preparation: FramePreparation, blank: FramePixels, workers: int, inherited: Connection):
         self._length, self._blank = len(preparation), blank
         self._free: SimpleQueue[_Worker] = SimpleQueue()
         self._workers: list[_Worker] = []
-        for _ in range(workers):
-            inherited_ends = [inherited, *(worker.connection for worker in self._workers)]
-            self._workers.append(_fork(preparation, len(blank.buffer), inherited_ends))
-            self._free.put(self._workers[-1])
+        try:
+            for _ in range(workers):
+                inherited_ends = [inherited, *(worker.connection for worker in self._workers)]
+                self._workers.append(_fork(preparation, len(blank.buffer), inherited_ends))
+                self._free.put(self._workers[-1])
+        except OSError:
+            self.close()
+            raise
 
     def __len__(self) -> int:
         return self._length

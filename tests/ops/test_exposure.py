@@ -330,7 +330,7 @@ def test_bad_exposures_are_named(generator):
         ),
         (
             good._replace(exposure=exposure._replace(frame=torch.zeros(3))),
-            r"depth_keyframes.exposure.frame must have shape \[1\]",
+            r"depth_keyframes.exposure.frame must have shape \[1\] or \[2\], got \[3\]",
         ),
         (
             good._replace(exposure=exposure._replace(frame=exposure.frame.double())),

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ import torch
 
 from spslam.errors import DatasetError, SpslamError
 from spslam.run.frame_feed import FrameFeed
+from spslam.run.reader_service import Work, _shared_out
+from spslam.slam.prepared_frame import FramePreparation
 from tests.run.test_reader_process import PATIENCE_S, ROOT, fail, has_ended
 from tests.system.sequences import Recorded, settings
 
@@ -116,3 +119,22 @@ def test_a_worker_that_is_killed_is_reported_in_one_line():
 def test_exception_in_a_dataset_keeps_its_traceback():
     with feed_of(fail) as feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
         next(feed)
+
+
+def test_where_no_process_can_start_threads_read(monkeypatch):
+    """And those that had started are ended."""
+    started, fork = [], os.fork
+
+    def fork_once():
+        if started:
+            raise BlockingIOError("no more processes")
+        started.append(fork())
+        return started[0]
+
+    monkeypatch.setattr(os, "fork", fork_once)
+    dataset = Recorded(3, is_random_access=True)
+    work = Work(dataset, settings(), 0, WORKERS, 4, 4, 0, 0)
+    preparation = FramePreparation(dataset, work.config)
+    with _shared_out(work, preparation, Pipe()[0]) as source:
+        assert source is preparation
+    assert os.waitpid(started[0], 0) == (started[0], 0)
