@@ -103,7 +103,10 @@ class TrackingOptions(Section):
         ge=0,
     )
     min_inlier_share: float = option(
-        "a frame is lost when a smaller fraction of its pixels lies on mapped surface", ge=0, le=1
+        "a frame is lost when a smaller fraction of its pixels lies on mapped surface, unless the image features of the "
+        "frames before hold it",
+        ge=0,
+        le=1,
     )
     min_valid_depth_share: float = option("a frame is lost when a smaller fraction of its pixels has depth", ge=0, le=1)
 

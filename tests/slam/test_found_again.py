@@ -89,6 +89,21 @@ def test_surface_and_image_features_decide_between_trusted_poses(other, times, d
     assert _by_features(likeliest, [likeliest, other], times) is (other if decides else likeliest)
 
 
+@pytest.mark.parametrize(
+    ("changes", "lost"),
+    [
+        ({}, False),  # the camera turns to what was not seen yet
+        ({"feature_inliers": 40}, True),
+        ({"feature_share": 0.7}, True),
+        ({"feature_share": math.nan}, True),  # colors are not where depth is
+        ({"prediction_error_cm": math.nan}, True),  # it may be anywhere, as where places are alike
+    ],
+)
+def test_off_the_map_image_features_hold_a_camera(recovery, changes, lost):
+    off = replace(CERTAIN, inlier_share=0.15, mean_robust_weight=0.1, feature_inliers=200, feature_share=1.0)
+    assert recovery._judgement(replace(off, **changes))["lost"] == lost
+
+
 @pytest.mark.parametrize(("share", "taken"), [(1.0, 1), (math.nan, 0)])
 def test_of_results_that_are_one_pose_that_with_most_agreement_stands_for_all(recovery, monkeypatch, share, taken):
     """Where colors are where depth is; else the one of the best fit."""

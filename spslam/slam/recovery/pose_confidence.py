@@ -102,6 +102,12 @@ class PoseConfidenceModel:
         """Whether enough image features agree with the pose, and most of those that agree with one another."""
         return fit.feature_inliers >= self.min_feature_inliers and fit.feature_share >= self.min_feature_share
 
+    def is_held(self, fit: Fit) -> bool:
+        """Whether image features hold the pose; where the camera may be anywhere, places alike have them alike."""
+        is_anywhere = math.isnan(fit.prediction_error_cm)
+        agrees = fit.feature_inliers >= self.min_holding_inliers and fit.feature_share >= self.min_holding_share
+        return agrees and not is_anywhere
+
     def _weight_where_mapped(self, fit: Fit) -> float:
         """The mean robust weight, as it would be on a map with as few holes as those of the calibration.
 
@@ -115,15 +121,9 @@ class PoseConfidenceModel:
 
     def _log10_min_eigenvalue(self, fit: Fit) -> float:
         """log10 of the smallest eigenvalue, falling faster below `firm_eigenvalue` unless features hold the pose."""
-        least = self.firm_eigenvalue if self._is_held_by_features(fit) else self.eigenvalue_floor
+        least = self.firm_eigenvalue if self.is_held(fit) else self.eigenvalue_floor
         lg = math.log10(max(fit.min_eigenvalue, least))
         return lg + (self.weak_eigenvalue_factor - 1) * min(lg - math.log10(self.firm_eigenvalue), 0.0)
-
-    def _is_held_by_features(self, fit: Fit) -> bool:
-        """Whether image features hold the pose; where the camera may be anywhere, places alike have them alike."""
-        is_anywhere = math.isnan(fit.prediction_error_cm)
-        agrees = fit.feature_inliers >= self.min_holding_inliers and fit.feature_share >= self.min_holding_share
-        return agrees and not is_anywhere
 
     def _prediction_error(self, fit: Fit) -> float:
         error = math.log1p(
@@ -132,7 +132,7 @@ class PoseConfidenceModel:
         )
         if math.isnan(error):
             return self.unknown_prediction_error
-        if self._is_held_by_features(fit) and fit.inlier_share > 0:
+        if self.is_held(fit) and fit.inlier_share > 0:
             return 0.0
         # Features that agree with the pose say nothing of the motion model, which may then be wrong.
         is_confirmed = fit.feature_inliers >= self.min_feature_inliers
@@ -140,7 +140,7 @@ class PoseConfidenceModel:
 
     def _missing_correlation(self, fit: Fit) -> float:
         # Images that are blurred while the camera turns correlate less; features that hold the pose tell more.
-        if math.isnan(fit.brightness_correlation) or self._is_held_by_features(fit):
+        if math.isnan(fit.brightness_correlation) or self.is_held(fit):
             return 0.0
         return max(self.min_brightness_correlation - fit.brightness_correlation, 0.0)
 

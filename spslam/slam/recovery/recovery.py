@@ -111,7 +111,9 @@ class Recovery:
     def _judgement(self, fit: Fit) -> dict[str, Any]:
         """What a fit says of its pose, as fields of `TrackedFrame`; one of NaN has no inliers."""
         tracking, probability = self._config.tracking, self._confidence.error_probability(fit)
-        is_trusted = fit.inlier_share >= tracking.min_inlier_share and probability <= tracking.lost_threshold
+        # A camera that turns to what was not seen yet leaves the map, while the features of the last frames hold it.
+        is_somewhere = fit.inlier_share >= tracking.min_inlier_share or self._confidence.is_held(fit)
+        is_trusted = is_somewhere and probability <= tracking.lost_threshold
         occluded = self._confidence.is_occluded(fit)
         return {"error_probability": probability, "lost": not is_trusted, "occluded": occluded}
 
