@@ -103,7 +103,7 @@ class TrackingOptions(Section):
         ge=0,
     )
     min_inlier_share: float = option(
-        "a frame is lost when a smaller fraction of its pixels lies on mapped surface, unless the image features of the "
+        "a frame is lost when a smaller fraction of its pixels lies on mapped surface, unless the image features of "
         "frames before hold it",
         ge=0,
         le=1,
