@@ -6,12 +6,12 @@ for its process, and copies the pixels that it has left in memory that both map.
 """
 
 import mmap
-import os
+import multiprocessing
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkProcess
 from queue import SimpleQueue
 from typing import NamedTuple, cast
 
@@ -64,18 +64,16 @@ class _Reply(NamedTuple):
         return frame
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Worker:
-    pid: int
+    process: ForkProcess
     connection: Connection
     memory: torch.Tensor  # int32 [words] that both processes map
-    code: int | None = None  # of its exit
 
     def ended(self) -> WorkerEndedError:
         """What is to be raised once its connection is closed; waits for its end."""
-        if self.code is None:
-            self.code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
-        return WorkerEndedError(self.code)
+        self.process.join()
+        return WorkerEndedError(self.process.exitcode or 0)
 
 
 class ForkedPreparation:
@@ -140,26 +138,23 @@ class ForkedPreparation:
 
 
 def _fork(preparation: FramePreparation, words: int, inherited: Sequence[Connection]) -> _Worker:
-    own, other = Pipe()
+    context = multiprocessing.get_context("fork")
+    own, other = context.Pipe()
     shared = mmap.mmap(-1, max(words, 1) * WORD_BYTES)  # anonymous, and shared with what is forked
     memory = torch.frombuffer(shared, dtype=torch.int32)[:words]
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            # Else an end that is closed elsewhere stays open here, and nobody notices.
-            for connection in (own, *inherited):
-                connection.close()
-            _work(preparation, other, memory)
-            code = 0
-        finally:
-            os._exit(code)  # what the parent would do on leaving is the parent's
+    process = context.Process(target=_work, args=(preparation, other, memory, (own, *inherited)), daemon=True)
+    process.start()
     other.close()
-    return _Worker(pid, own, memory)
+    return _Worker(process, own, memory)
 
 
-def _work(preparation: FramePreparation, connection: Connection, memory: torch.Tensor) -> None:
+def _work(
+    preparation: FramePreparation, connection: Connection, memory: torch.Tensor, inherited: Sequence[Connection]
+) -> None:
     """What a worker does until its connection is closed."""
+    # Else an end that is closed elsewhere stays open here, and nobody notices.
+    for other in inherited:
+        other.close()
     try:
         while True:
             position = int.from_bytes(connection.recv_bytes(), "little")
