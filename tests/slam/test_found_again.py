@@ -97,6 +97,8 @@ def test_surface_and_image_features_decide_between_trusted_poses(other, times, d
         ({"feature_share": 0.7}, True),
         ({"feature_share": math.nan}, True),  # colors are not where depth is
         ({"prediction_error_cm": math.nan}, True),  # it may be anywhere, as where places are alike
+        ({"prediction_error_cm": 30.0}, True),  # it has jumped
+        ({"prediction_error_deg": 10.0}, True),
     ],
 )
 def test_off_the_map_image_features_hold_a_camera(recovery, changes, lost):

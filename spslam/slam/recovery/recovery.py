@@ -24,7 +24,7 @@ from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.tracker import PoseEstimate, Tracker, TrackingProblem
 
 CONSISTENT_FRAMES = 4  # lost frames in a row whose likely poses are consistent are found
-CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one of them to the next
+CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one such frame to the next
 LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
 OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
 ANCHORS = 2  # stored frames that hold a pose beside the last one
@@ -111,8 +111,10 @@ class Recovery:
     def _judgement(self, fit: Fit) -> dict[str, Any]:
         """What a fit says of its pose, as fields of `TrackedFrame`; one of NaN has no inliers."""
         tracking, probability = self._config.tracking, self._confidence.error_probability(fit)
-        # A camera that turns to what was not seen yet leaves the map, while the features of the last frames hold it.
-        is_somewhere = fit.inlier_share >= tracking.min_inlier_share or self._confidence.is_held(fit)
+        # A camera that turns to what was not seen yet leaves the map, while features of the last frames hold it; one that
+        # has jumped has to be found on the map.
+        is_followed = self._confidence.is_held(fit) and _is_consistent(fit)
+        is_somewhere = fit.inlier_share >= tracking.min_inlier_share or is_followed
         is_trusted = is_somewhere and probability <= tracking.lost_threshold
         occluded = self._confidence.is_occluded(fit)
         return {"error_probability": probability, "lost": not is_trusted, "occluded": occluded}
@@ -350,9 +352,7 @@ class Recovery:
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
         frames with consistent poses.
         """
-        is_consistent = (
-            tracked.fit.prediction_error_cm < CONSISTENT_CM and tracked.fit.prediction_error_deg < CONSISTENT_DEG
-        )
+        is_consistent = _is_consistent(tracked.fit)
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
         tracked = self._judged(replace(tracked, fit=fit))
         if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
@@ -362,6 +362,11 @@ class Recovery:
         if frames >= CONSISTENT_FRAMES:
             return replace(tracked, lost=False, consistent_frames=0)
         return replace(tracked, lost=True, consistent_frames=frames)
+
+
+def _is_consistent(fit: Fit) -> bool:
+    """Whether the pose is about where the frames before predict it; False where nothing does."""
+    return fit.prediction_error_cm < CONSISTENT_CM and fit.prediction_error_deg < CONSISTENT_DEG
 
 
 def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: float = 1.0) -> TrackedFrame:
