@@ -111,8 +111,8 @@ class Recovery:
     def _judgement(self, fit: Fit) -> dict[str, Any]:
         """What a fit says of its pose, as fields of `TrackedFrame`; one of NaN has no inliers."""
         tracking, probability = self._config.tracking, self._confidence.error_probability(fit)
-        # A camera that turns to what was not seen yet leaves the map, while features of the last frames hold it; one that
-        # has jumped has to be found on the map.
+        # A camera that turns to what was not seen yet leaves the map, while features of the last frames hold it; one
+        # that has jumped has to be found on the map.
         is_followed = self._confidence.is_held(fit) and _is_consistent(fit)
         is_somewhere = fit.inlier_share >= tracking.min_inlier_share or is_followed
         is_trusted = is_somewhere and probability <= tracking.lost_threshold
