@@ -18,7 +18,7 @@ from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 from spslam.slam.upload import Uploader
 
-# More threads hardly decode faster: they wait for Python's GIL, and slow down the frame loop.
+# More of them hardly read faster, and slow down the frame loop.
 MAX_WORKERS = 16
 MIN_WORKERS = 2
 MIN_AHEAD = 8

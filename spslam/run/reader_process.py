@@ -13,17 +13,16 @@ import signal
 import subprocess
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import torch
 
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.clock import CaptureOffsets
 from spslam.errors import DatasetError, SpslamError, brief
 from spslam.run.reader_launch import AHEAD_PER_WORKER, launch, take_standby
-from spslam.run.reader_service import DISCONNECTED, Message, Work, mapped, slot_message
+from spslam.run.reader_message import DISCONNECTED, Message
+from spslam.run.reader_service import Work, mapped, slot_message
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload, Uploader
@@ -176,17 +175,11 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             return message.error
         if message.slot is None:
             raise StopIteration
-        pixels = self._take(message.slot, message)
-        prepared = PreparedFrame(message.dataset_index, message.timestamp, pixels, message.decode_ms)
-        prepared.features = message.features if message.keeps_features else None
-        if message.offsets is not None:
-            prepared.offsets = CaptureOffsets(*message.offsets)
-        return prepared
+        return message.frame(self._take(message.slot, message))
 
     def _take(self, slot: int, message: Message) -> FramePixels | Upload:
         """A copy of the pixels in a slot, or their upload."""
-        share, features = message.valid_depth_share, message.features
-        pixels = replace(self._blank, buffer=self._memory[slot], valid_depth_share=share, features=features)
+        pixels = message.pixels(self._blank, self._memory[slot])
         if self._uploader is None:
             copy = pixels.holding(pixels.buffer.clone())
             self._connection.send_bytes(slot_message(slot))

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import NamedTuple, cast
+from typing import cast
 
 import cv2
 import numpy as np
@@ -17,12 +17,11 @@ import torch
 from spslam import ops
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
-from spslam.datasets.clock import AT_ONCE
 from spslam.datasets.prefetch import Readable, prefetch
 from spslam.errors import DatasetError
 from spslam.run.frozen_frames import FrozenFrames
-from spslam.run.reader_workers import DISCONNECTED, ForkedPreparation, WorkerEndedError
-from spslam.slam.image_features import ImageFeatures
+from spslam.run.reader_message import DISCONNECTED, Message
+from spslam.run.reader_workers import ForkedPreparation, WorkerEndedError
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
@@ -55,36 +54,6 @@ class Work:
     slots: int
     words: int
     processed: int
-
-
-class Message(NamedTuple):
-    """From the process: a frame, a frame that can't be read, a failure, or the end of the dataset (all defaults).
-
-    Attributes:
-        read_ms: time that a reading thread spent on the frame.
-        slot: slot that holds the frame's pixels; None where there is no frame.
-        dataset_index: `PreparedFrame.index`.
-        timestamp, decode_ms: as in `PreparedFrame`.
-        valid_depth_share, features: as in `FramePixels`.
-        keeps_features: whether the features are those of `PreparedFrame` too.
-        offsets: as in `PreparedFrame`, in the order of its fields; None for those of images taken at once.
-        error: of a frame that can't be read.
-        failure: traceback of an exception that is not the data's fault; the process then ends.
-        ended: exit code of a process that prepared frames, if one ended before its time.
-    """
-
-    read_ms: float = 0.0
-    slot: int | None = None
-    dataset_index: int = 0
-    timestamp: float = 0.0
-    decode_ms: float = 0.0
-    valid_depth_share: float = 0.0
-    features: ImageFeatures | None = None
-    keeps_features: bool = False
-    offsets: tuple[float, float] | None = None
-    error: DatasetError | None = None
-    failure: str | None = None
-    ended: int | None = None
 
 
 def mapped(shared: int, slots: int, words: int) -> torch.Tensor:
@@ -160,9 +129,7 @@ def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> No
             number += 1
             slot, pixels = _free_slot(free, connection), cast(FramePixels, frame.pixels)
             memory[slot].copy_(pixels.buffer)
-            described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, pixels.features)
-            offsets = None if frame.offsets == AT_ONCE else (frame.offsets.depth, frame.offsets.color)
-            _send(connection, Message(read_ms, slot, *described, frame.features is not None, offsets))
+            _send(connection, Message.of(frame, read_ms, slot))
     _send(connection, Message())
 
 

@@ -9,25 +9,21 @@ import mmap
 import multiprocessing
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
 from queue import SimpleQueue
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 
-from spslam.datasets.clock import CaptureOffsets
-from spslam.datasets.frozen_depth import FrameSignature
 from spslam.errors import DatasetError
-from spslam.slam.image_features import ImageFeatures
+from spslam.run.reader_message import DISCONNECTED, Message
 from spslam.slam.pixels import WORD_BYTES, FramePixels
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
 _POSITION_BYTES = 8  # of a frame's position
-
-# Raised by a connection whose other end is closed.
-DISCONNECTED = (EOFError, ConnectionError)
+_OWN_SLOT = 0  # each worker has memory for one frame
 
 
 class WorkerEndedError(Exception):
@@ -40,28 +36,6 @@ class WorkerEndedError(Exception):
     def __init__(self, code: int):
         super().__init__(f"a process that prepares frames ended with code {code}")
         self.code = code
-
-
-class _Reply(NamedTuple):
-    """Of a worker: a frame, but for its pixels, or why there is none; see `reader_service.Message`."""
-
-    dataset_index: int = 0
-    timestamp: float = 0.0
-    decode_ms: float = 0.0
-    valid_depth_share: float = 0.0
-    features: ImageFeatures | None = None
-    keeps_features: bool = False
-    signature: FrameSignature | None = None
-    offsets: tuple[float, float] = (0.0, 0.0)
-    error: DatasetError | None = None
-    failure: str | None = None
-
-    def frame(self, pixels: FramePixels) -> PreparedFrame:
-        """The frame with these pixels."""
-        features = self.features if self.keeps_features else None
-        frame = PreparedFrame(self.dataset_index, self.timestamp, pixels, self.decode_ms, features=features)
-        frame.signature, frame.offsets = self.signature, CaptureOffsets(*self.offsets)
-        return frame
 
 
 @dataclass(frozen=True)
@@ -119,13 +93,12 @@ class ForkedPreparation:
         worker = self._free.get()
         try:
             worker.connection.send_bytes(i.to_bytes(_POSITION_BYTES, "little"))
-            reply = _Reply(*worker.connection.recv())
-            if reply.failure is not None:
-                raise RuntimeError(reply.failure)
-            if reply.error is not None:
-                raise reply.error
-            pixels = replace(self._blank, valid_depth_share=reply.valid_depth_share, features=reply.features)
-            return reply.frame(pixels.holding(worker.memory.clone()))
+            message = Message(*worker.connection.recv())
+            if message.failure is not None:
+                raise RuntimeError(message.failure)
+            if message.error is not None:
+                raise message.error
+            return message.frame(message.pixels(self._blank, worker.memory.clone()))
         except DISCONNECTED:
             raise worker.ended() from None
         finally:
@@ -163,15 +136,12 @@ def _work(
         return
 
 
-def _prepare(preparation: FramePreparation, position: int, memory: torch.Tensor) -> _Reply:
+def _prepare(preparation: FramePreparation, position: int, memory: torch.Tensor) -> Message:
     try:
         frame = preparation[position]
-        pixels = cast(FramePixels, frame.pixels)
-        memory.copy_(pixels.buffer)
-        described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, pixels.features)
-        offsets = (frame.offsets.depth, frame.offsets.color)
-        return _Reply(*described, frame.features is not None, frame.signature, offsets)
+        memory.copy_(cast(FramePixels, frame.pixels).buffer)
+        return Message.of(frame, frame.decode_ms, _OWN_SLOT, frame.signature)
     except DatasetError as error:
-        return _Reply(error=error)
+        return Message(error=error)
     except Exception:
-        return _Reply(failure=traceback.format_exc())
+        return Message(failure=traceback.format_exc())

@@ -16,7 +16,7 @@ from spslam.slam.row_copies import RowCopies, write_rows
 
 _FIRST_CAPACITY = 64
 # A frame's log gain and the variance of its steps before any is known: exposure is taken to be even until it is seen to
-# change, as the first frames of a plain place would else slide along it.
+# change.
 _UNKNOWN_GAIN = (0.0, 1e-8)
 _ON_HOST = ("timestamps", "depth_times", "color_offsets", "indices", "lost", "consistent_frames")
 

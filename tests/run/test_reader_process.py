@@ -50,6 +50,13 @@ def has_ended(pid: int) -> bool:
     return state == "Z"
 
 
+def wait_until_ended(pids):
+    deadline = time.monotonic() + PATIENCE_S
+    while not all(has_ended(pid) for pid in pids):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 def test_the_function_that_the_process_runs_exists():
     """It is named by a string, as importing it would load torch."""
     module = importlib.import_module(reader_launch.SERVICE_MODULE)
@@ -235,7 +242,4 @@ def test_reader_ends_when_the_loop_is_killed():
     os.kill(loop.pid, signal.SIGKILL)
     loop.wait()
     loop.stdout.close()
-    deadline = time.monotonic() + PATIENCE_S
-    while not has_ended(reader):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_until_ended([reader])

@@ -1,11 +1,9 @@
 """Frames prepared by processes that the reading process forks: the same frames, and what happens when one ends."""
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
-import time
 from multiprocessing import Pipe
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from spslam.errors import DatasetError, SpslamError
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.reader_service import Work, _shared_out
 from spslam.slam.prepared_frame import FramePreparation
-from tests.run.test_reader_process import PATIENCE_S, ROOT, fail, has_ended
+from tests.run.test_reader_process import ROOT, fail, has_ended, wait_until_ended
 from tests.system.sequences import Recorded, settings
 
 FRAMES = 34  # image features of the first and the 31st are extracted ahead
@@ -35,13 +33,6 @@ def refuse_some(frame):
 
 def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def wait_until_ended(pids):
-    deadline = time.monotonic() + PATIENCE_S
-    while not all(has_ended(pid) for pid in pids):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @pytest.mark.parametrize("change", [None, refuse_some])
@@ -112,8 +103,7 @@ def test_a_worker_that_is_killed_is_reported_in_one_line():
                 frames.append(frame)
         pid = feed._process._process.pid
     assert [frame.index for frame in frames] == list(range(20))
-    with contextlib.suppress(ProcessLookupError):
-        assert has_ended(pid)
+    assert has_ended(pid)
 
 
 def test_exception_in_a_dataset_keeps_its_traceback():
