@@ -118,11 +118,15 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
 
         Raises:
             ReaderUnavailableError: the dataset's class can't be imported by the process, which has then ended.
+            RuntimeError: it can't begin for another reason, with the traceback.
         """
         try:
             ready = self._connection.recv()
         except DISCONNECTED:
             ready = False
+        if isinstance(ready, tuple):
+            self.close()
+            _check_failure(Message(*ready))
         if not ready:
             self.close()
             name = f"{self._kind.__module__}.{self._kind.__qualname__}"
@@ -166,10 +170,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             self._has_started = True
         self._return_slots()
         message = Message(*self._connection.recv())
-        if message.ended is not None:
-            raise SpslamError(_describe_exit(message.ended))
-        if message.failure is not None:
-            raise RuntimeError(f"reading frames failed:\n{message.failure}")
+        _check_failure(message)
         self.read_seconds += message.read_ms / 1e3
         if message.error is not None:
             return message.error
@@ -198,6 +199,14 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
                 upload.end.wait()
             self._in_use.popleft()
             self._connection.send_bytes(slot_message(slot))
+
+
+def _check_failure(message: Message) -> None:
+    """Raises what the process says has failed in it, apart from a frame that can't be read."""
+    if message.ended is not None:
+        raise SpslamError(_describe_exit(message.ended))
+    if message.failure is not None:
+        raise RuntimeError(f"reading frames failed:\n{message.failure}")
 
 
 def _unavailable(reason: str) -> ReaderUnavailableError:

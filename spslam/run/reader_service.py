@@ -96,10 +96,8 @@ def serve(socket: int, shared: int) -> None:
         except (AttributeError, ImportError):  # the dataset's class can't be imported here
             connection.send(False)
             return
-        connection.send(True)
-        connection.recv()
         try:
-            _send_frames(work, mapped(shared, work.slots, work.words), connection)
+            _serve(work, mapped(shared, work.slots, work.words), connection)
         except DISCONNECTED:
             raise
         except WorkerEndedError as error:
@@ -112,13 +110,28 @@ def serve(socket: int, shared: int) -> None:
             connection.recv_bytes()
 
 
-def _send_frames(work: Work, memory: torch.Tensor, connection: Connection) -> None:
+def _serve(work: Work, memory: torch.Tensor, connection: Connection) -> None:
+    """Says that it is ready, waits until the first frame is requested, and sends all."""
     preparation = FramePreparation(
         work.dataset, work.config, work.start, extracts_all=_is_shared_out(work, MIN_EXTRACTING)
     )
+    # Twelve processes take a tenth of a second to fork; meanwhile the loop's process loads kernels.
+    with _shared_out(work, preparation, connection) as source:
+        connection.send(True)
+        connection.recv()
+        _send_frames(work, preparation, source, memory, connection)
+
+
+def _send_frames(
+    work: Work,
+    preparation: FramePreparation,
+    source: Readable[PreparedFrame],
+    memory: torch.Tensor,
+    connection: Connection,
+) -> None:
     free, before, number = deque(range(work.slots)), 0.0, work.processed
     frozen = FrozenFrames(work.dataset, work.start)
-    with _shared_out(work, preparation, connection) as source, prefetch(source, work.workers, work.ahead) as frames:
+    with prefetch(source, work.workers, work.ahead) as frames:
         for item in frames:
             read_ms, before = 1e3 * (frames.read_seconds - before), frames.read_seconds
             frame = frozen.checked(item)

@@ -111,6 +111,31 @@ def test_exception_in_a_dataset_keeps_its_traceback():
         next(feed)
 
 
+class Unprepared(Recorded):
+    """Fails when the reading process makes itself ready."""
+
+    def __setstate__(self, state):
+        self.__dict__.update(state, is_random_access=None)
+
+    def __getattribute__(self, name):
+        if name == "is_random_access" and super().__getattribute__(name) is None:
+            fail(None)
+        return super().__getattribute__(name)
+
+
+def test_exception_before_it_is_ready_keeps_its_traceback_too():
+    config = settings("run.reader=process", f"run.prefetch_workers={WORKERS}")
+    feed = FrameFeed(Unprepared(FRAMES, is_random_access=True), config, torch.device("cpu"))
+    with feed, pytest.raises(RuntimeError, match="(?s)in fail.*ZeroDivisionError"):
+        feed.prepare()
+
+
+def test_processes_are_there_before_the_first_frame_is_requested():
+    with feed_of() as feed:
+        feed.prepare()
+        assert len(children(feed._process._process.pid)) == WORKERS
+
+
 def test_where_no_process_can_start_threads_read(monkeypatch):
     """And those that had started are ended."""
     started, fork = [], os.fork
