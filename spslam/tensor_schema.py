@@ -91,6 +91,8 @@ def _check_depth_keyframes(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
 def _check_features(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
     """Counts cover the features; frames ascend and exist."""
     frames, counts = tensors["features.frames"], tensors["features.counts"]
+    if int(tensors.get("newest.frame", frames.new_tensor(-1))) >= sizes["frames"]:
+        raise SpslamError(f"tensor newest.frame must be below {sizes['frames']}")
     if int(counts.sum()) != sizes["features_kept"] or bool((counts > sizes["features_kept"]).any()):
         raise SpslamError(f"tensor features.counts must sum to {sizes['features_kept']}, got {int(counts.sum())}")
     if len(frames) and (int(frames[-1]) >= sizes["frames"] or bool((frames[1:] <= frames[:-1]).any())):
@@ -226,6 +228,19 @@ def _edge_rules(name: str) -> dict[str, TensorRule]:
     }
 
 
+def _newest_rules() -> dict[str, TensorRule]:
+    """The last frame's images, and how the camera moved while they were read; all there or none."""
+    image = ("depth_image_rows", "depth_image_columns")
+    return {
+        "newest.frame": TensorRule(torch.int64, (1,), low=-1, optional=True),
+        "newest.depth": TensorRule(torch.uint16, image, optional=True),
+        "newest.intensity": TensorRule(torch.uint8, image, optional=True),
+        "newest.poses": TensorRule(torch.float32, (2, 7), optional=True),
+        "newest.readout": TensorRule(torch.float32, (1,), low=-1, high=1, optional=True),
+        "newest.seconds": TensorRule(torch.float64, (1,), low=0, optional=True),
+    }
+
+
 def _moment_rules(names: Iterable[tuple[str, tuple[int | str, ...]]]) -> dict[str, TensorRule]:
     """Adam's moments; both are there or none. Tables may have spare rows, so their number is free."""
     rules = {}
@@ -246,8 +261,8 @@ _MOMENTS = (
     ("poses", ("pose_rows", 7)),
 )
 
-# And: width and height of the images (px), thumbnail_rows and thumbnail_columns, depth_images, depth_image_rows and
-# depth_image_columns (all 0 without depth keyframes).
+# And: width and height of the images (px), thumbnail_rows and thumbnail_columns, depth_images (0 without depth
+# keyframes), depth_image_rows and depth_image_columns.
 CHECKPOINT = TensorSchema(
     {
         **_map_rules("scene."),
@@ -273,6 +288,7 @@ CHECKPOINT = TensorSchema(
         "features.counts": TensorRule(torch.int64, ("feature_frames",), low=0),
         "features.descriptors": TensorRule(torch.uint8, ("features_kept", 32)),
         "features.points": TensorRule(torch.float32, ("features_kept", 3)),
+        **_newest_rules(),
         "depth_keyframes.images": TensorRule(
             torch.uint16, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
         ),
@@ -295,6 +311,7 @@ CHECKPOINT = TensorSchema(
     (
         ("depth_keyframes.images", "depth_keyframes.intensities"),
         ("depth_keyframes.images", "depth_keyframes.frames"),
+        *(("newest.frame", name) for name in _newest_rules()),
         *(("graph.frames", name) for name in _graph_rules("graph.")),
         *((f"moments.{name}.first", f"moments.{name}.second") for name, _ in _MOMENTS),
     ),

@@ -15,12 +15,13 @@ import torch
 from spslam.config import Config, read_shipped
 from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
+from spslam.slam.depth_keyframes import depth_image_shape
 from spslam.slam.recovery.pose_confidence import MODEL_FILE
 from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
 from spslam.tensor_schema import CHECKPOINT
 
-FORMAT = "spslam-checkpoint-10"
+FORMAT = "spslam-checkpoint-11"
 _FILE = TensorFile("checkpoint", CHECKPOINT, FORMAT, error=OutputError)
 # The ops number iterations up to 2^30; this many leave room to continue.
 _MOST_ITERATIONS = 2**29
@@ -75,6 +76,8 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
     tensors.update(_prefixed("unjoined.", _unjoined_tensors(state.unjoined)))
     tensors.update(_prefixed("noise.", state.noise.tensors()))
     tensors.update(_prefixed("features.", state.features.tensors()))
+    if state.newest is not None:
+        tensors.update(_prefixed("newest.", state.newest.tensors()))
     if state.depth_keyframes is not None:
         tensors.update(_prefixed("depth_keyframes.", state.depth_keyframes.tensors()))
     if state.graph is not None:
@@ -156,6 +159,8 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
     state.unjoined = _unjoined(_section(tensors, "unjoined."), len(tensors["frames.poses"]))
     state.noise.load_state_dict(_section(tensors, "noise."))
     state.features.load_state_dict(_section(tensors, "features."))
+    if state.newest is not None:
+        state.newest.load_state_dict(_section(tensors, "newest."))
     if state.depth_keyframes is not None:
         state.depth_keyframes.load_state_dict(_section(tensors, "depth_keyframes."))
     if state.graph is not None:
@@ -208,14 +213,17 @@ def _unjoined(tensors: dict[str, torch.Tensor], frames: int) -> list[UnjoinedFra
 def _sizes(state: SlamState) -> dict[str, int]:
     """The sizes that `CHECKPOINT` leaves open."""
     _, rows, columns = state.frames.depth_thumbnails.shape
-    images = (0, 0, 0) if state.depth_keyframes is None else tuple(state.depth_keyframes.images.shape)
+    images = 0 if state.depth_keyframes is None else len(state.depth_keyframes.images)
+    image_rows, image_columns = depth_image_shape(state.frames.camera)
     return {
         **TENSOR_SIZES,
         "width": state.frames.camera.width,
         "height": state.frames.camera.height,
         "thumbnail_rows": rows,
         "thumbnail_columns": columns,
-        **dict(zip(("depth_images", "depth_image_rows", "depth_image_columns"), images, strict=True)),
+        "depth_images": images,
+        "depth_image_rows": image_rows,
+        "depth_image_columns": image_columns,
     }
 
 

@@ -38,8 +38,7 @@ class DepthKeyframeStore:
         self.unit, self.max_depth_m = depth_unit(max_depth_m), max_depth_m
         self._kernel_m = kernel_m
         slots = 2 + max(AGES)
-        rows, columns = (-(-size // self.step) for size in (camera.height, camera.width))
-        self.images = torch.zeros(slots, rows, columns, dtype=torch.uint16, device=device)
+        self.images = torch.zeros(slots, *depth_image_shape(camera), dtype=torch.uint16, device=device)
         self.intensities = torch.zeros_like(self.images, dtype=torch.uint8)
         self.frames = [-1] * slots
         self.intrinsics = depth_image_intrinsics(camera)
@@ -100,6 +99,12 @@ def depth_image_intrinsics(camera: Camera) -> ops.Intrinsics:
     """Those of a camera's depth and intensity images."""
     step = depth_image_step(camera)
     return ops.Intrinsics(camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step)
+
+
+def depth_image_shape(camera: Camera) -> tuple[int, int]:
+    """Rows and columns of a camera's depth and intensity images."""
+    step = depth_image_step(camera)
+    return -(-camera.height // step), -(-camera.width // step)
 
 
 def depth_image_step(camera: Camera) -> int:

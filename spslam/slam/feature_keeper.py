@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from spslam import ops
-from spslam.camera import Camera
 from spslam.config import Config
 from spslam.slam.feature_store import keeps_features
-from spslam.slam.image_features import ImageFeatures, extract_features
-from spslam.slam.pixels import FramePixels
+from spslam.slam.image_features import FrameFeatures, ImageFeatures
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier
@@ -19,18 +17,17 @@ class FeatureKeeper:
 
     Args:
         config: options of the run.
-        camera: of all frames.
-        rectifier: of that camera.
+        rectifier: of the camera of all frames.
     """
 
-    def __init__(self, config: Config, camera: Camera, rectifier: ShutterRectifier):
-        self._config, self._camera, self._rectifier = config, camera, rectifier
+    def __init__(self, config: Config, rectifier: ShutterRectifier):
+        self._config, self._rectifier = config, rectifier
 
     def keep(
         self,
         state: SlamState,
         frame: PreparedFrame,
-        read: FramePixels,
+        read: FrameFeatures,
         tracked: TrackedFrame,
         shutter: ops.ShutterMotion | None,
     ) -> None:
@@ -39,7 +36,7 @@ class FeatureKeeper:
         Args:
             state: after the frame; changed.
             frame: as it came.
-            read: its pixels, as they were read.
+            read: of its pixels, as they were read.
             tracked: what tracking made of it.
             shutter: how the camera moved while it was read; None where that does not matter.
         """
@@ -51,12 +48,10 @@ class FeatureKeeper:
         if features is not None:
             state.features.add(len(state.frames) - 1, features)
 
-    def _wanted(self, state: SlamState, frame: PreparedFrame, read: FramePixels) -> ImageFeatures | None:
+    def _wanted(self, state: SlamState, frame: PreparedFrame, read: FrameFeatures) -> ImageFeatures | None:
         """Of a frame that nobody doubted; those that are due and were not extracted ahead are extracted now."""
         if frame.features is None and not keeps_features(self._config, state.frames.processed - 1):
             return None
         if state.has_enough_features(len(state.frames) - 1):
             return None
-        if frame.features is not None:
-            return frame.features
-        return extract_features(read, self._camera, self._config.dataset.max_depth_m)
+        return read.extracted if frame.features is None else frame.features

@@ -8,7 +8,7 @@ import torch
 
 from spslam import ops
 from spslam.slam.color_motion import MAX_COLOR_DELAY_S, MAX_SHARE, ColorMotion
-from spslam.slam.image_features import ImageFeatures, features_of_images
+from spslam.slam.image_features import ImageFeatures
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.state import SlamState
 
@@ -167,13 +167,10 @@ class FrameHistory:
 
     def features(self, row: int) -> ImageFeatures | None:
         """Image features of the frame in a row, if they are kept or its images still are; may wait for the device."""
-        store, images = self._state.features, self._state.depth_keyframes
+        store, newest = self._state.features, self._state.newest
         if row in store.frames:
             return store[store.frames.index(row)]
-        if images is None or row != images.frames[0]:
-            return None
-        intensity, depth = (one[0].cpu().numpy() for one in (images.intensities, images.images))
-        return features_of_images(intensity, depth, self._state.frames.camera, images.max_depth_m)
+        return newest.features() if newest is not None and row == newest.number else None
 
     def feature_rows(self) -> list[int]:
         """Rows of the frames with a trusted pose whose image features are kept, ascending."""

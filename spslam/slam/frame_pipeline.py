@@ -20,6 +20,7 @@ from spslam.slam.frame_history import FrameHistory
 from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report, pose_matrix
 from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
+from spslam.slam.image_features import FrameFeatures
 from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.localizer import Localizer
 from spslam.slam.mapper import Mapper, MappingTask
@@ -82,7 +83,7 @@ class FramePipeline:
         prior = load_prior(config.prior.weights, config.prior.neighborhood)
         self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
-        self._features = FeatureKeeper(config, camera, self._rectifier)
+        self._features = FeatureKeeper(config, self._rectifier)
         tracking = config.tracking
         self._measures_timing = tracking.depth_keyframes and tracking.color and tracking.capture_timing
         confidence = PoseConfidenceModel.load()
@@ -148,6 +149,7 @@ class FramePipeline:
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
         read = self._receive(frame, events)
+        features = self._features_of(read)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
         pixels, constraints, predicted, shutter = read, Constraints(), None, None
@@ -155,16 +157,16 @@ class FramePipeline:
             predicted, shutter, pixels = self._predict(read, frame.depth_time)
             times = frame.depth_time, frame.offsets.color
             constraints = self.constraints.gather(self.history, pixels, *times, shutter)
-        tracked = self._track(pixels, predicted, constraints, number, events, read)
+        tracked = self._track(pixels, predicted, constraints, number, events, features)
         shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
         pixels = read if shutter is None else self._rectifier.frame(read, shutter)
-        self._store(frame, pixels, constraints, tracked)
+        self._store(frame, pixels, constraints, tracked, features, shutter)
         if not begins_map:
             self._tell(on_pose, tracked)
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
             self._tell(on_pose, tracked)
-        self._features.keep(self.state, frame, read, tracked, shutter)
+        self._features.keep(self.state, frame, features, tracked, shutter)
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
@@ -221,7 +223,7 @@ class FramePipeline:
         number: int,
         to_be_mapped: bool = False,
         constraints: Constraints | None = None,
-        read: FramePixels | None = None,
+        features: FrameFeatures | None = None,
     ) -> TrackedFrame:
         """The pose of a frame against the map and the frames before it; changes nothing.
 
@@ -231,14 +233,17 @@ class FramePipeline:
             number: of the frame; keys its random draws.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted; it is then checked for occlusion.
             constraints: beside the map's; None gathers them.
-            read: the frame as it was read, where `pixels` are as of predicted motion.
+            features: of the frame as it was read, where `pixels` are as of predicted motion.
         """
         if self._has_too_little_depth(pixels):
             return TrackedFrame.untracked(predicted.clone(), lost=True)
         constraints = self.constraints.gather(self.history, pixels) if constraints is None else constraints
         problem = TrackingProblem(self.state.scene, pixels.records, predicted, number, constraints)
-        read = pixels if read is None else read
-        return self._localizer.localize(problem, pixels, read, self.history, to_be_mapped, self.while_tracking)
+        features = self._features_of(pixels) if features is None else features
+        return self._localizer.localize(problem, pixels, features, self.history, to_be_mapped, self.while_tracking)
+
+    def _features_of(self, read: FramePixels) -> FrameFeatures:
+        return FrameFeatures(read, self.camera, self.config.dataset.max_depth_m)
 
     @property
     def _has_map(self) -> bool:
@@ -255,8 +260,7 @@ class FramePipeline:
         return tuple(replace(each, source=each.source - opened, target=each.target - opened) for each in decisions)
 
     def _follow_other_maps(self, frame: PreparedFrame, pixels: FramePixels) -> None:
-        place = self._other_maps.after_frame(frame, pixels, not self._has_too_little_depth(pixels))
-        if place is not None:
+        if (place := self._other_maps.after_frame(frame, pixels, not self._has_too_little_depth(pixels))) is not None:
             self.optimize_map()
             self._other_maps.join(place)
 
@@ -264,8 +268,7 @@ class FramePipeline:
         """`_update_globally` of a live run, after a frame: waits for nothing."""
         if self.global_mapping is None:
             return ()
-        volume = self.state.scene.volume
-        loops = self.global_mapping.take_up_ready(number)
+        volume, loops = self.state.scene.volume, self.global_mapping.take_up_ready(number)
         if self._task is not None and self.state.scene.volume is not volume:
             self._task = self.mapper.begin(self.state, self._task.left)  # it was begun for the map before
         return loops
@@ -294,7 +297,7 @@ class FramePipeline:
         constraints: Constraints,
         number: int,
         events: FrameEvents,
-        read: FramePixels,
+        features: FrameFeatures,
     ) -> TrackedFrame:
         """Finds the pose; `predicted` is None where there is no map yet."""
         if predicted is None:
@@ -305,12 +308,18 @@ class FramePipeline:
             has_depth = not self._has_too_little_depth(pixels)
             tracked = self._other_maps.find_camera(pixels, number, self.history.noise, has_depth)
         else:
-            tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints, read)
+            tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints, features)
         events.tracking = (begin, self._record())
         return tracked
 
     def _store(
-        self, frame: PreparedFrame, pixels: FramePixels, constraints: Constraints, tracked: TrackedFrame
+        self,
+        frame: PreparedFrame,
+        pixels: FramePixels,
+        constraints: Constraints,
+        tracked: TrackedFrame,
+        features: FrameFeatures,
+        shutter: ops.ShutterMotion | None,
     ) -> None:
         """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
         state, number, copies = self.state, len(self.state.frames), RowCopies()
@@ -326,7 +335,10 @@ class FramePipeline:
             None if tracked.lost else tracked.gain,
         )
         state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records, copies)
-        if state.depth_keyframes is not None and not tracked.occluded and not tracked.lost:
+        is_known = not tracked.occluded and not tracked.lost
+        if state.newest is not None and is_known:
+            state.newest.replace(number, features, shutter, copies)
+        if state.depth_keyframes is not None and is_known:
             if constraints.depth_keyframes is not None:
                 state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes, tracked.gain)
             state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image, copies)

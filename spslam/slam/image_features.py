@@ -48,18 +48,21 @@ class FrameFeatures:
     """The image features of one frame, extracted where they are first asked for.
 
     Args:
-        pixels: of the frame as it was read: features are rectified by themselves, not their images.
+        pixels: see the attribute.
         camera: of all frames.
         max_depth_m: the largest depth that images hold.
+
+    Attributes:
+        pixels: of the frame as it was read: features are rectified by themselves, not their images.
     """
 
     def __init__(self, pixels: FramePixels, camera: Camera, max_depth_m: float):
-        self._pixels, self._camera, self._max_depth_m = pixels, camera, max_depth_m
+        self.pixels, self._camera, self._max_depth_m = pixels, camera, max_depth_m
 
     @cached_property
     def extracted(self) -> ImageFeatures:
         """The features; waits for the device."""
-        return extract_features(self._pixels, self._camera, self._max_depth_m)
+        return extract_features(self.pixels, self._camera, self._max_depth_m)
 
 
 def extract_features(pixels: FramePixels, camera: Camera, max_depth_m: float) -> ImageFeatures:

@@ -10,6 +10,7 @@ import torch
 from spslam import ops
 from spslam.slam.fit import prediction_error
 from spslam.slam.frame_history import FrameHistory
+from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.recovery import Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
@@ -36,7 +37,7 @@ class Localizer:
         self,
         problem: TrackingProblem,
         pixels: FramePixels,
-        read: FramePixels,
+        features: FrameFeatures,
         history: FrameHistory,
         to_be_mapped: bool,
         meanwhile: Callable[[], None] | None = None,
@@ -46,18 +47,17 @@ class Localizer:
         Args:
             problem: the frame.
             pixels: of the frame, as the problem has it.
-            read: the frame as it was read.
+            features: of the frame as it was read.
             history: the frames before.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted; it is then checked for occlusion.
             meanwhile: as of `Tracker.track`.
         """
-        shutter = problem.constraints.shutter
+        shutter, read = problem.constraints.shutter, features.pixels
         estimate = self._tracker.track(problem, meanwhile)
         if shutter is not None and self._rectifier.bends(shutter, estimate.fit.prediction_error_deg):
             problem, pixels = self._rectified(problem, read, shutter._replace(pose=estimate.pose))
             again = self._tracker.track_from(problem, estimate.pose)
             estimate = replace(again, iterations=estimate.iterations + again.iterations)
-        features = self._recovery.features_of(read)
         tracked = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped, features)
         shutter = problem.constraints.shutter
         # The pose that the frame was rectified by is the one that was tracked, unless it was recovered from elsewhere.

@@ -139,6 +139,13 @@ def blank_pixels(camera: Camera, config: Config) -> FramePixels:
     return FramePixels(torch.zeros(words, dtype=torch.int32), sampling.count, *shapes, 0.0)
 
 
+def image_pixels(depth: torch.Tensor, intensity: torch.Tensor) -> FramePixels:
+    """Images uint16 and uint8 [h', w'] without records, of one device."""
+    rows, columns = depth.shape
+    nothing = torch.zeros(0, dtype=torch.int32, device=depth.device)
+    return FramePixels(nothing, 0, (0, 0), (rows, columns), 0.0).having(depth_image=depth, intensity_image=intensity)
+
+
 def _image_words(shape: tuple[int, int]) -> tuple[int, int]:
     """Words that a depth and an intensity image of a shape take."""
     pixels = shape[0] * shape[1]

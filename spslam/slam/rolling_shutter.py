@@ -1,7 +1,10 @@
 """Frames of a rolling shutter, as of their middle row's moment; see `spslam.ops.rolling_shutter`."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,11 +12,13 @@ from spslam import ops
 from spslam.camera import Camera
 from spslam.pose_graph import rotation_vectors
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
-from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import pose_matrix
-from spslam.slam.state import SlamState
+
+if TYPE_CHECKING:
+    from spslam.slam.frame_history import FrameHistory
+    from spslam.slam.state import SlamState
 
 # rad, m, during the readout, as in csrc/kernels/rolling_shutter.h: what moves by more has jumped.
 MAX_READOUT_MOTION = 0.15

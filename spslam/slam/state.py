@@ -14,10 +14,11 @@ from spslam.geometry import pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import SparseVolume, resize_rows
 from spslam.slam.depth_keyframes import DepthKeyframeStore
-from spslam.slam.feature_store import FeatureStore
+from spslam.slam.feature_store import FeatureStore, uses_features
 from spslam.slam.frame_table import FrameTable
 from spslam.slam.graph.keyframe import KeyframeCamera
 from spslam.slam.graph.keyframe_store import KeyframeStore
+from spslam.slam.newest_frame import NewestFrame
 from spslam.slam.pixel_database import PixelDatabase
 from spslam.slam.sensor_noise import SensorNoiseEstimate
 
@@ -114,6 +115,7 @@ class SlamState:
         noise: of the sensor.
         depth_keyframes: images of some earlier frames; None where tracking does not use them.
         features: image features of some earlier frames; none where tracking does not use them.
+        newest: the last frame with a trusted pose, for its image features; None where tracking does not use them.
         graph: keyframes and what was measured between them; None where there is no keyframe graph.
         moments: optimizer state by parameter name.
         steps: Adam steps since the moments were last reset.
@@ -129,6 +131,7 @@ class SlamState:
     noise: SensorNoiseEstimate
     depth_keyframes: DepthKeyframeStore | None = None
     features: FeatureStore = field(default_factory=FeatureStore)
+    newest: NewestFrame | None = None
     graph: KeyframeStore | None = None
     moments: dict[str, Moments] = field(default_factory=dict)
     steps: int = 0
@@ -173,7 +176,8 @@ class SlamState:
         if config.graph.enabled and config.prior.enabled:
             prior = config.prior
             graph = KeyframeStore(KeyframeCamera.of(camera, depth_m, prior.normal_step_px, prior.max_jump))
-        return cls(scene, frames, pixels, noise, depth_keyframes, graph=graph)
+        newest = NewestFrame(camera, depth_m, device) if uses_features(config) else None
+        return cls(scene, frames, pixels, noise, depth_keyframes, newest=newest, graph=graph)
 
     def has_enough_features(self, number: int) -> bool:
         """Whether features of enough frames are kept that stand close to where frame `number` stands."""

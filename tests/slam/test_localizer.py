@@ -1,6 +1,7 @@
 """Which frame is tracked again, and on what: a frame that predicted motion has bent."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -45,10 +46,6 @@ class Parts:
         self.tracked.append(problem.records)
         return PoseEstimate(AGAIN, 8, Fit(prediction_error_deg=self.error_deg), None)
 
-    def features_of(self, read):
-        assert read.pose is None  # features of images that are rectified already would be rectified twice
-        return object()
-
     def resolve(self, problem, estimate, pixels, history, to_be_mapped, features):
         assert pixels.records is problem.records
         self.resolved.append((estimate, features))
@@ -66,7 +63,8 @@ class Parts:
 def localized(parts, has_shutter=True):
     shutter = ops.ShutterMotion(STILL, STILL, 1 / 30, torch.tensor([0.02])) if has_shutter else None
     problem = TrackingProblem(None, STILL, STILL, 1, Constraints(shutter=shutter))
-    return Localizer(parts, parts, parts).localize(problem, Pixels(STILL), Pixels(None), None, False)
+    read = SimpleNamespace(pixels=Pixels(None))
+    return Localizer(parts, parts, parts).localize(problem, Pixels(STILL), read, None, False)
 
 
 @pytest.mark.parametrize(("error_deg", "has_shutter"), [(0.5, True), (2.0, False)])

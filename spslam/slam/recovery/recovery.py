@@ -76,7 +76,7 @@ class Recovery:
         pixels: FramePixels,
         history: FrameHistory,
         to_be_mapped: bool,
-        features: FrameFeatures | None = None,
+        features: FrameFeatures,
     ) -> TrackedFrame:
         """The frame's best pose: the estimate or, if it is doubtful, the best one from other initial poses.
 
@@ -86,9 +86,8 @@ class Recovery:
             pixels: of the frame.
             history: the frames before.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
-            features: of the frame as it was read; None are those of `pixels`.
+            features: of the frame as it was read.
         """
-        features = self.features_of(pixels) if features is None else features
         tracked = self.judge(estimate)
         if history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked):
             tracked = self._recover(problem, tracked, pixels, history, self._image(problem, history, features))
@@ -216,10 +215,6 @@ class Recovery:
             found = self._relocalize(frame, candidates)
         iterations += sum(candidate.iterations for candidate in candidates)
         return replace(found, iterations=iterations, features=frame.image.read if frame.image else None)
-
-    def features_of(self, read: FramePixels) -> FrameFeatures:
-        """The image features of a frame as it was read."""
-        return FrameFeatures(read, self._camera, self._config.dataset.max_depth_m)
 
     def _image(
         self, problem: TrackingProblem, history: FrameHistory, features: FrameFeatures
