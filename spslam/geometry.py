@@ -40,6 +40,8 @@ def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
     by 180 degrees too.
     """
     rotation = _as_floats("matrix_to_quaternion", "rotation", rotation, (3, 3))
+    if rotation.ndim == 2:
+        return _quaternion_of(*rotation.ravel().tolist())
     m = rotation
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
@@ -59,6 +61,23 @@ def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
     quaternion = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
     quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     return np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def _quaternion_of(
+    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
+) -> np.ndarray:
+    """`matrix_to_quaternion` of one matrix, by rows; a frame asks several times, as for `_matrix_of`."""
+    trace, wx, wy, wz = xx + yy + zz, zy - yz, xz - zx, yx - xy
+    outer = (
+        (1 + trace, wx, wy, wz),
+        (wx, 1 - trace + 2 * xx, yx + xy, xz + zx),
+        (wy, yx + xy, 1 - trace + 2 * yy, yz + zy),
+        (wz, xz + zx, yz + zy, 1 - trace + 2 * zz),
+    )
+    row = outer[max(range(4), key=lambda i: outer[i][i])]
+    norm = math.sqrt(sum(number * number for number in row))
+    sign = -norm if row[0] < 0 else norm
+    return np.array([number / sign for number in row])
 
 
 def orthonormalize(rotation: np.ndarray) -> np.ndarray:

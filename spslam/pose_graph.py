@@ -9,6 +9,7 @@ all others is found out late. Gauss-Newton steps are solved by a sparse factoriz
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,6 +109,8 @@ def squared_errors(poses: np.ndarray, edges: PoseEdges) -> np.ndarray:
 
 def rotation_matrices(vectors: np.ndarray) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (axis times angle, rad)."""
+    if np.ndim(vectors) == 1:
+        return _rotation_matrix(*np.asarray(vectors).tolist())
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     small = angle < 1e-8
     safe = np.where(small, 1.0, angle)
@@ -117,9 +120,27 @@ def rotation_matrices(vectors: np.ndarray) -> np.ndarray:
     return np.eye(3) + sine * k + cosine * (k @ k)
 
 
+def _rotation_matrix(x: float, y: float, z: float) -> np.ndarray:
+    """`rotation_matrices` of one vector: a frame asks several times, and arrays of one number take longer."""
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    sine, cosine = (1.0, 0.5) if angle < 1e-8 else (math.sin(angle) / angle, (1 - math.cos(angle)) / square)
+    xy, xz, yz = cosine * x * y, cosine * x * z, cosine * y * z
+    return np.array(
+        (
+            (1 - cosine * (y * y + z * z), xy - sine * z, xz + sine * y),
+            (xy + sine * z, 1 - cosine * (x * x + z * z), yz - sine * x),
+            (xz - sine * y, yz + sine * x, 1 - cosine * (x * x + y * y)),
+        )
+    )
+
+
 def rotation_vectors(rotations: np.ndarray) -> np.ndarray:
     """Rotation vectors [..., 3] of rotation matrices [..., 3, 3]."""
     q = matrix_to_quaternion(rotations)
+    if q.ndim == 1:
+        length = math.sqrt(float(q[1:] @ q[1:]))
+        return q[1:] * (2.0 if length < 1e-12 else 2 * math.atan2(length, float(q[0])) / length)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., :1])
     return q[..., 1:] * np.where(sine < 1e-12, 2.0, angle / np.where(sine < 1e-12, 1.0, sine))

@@ -19,6 +19,9 @@ from spslam.slam.system import SlamSystem
 Progress = Callable[[int, int, FrameReport | None], None]
 
 
+MOST_PENDING = 2  # frames whose reports may wait for the next frame to be tracked
+
+
 class RunLoop:
     """Processes the frames of a session and reports each one when the device has finished it.
 
@@ -42,6 +45,7 @@ class RunLoop:
         self.system, self.feed, self.session, self.progress = system, feed, session, progress
         self.observer = observer or RunObserver()
         self._pending: deque[tuple[int, PendingReport | None]] = deque()
+        self._logs_meanwhile = False
 
     def run(self) -> None:
         """Processes all frames, then runs the last optimization.
@@ -69,11 +73,14 @@ class RunLoop:
 
     def _process(self, log: RunLog, writer: CheckpointWriter, interruption: Interruption) -> None:
         self.system.while_tracking = functools.partial(self._work_ahead, log)
+        self._logs_meanwhile = self.system.device.type == "cuda"
         every = self.system.config.run.checkpoint_every
         done = last_saved = self.session.start
         for done, item in enumerate(self.feed, self.session.start + 1):
             self._pending.append((done, self._submit(item, done - 1)))
-            self._flush_reports(log)
+            # What is done by then is logged while the device tracks the next frame, where it tracks one.
+            if not self._logs_meanwhile or len(self._pending) > MOST_PENDING:
+                self._flush_reports(log)
             self._update_clock(done)
             if interruption.requested:
                 break

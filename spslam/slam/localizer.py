@@ -54,7 +54,7 @@ class Localizer:
         """
         shutter, read = problem.constraints.shutter, features.pixels
         estimate = self._tracker.track(problem, meanwhile)
-        if shutter is not None and self._rectifier.bends(shutter, estimate.fit.prediction_error_deg):
+        if shutter is not None and self._rectifier.bends(shutter, estimate.measured.prediction_error_deg):
             problem, pixels = self._rectified(problem, read, shutter._replace(pose=estimate.pose))
             again = self._tracker.track_from(problem, estimate.pose)
             estimate = replace(again, iterations=estimate.iterations + again.iterations)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -43,25 +44,58 @@ class TrackingProblem:
 
 
 @dataclass(frozen=True)
+class SurfaceEquations:
+    """Normal equations of a pose, by what the map alone says.
+
+    Attributes:
+        numbers: 36, the matrix of a step (translation m, rotation rad) by rows.
+        pixels: how many it is a sum over.
+        variance: of one of them, m^2, were they independent.
+    """
+
+    numbers: list[float]
+    pixels: int
+    variance: float
+
+    @cached_property
+    def hessian(self) -> np.ndarray:
+        """float64 [6, 6]."""
+        return np.array(self.numbers).reshape(6, 6)
+
+
+@dataclass(frozen=True)
 class PoseEstimate:
     """A pose that tracking found.
 
     Attributes:
         pose: float32 [7].
         iterations: how many were made.
-        fit: how well it fits.
-        information: float64 [6, 6], inverse covariance of (translation m, rotation rad about the camera's center) in
-            world axes, as surface alone determines the pose.
+        measured: how well it fits, without what is only worked out of a pose that is decided on, see `fit`.
+        equations: of surface alone at that pose; None where there are none.
         numbers: of the pose, read with its fit; None where they were not.
         gain: float32 [2] of the frame at that pose, as `FrameTable.gains`; on the device.
     """
 
     pose: torch.Tensor
     iterations: int
-    fit: Fit
-    information: np.ndarray
+    measured: Fit
+    equations: SurfaceEquations | None
     numbers: tuple[float, ...] | None = None
     gain: torch.Tensor | None = None
+
+    @cached_property
+    def fit(self) -> Fit:
+        """How well it fits."""
+        if self.equations is None:
+            return self.measured
+        hessian, pixels = self.equations.hessian, self.equations.pixels
+        return replace(self.measured, min_eigenvalue=min_eigenvalue(hessian, pixels))
+
+    @property
+    def information(self) -> np.ndarray | None:
+        """float64 [6, 6], inverse covariance of (translation m, rotation rad about the camera's center) in world axes,
+        as surface alone determines the pose; None where it was not measured."""
+        return None if self.equations is None else self.equations.hessian / self.equations.variance
 
 
 class Tracker:
@@ -99,10 +133,10 @@ class Tracker:
         if tracking.optimizer == "adam":
             return self._track_adam(problem, iterations)
         found = self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
-        if not found.fit.is_far_from_prediction:
+        if not found.measured.is_far_from_prediction:
             return found
         further = self.track_from(problem, found.pose)
-        is_on_map = further.fit.inlier_share >= tracking.min_inlier_share
+        is_on_map = further.measured.inlier_share >= tracking.min_inlier_share
         return replace(further if is_on_map else found, iterations=iterations + tracking.iterations)
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
@@ -169,7 +203,7 @@ class Tracker:
         # Waits for the device, once: whether the pose is trusted decides what is done next.
         is_predicted = start is problem.predicted
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
-        start_numbers, pose_numbers, hessian = numbers[:7], numbers[7:14], np.array(numbers[14:50]).reshape(6, 6)
+        start_numbers, pose_numbers = numbers[:7], numbers[7:14]
         size = found.numel()
         mean_square, inlier_share, _, _, mean_robust_weight, _, _ = numbers[size - 7 : size]
         predicted = start_numbers if is_predicted else numbers[size:]
@@ -178,9 +212,9 @@ class Tracker:
             residual_cm=100 * math.sqrt(max(mean_square, 0.0)),
             inlier_share=inlier_share,
             mean_robust_weight=mean_robust_weight,
-            min_eigenvalue=min_eigenvalue(hessian, tracking.pixels),
             prediction_error_cm=error_cm,
             prediction_error_deg=error_deg,
         )
         variance = max(mean_square, LEAST_DEVIATION_M**2) * tracking.pixels / INDEPENDENT_PIXELS
-        return PoseEstimate(found[7:14], iterations, fit, hessian / variance, tuple(pose_numbers), found[-2:])
+        equations = SurfaceEquations(numbers[14:50], tracking.pixels, variance)
+        return PoseEstimate(found[7:14], iterations, fit, equations, tuple(pose_numbers), found[-2:])

@@ -15,8 +15,8 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.geometry import inverse
-from spslam.pose_graph import cross_matrices, rotation_matrices, rotation_vectors
+from spslam.geometry import inverse, pose_from
+from spslam.pose_graph import rotation_matrices, rotation_vectors
 from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
 from spslam.slam.image_features import ImageFeatures
@@ -154,43 +154,43 @@ class FeatureAlignment:
         positions = np.concatenate([np.zeros((0, 2)), *(one.positions for one in matches)])
         at = before = pose_matrix(pose)
         error_px = max(self.max_error_px, late_px)
-        agreeing = 0
         for _ in range(HELD_ITERATIONS):
-            residuals, jacobians = self._reprojection(points, positions, self._color_pose(at))
-            jacobians = jacobians * (1.0 if self._motion is None else self._motion.lever(at))
-            ratio = (residuals**2).sum(1) / error_px**2
-            agreeing = int((ratio < 1).sum())
+            lever = 1.0 if self._motion is None else self._motion.lever(at)
+            agreeing, features, toward = self._normal_equations(points, positions, self._color_pose(at), error_px)
             if agreeing < MIN_INLIERS:
                 return None
-            share = min(1.0, INDEPENDENT_FEATURES / agreeing) / error_px**2
-            weights = share / (1 + ratio / WIDE**2) ** 2
             change = np.r_[at[:3, 3] - before[:3, 3], rotation_vectors(at[:3, :3] @ before[:3, :3].T)]
-            weighted = weights[:, None, None] * jacobians
-            normal = information + np.einsum("nki,nkj->ij", weighted, jacobians)
-            gradient = information @ change + np.einsum("nki,nk->i", weighted, residuals)
-            step = -np.linalg.solve(normal + np.eye(6), gradient)
-            at = at.copy()
-            at[:3, 3] += step[:3]
-            at[:3, :3] = rotation_matrices(step[3:]) @ at[:3, :3]
+            normal = information + lever**2 * features
+            step = -np.linalg.solve(normal + np.eye(6), information @ change + lever * toward)
+            at = pose_from(rotation_matrices(step[3:]) @ at[:3, :3], at[:3, 3] + step[:3])
             if np.abs(step).max() < SMALL_STEP:
                 break
         return pose_tensor(at, pose.device)
 
-    def _reprojection(
-        self, points: np.ndarray, positions: np.ndarray, pose: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Errors [N, 2] of points in front of the camera, px, and their derivatives [N, 2, 6] by a step of the pose."""
-        arms = points - pose[:3, 3]
-        local = arms @ pose[:3, :3]
-        front = local[:, 2] > MIN_DEPTH_M
-        (x, y, z), (fx, fy) = local[front].T, (self._matrix[0, 0], self._matrix[1, 1])
-        projected = np.stack([fx * x / z + self._matrix[0, 2], fy * y / z + self._matrix[1, 2]], 1)
-        by_point = np.zeros((len(z), 2, 3))
-        by_point[:, 0, 0], by_point[:, 0, 2] = fx / z, -fx * x / z**2
-        by_point[:, 1, 1], by_point[:, 1, 2] = fy / z, -fy * y / z**2
-        by_world = by_point @ pose[:3, :3].T
-        jacobians = np.concatenate([-by_world, by_world @ cross_matrices(arms[front])], 2)
-        return projected - positions[front], jacobians
+    def _normal_equations(
+        self, points: np.ndarray, positions: np.ndarray, pose: np.ndarray, error_px: float
+    ) -> tuple[int, np.ndarray, np.ndarray]:
+        """How many points agree with a pose, and what all want: matrix [6, 6] and gradient [6] of a step of the pose.
+
+        In camera axes, with a = x/z and b = y/z, a point's derivatives by a step (m, rad) are
+        f_x (-1/z, 0, a/z, ab, -(1 + a^2), b) and f_y (0, -1/z, b/z, 1 + b^2, -ab, -a).
+        """
+        local = pose[:3, :3].T @ (points - pose[:3, 3]).T
+        front = local[2] > MIN_DEPTH_M
+        if not front.all():
+            local, positions = local[:, front], positions[front]
+        (a, b), nearness, (fx, fy) = local[:2] / local[2], 1 / local[2], np.diag(self._matrix)[:2]
+        residuals = self._matrix[:2, :2] @ np.stack([a, b]) + self._matrix[:2, 2:] - positions.T
+        ratio = (residuals**2).sum(0) / error_px**2
+        agreeing = int((ratio < 1).sum())
+        share = min(1.0, INDEPENDENT_FEATURES / max(agreeing, 1)) / error_px**2
+        root = math.sqrt(share) / (1 + ratio / WIDE**2)  # of Geman-McClure's weight
+        zero, ab = np.zeros_like(a), a * b
+        rows = ((-nearness, zero, a * nearness, ab, -(1 + a**2), b), (zero, -nearness, b * nearness, 1 + b**2, -ab, -a))
+        jacobians = np.concatenate([focal * root * np.stack(row) for focal, row in zip((fx, fy), rows, strict=True)], 1)
+        to_world = np.kron(np.eye(2), pose[:3, :3])
+        matrix, gradient = jacobians @ jacobians.T, jacobians @ (root * residuals).ravel()
+        return agreeing, to_world @ matrix @ to_world.T, to_world @ gradient
 
     def _color_pose(self, pose: np.ndarray) -> np.ndarray:
         return pose if self._motion is None else self._motion.color_pose(pose)
@@ -203,12 +203,12 @@ class FeatureAlignment:
             pose: of this frame.
             late_px: or to within so much, which the image may have moved since depth was measured.
         """
-        to_camera, most_px = inverse(self._color_pose(pose_matrix(pose))), max(self.max_error_px, late_px)
-        points = matches.points @ to_camera[:3, :3].T + to_camera[:3, 3]
-        in_front = points[:, 2] > 0
-        projected = points @ self._matrix.T
-        positions = projected[:, :2] / np.where(in_front, points[:, 2], 1)[:, None]
-        return int((in_front & (np.linalg.norm(positions - matches.positions, axis=1) < most_px)).sum())
+        at, most_px = self._color_pose(pose_matrix(pose)), max(self.max_error_px, late_px)
+        local = at[:3, :3].T @ (matches.points - at[:3, 3]).T
+        in_front = local[2] > 0
+        projected = self._matrix[:2, :2] @ (local[:2] / np.where(in_front, local[2], 1))
+        errors = projected + self._matrix[:2, 2:] - matches.positions.T
+        return int((in_front & ((errors**2).sum(0) < most_px**2)).sum())
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""
