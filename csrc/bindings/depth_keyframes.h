@@ -24,6 +24,21 @@ inline FrameMotion load_motion(const char* name, const std::int64_t* integers, s
   return {integers[0], 1e-9f * static_cast<float>(integers[1]), 1e-9f * static_cast<float>(integers[2])};
 }
 
+// Whether there are log gains among the tensors below: of all frames, the last but one, and of the one compared.
+inline bool has_log_gains(const std::vector<Tensor>& tensors) {
+  return tensors.size() >= 5;
+}
+
+// The tensors below, contiguous; the log gains of all frames may stay a column of a table, which has a stride.
+inline std::vector<Tensor> readable_keyframes(const std::vector<Tensor>& tensors) {
+  std::vector<Tensor> result = tensors;
+  for (std::size_t i = 0; i < result.size(); ++i) {
+    const bool is_column = has_log_gains(tensors) && i + 2 == tensors.size() && tensors[i].dim() == 2;
+    if (!is_column) result[i] = as_contiguous(tensors[i]);
+  }
+  return result;
+}
+
 // Of the images, the poses and, if any, the intensities, and after them the delay of colors, if any, and the log gains
 // of all frames and of the one compared, if any, there perhaps with a variance; none without tensors. They must outlive
 // the launch.
@@ -36,7 +51,7 @@ inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<T
                 tensors[1].size(1) == kPoseSize && (tensors.size() == 2 || same_shape(tensors[2], tensors[0])),
             name, ": depth_keyframes must be images [R, H, W], poses [F, 7] and, if any, intensities [R, H, W]");
   const std::size_t size = tensors.size();
-  const bool has_delay = size == 4 || size == 6, has_gains = size >= 5;
+  const bool has_delay = size == 4 || size == 6, has_gains = has_log_gains(tensors);
   SPS_CHECK(!has_delay || tensors[3].numel() == 1, name, ": color_delay must have one element");
   const std::int64_t own = has_gains ? tensors[size - 1].numel() : 0;
   SPS_CHECK(!has_gains || (has_shape(tensors[size - 2], {tensors[1].size(0), 1}) && (own == 1 || own == 2) &&

@@ -82,7 +82,7 @@ Tensor track_gauss_newton(std::vector<Tensor> scene_tensors, std::vector<double>
   DeviceScope scope(pixels);
   const SceneArgument scene(scene_tensors, scene_scalars, plane_layout);
   reference = all_contiguous(reference);
-  depth_keyframes = all_contiguous(depth_keyframes);
+  depth_keyframes = readable_keyframes(depth_keyframes);
   GaussNewtonOptions options = load_options({kName, "scalars", scalars}, {kName, "integers", integers});
   SPS_CHECK(frame.size() == 2 || frame[2].numel() == kSensorNoiseSize, kName, ": noise must have ", kSensorNoiseSize,
             " elements");

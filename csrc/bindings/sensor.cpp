@@ -22,7 +22,7 @@ MeasuredFrame load_frame(const char* name, const Tensor& pixels, const Tensor& p
   SPS_CHECK(has_shape(pixels, {-1, 3}), name, ": pixels must have shape [P, 3]");
   SPS_CHECK(pose.numel() == kPoseSize, name, ": pose must have ", kPoseSize, " elements");
   MeasuredFrame frame{
-      as_contiguous(pixels), as_contiguous(pose), all_contiguous(images), load_intrinsics(name, intrinsics), {}};
+      as_contiguous(pixels), as_contiguous(pose), readable_keyframes(images), load_intrinsics(name, intrinsics), {}};
   frame.keyframes = load_depth_keyframes(name, frame.images, scalars, integers);
   return frame;
 }

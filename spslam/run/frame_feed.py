@@ -88,6 +88,11 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         item.requested, item.wait_ms = requested, 0.0 if was_there else 1e3 * (time.perf_counter() - started)
         return item
 
+    def want_features(self, wanted: bool) -> None:
+        """Says whether image features of the next frames will probably be asked for: a process extracts them ahead."""
+        if isinstance(self._reader, ReaderProcess):
+            self._reader.want_features(wanted)
+
     def look_ahead(self) -> None:
         """Takes the next frame from the reading process, and sends it to the device, if it is there; does not wait.
 

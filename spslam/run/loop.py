@@ -109,7 +109,9 @@ class RunLoop:
         if isinstance(item, DatasetError):
             self.session.folder.record_skipped(position, item)
             return None
-        return self.system.submit(item)
+        pending = self.system.submit(item)
+        self.feed.want_features(self.system.features.are_expected)
+        return pending
 
     def _work_ahead(self, log: RunLog) -> None:
         """What the host does while the device tracks a frame, instead of having it wait later."""

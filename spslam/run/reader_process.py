@@ -15,19 +15,16 @@ from collections import deque
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 
-import torch
-
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, SpslamError, brief
 from spslam.run.reader_launch import AHEAD_PER_WORKER, launch, take_standby
 from spslam.run.reader_message import DISCONNECTED, Message
-from spslam.run.reader_service import Work, mapped, slot_message
+from spslam.run.reader_service import SharedFrames, Work, slot_message
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload, Uploader
 
-_WORD_BYTES = 4
 _EXIT_TIMEOUT_S = 5.0
 
 
@@ -46,7 +43,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self,
         process: subprocess.Popen,
         connection: Connection,
-        memory: torch.Tensor,
+        shared: SharedFrames,
         blank: FramePixels,
         uploader: Uploader | None,
         kind: type[RgbdDataset],
@@ -56,14 +53,15 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         Args:
             process: the reading process.
             connection: socket to the process.
-            memory: int32 [slots, words], shared memory.
+            shared: memory that both map.
             blank: pixels of a frame without content, for the shapes.
             uploader: copies the pixels to a device; if None, they are copied out of the slot on the host.
             kind: the dataset's class, for messages.
         """
         self.read_seconds = 0.0
         self._process, self._connection = process, connection
-        self._memory, self._blank, self._uploader, self._kind = memory, blank, uploader, kind
+        self._memory, self._wanted = shared
+        self._blank, self._uploader, self._kind = blank, uploader, kind
         self._in_use: deque[tuple[int, Upload]] = deque()
         self._has_started = self._is_locked = False
         # Each frame asks; `Connection.poll` would make another one each time.
@@ -106,12 +104,12 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             reader = take_standby() or launch()
         except (OSError, AttributeError, TypeError) as error:
             raise _unavailable(f"the process can't be started ({brief(str(error))})") from error
-        os.ftruncate(reader.shared, max(slots * words * _WORD_BYTES, 1))
-        memory = mapped(reader.shared, slots, words)
+        os.ftruncate(reader.shared, SharedFrames.size(slots, words))
+        shared = SharedFrames.mapped(reader.shared, slots, words)
         os.close(reader.shared)
         with contextlib.suppress(*DISCONNECTED):
             reader.connection.send_bytes(content)
-        return cls(reader.process, reader.connection, memory, blank, uploader, type(dataset))
+        return cls(reader.process, reader.connection, shared, blank, uploader, type(dataset))
 
     def wait_until_ready(self) -> None:
         """Waits until the process can read.
@@ -133,6 +131,10 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             raise _unavailable(f"{name} can't be imported by another process")
         if self._uploader is not None:
             self._is_locked = self._uploader.lock_pages(self._memory)
+
+    def want_features(self, wanted: bool) -> None:
+        """Says whether image features of frames that are read from now on will probably be asked for."""
+        self._wanted[0] = wanted
 
     def is_ready(self) -> bool:
         """Whether the next frame, or what there is instead, is there; the first has to be requested."""

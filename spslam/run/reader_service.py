@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -26,8 +26,9 @@ from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
 _SLOT_BYTES = 4  # of a slot's number
-# So many processes extract the image features of all frames, which takes as long as all else; the loop, that may need
-# those of one frame in ten, then waits for none. Fewer would hold it up.
+_WORD_BYTES = 4
+# So many processes extract the image features of all frames while the loop wants some, so that it waits for none; it
+# takes as long as all else, and fewer would hold the loop up.
 MIN_EXTRACTING = 4
 
 
@@ -56,19 +57,33 @@ class Work:
     processed: int
 
 
-def mapped(shared: int, slots: int, words: int) -> torch.Tensor:
-    """Maps the shared memory.
+class SharedFrames(NamedTuple):
+    """Memory that the loop, the process and those that it forks map.
 
-    Args:
-        shared: its file descriptor.
-        slots: number of slots.
-        words: size of a slot in 32-bit words.
-
-    Returns:
-        int32 [slots, words].
+    Attributes:
+        slots: int32 [slots, words].
+        wanted: int32 [1], whether the loop wants image features of the next frames.
     """
-    content = np.frombuffer(mmap.mmap(shared, 0), np.int32, slots * words)
-    return torch.from_numpy(content).view(slots, words)
+
+    slots: torch.Tensor
+    wanted: np.ndarray
+
+    @classmethod
+    def mapped(cls, shared: int, slots: int, words: int) -> "SharedFrames":
+        """Maps the memory.
+
+        Args:
+            shared: its file descriptor.
+            slots: number of slots.
+            words: size of a slot in 32-bit words.
+        """
+        content = np.frombuffer(mmap.mmap(shared, cls.size(slots, words)), np.int32)
+        return cls(torch.from_numpy(content[:-1]).view(slots, words), content[-1:])
+
+    @staticmethod
+    def size(slots: int, words: int) -> int:
+        """Bytes that it takes."""
+        return _WORD_BYTES * (slots * words + 1)
 
 
 def slot_message(slot: int) -> bytes:
@@ -97,7 +112,7 @@ def serve(socket: int, shared: int) -> None:
             connection.send(False)
             return
         try:
-            _serve(work, mapped(shared, work.slots, work.words), connection)
+            _serve(work, SharedFrames.mapped(shared, work.slots, work.words), connection)
         except DISCONNECTED:
             raise
         except WorkerEndedError as error:
@@ -110,16 +125,17 @@ def serve(socket: int, shared: int) -> None:
             connection.recv_bytes()
 
 
-def _serve(work: Work, memory: torch.Tensor, connection: Connection) -> None:
+def _serve(work: Work, shared: SharedFrames, connection: Connection) -> None:
     """Says that it is ready, waits until the first frame is requested, and sends all."""
-    preparation = FramePreparation(
-        work.dataset, work.config, work.start, extracts_all=_is_shared_out(work, MIN_EXTRACTING)
-    )
-    # Twelve processes take a tenth of a second to fork; meanwhile the loop's process loads kernels.
+    extracts = (lambda: bool(shared.wanted[0])) if _is_shared_out(work, MIN_EXTRACTING) else None
+    preparation = FramePreparation(work.dataset, work.config, work.start, extracts=extracts)
+    # That takes tenths of a second; meanwhile the loop's process loads kernels.
+    with contextlib.suppress(Exception):  # what is wrong with the data is said of the first frame
+        preparation.warm_up()
     with _shared_out(work, preparation, connection) as source:
         connection.send(True)
         connection.recv()
-        _send_frames(work, preparation, source, memory, connection)
+        _send_frames(work, preparation, source, shared.slots, connection)
 
 
 def _send_frames(

@@ -5,6 +5,7 @@ some thirty calls per frame gives Python's global interpreter lock away and wait
 for its process, and copies the pixels that it has left in memory that both map.
 """
 
+import contextlib
 import mmap
 import multiprocessing
 import traceback
@@ -128,6 +129,9 @@ def _work(
     # Else an end that is closed elsewhere stays open here, and nobody notices.
     for other in inherited:
         other.close()
+    # A process that was forked gets its memory page by page.
+    with contextlib.suppress(Exception):  # what is wrong with the data is said of the first frame
+        preparation.warm_up()
     try:
         while True:
             position = int.from_bytes(connection.recv_bytes(), "little")

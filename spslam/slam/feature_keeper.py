@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from spslam import ops
+from spslam.camera import Camera
 from spslam.config import Config
 from spslam.slam.feature_store import keeps_features
 from spslam.slam.image_features import FrameFeatures, ImageFeatures
+from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import PreparedFrame
+from spslam.slam.recovery.recovery import UNSURE_EIGENVALUE
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.state import SlamState
+
+# After a frame whose features were asked for, or nearly: frames where surface says little come in groups, and the next
+# ones are read by then.
+EXPECTED_FRAMES = 30
+NEAR = 1.5  # times the eigenvalue below which they may be asked for
 
 
 class FeatureKeeper:
@@ -17,11 +25,13 @@ class FeatureKeeper:
 
     Args:
         config: options of the run.
-        rectifier: of the camera of all frames.
+        camera: of all frames.
+        rectifier: of that camera.
     """
 
-    def __init__(self, config: Config, rectifier: ShutterRectifier):
-        self._config, self._rectifier = config, rectifier
+    def __init__(self, config: Config, camera: Camera, rectifier: ShutterRectifier):
+        self._config, self._camera, self._rectifier = config, camera, rectifier
+        self._since_asked = EXPECTED_FRAMES  # frames since features were asked for last
 
     def keep(
         self,
@@ -40,6 +50,8 @@ class FeatureKeeper:
             tracked: what tracking made of it.
             shutter: how the camera moved while it was read; None where that does not matter.
         """
+        is_asked = tracked.features is not None or tracked.fit.min_eigenvalue < NEAR * UNSURE_EIGENVALUE
+        self._since_asked = 0 if is_asked else self._since_asked + 1
         if tracked.occluded or state.frames.is_lost(-1):
             return
         features = self._wanted(state, frame, read) if tracked.features is None else tracked.features
@@ -47,6 +59,15 @@ class FeatureKeeper:
             features = self._rectifier.features(features, shutter)
         if features is not None:
             state.features.add(len(state.frames) - 1, features)
+
+    def of(self, read: FramePixels) -> FrameFeatures:
+        """Those of a frame as it was read, extracted where they are asked for."""
+        return FrameFeatures(read, self._camera, self._config.dataset.max_depth_m)
+
+    @property
+    def are_expected(self) -> bool:
+        """Whether those of the next frames will probably be asked for: those of a recent one were, or nearly."""
+        return self._since_asked < EXPECTED_FRAMES
 
     def _wanted(self, state: SlamState, frame: PreparedFrame, read: FrameFeatures) -> ImageFeatures | None:
         """Of a frame that nobody doubted; those that are due and were not extracted ahead are extracted now."""

@@ -55,6 +55,7 @@ class FramePipeline:
         device: where the map lives.
         first_pose: float64 [4, 4] T_world_camera of the first frame.
         state: everything known between two frames.
+        features: keeps image features of frames, and knows whether those of the next ones will be asked for.
         while_tracking: called in each frame while the device tracks it, for what the host has to do in any case.
         mapping_loss: float32 [] total loss of the last iteration that `optimize_map` made; None before.
     """
@@ -83,7 +84,7 @@ class FramePipeline:
         prior = load_prior(config.prior.weights, config.prior.neighborhood)
         self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
-        self._features = FeatureKeeper(config, self._rectifier)
+        self.features = FeatureKeeper(config, camera, self._rectifier)
         tracking = config.tracking
         self._measures_timing = tracking.depth_keyframes and tracking.color and tracking.capture_timing
         confidence = PoseConfidenceModel.load()
@@ -149,7 +150,7 @@ class FramePipeline:
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
         read = self._receive(frame, events)
-        features = self._features_of(read)
+        features = self.features.of(read)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
         pixels, constraints, predicted, shutter = read, Constraints(), None, None
@@ -166,7 +167,7 @@ class FramePipeline:
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
             self._tell(on_pose, tracked)
-        self._features.keep(self.state, frame, features, tracked, shutter)
+        self.features.keep(self.state, frame, features, tracked, shutter)
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
@@ -239,11 +240,8 @@ class FramePipeline:
             return TrackedFrame.untracked(predicted.clone(), lost=True)
         constraints = self.constraints.gather(self.history, pixels) if constraints is None else constraints
         problem = TrackingProblem(self.state.scene, pixels.records, predicted, number, constraints)
-        features = self._features_of(pixels) if features is None else features
+        features = self.features.of(pixels) if features is None else features
         return self._localizer.localize(problem, pixels, features, self.history, to_be_mapped, self.while_tracking)
-
-    def _features_of(self, read: FramePixels) -> FrameFeatures:
-        return FrameFeatures(read, self.camera, self.config.dataset.max_depth_m)
 
     @property
     def _has_map(self) -> bool:

@@ -1,8 +1,12 @@
 """A frame sampled from its images, as the system takes it."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import cast
+
+import cv2
+import numpy as np
 
 from spslam.camera import Camera
 from spslam.config import Config
@@ -67,7 +71,8 @@ class FramePreparation:
         config: how they are sampled.
         start: position of the first one.
         uploader: sends them to a device.
-        extracts_all: extract the image features of every frame: whoever takes them waits for none that it asks for.
+        extracts: asked of each frame whether to extract its image features in any case: whoever takes it then waits
+            for none. None extracts those that are needed.
     """
 
     def __init__(
@@ -76,10 +81,10 @@ class FramePreparation:
         config: Config,
         start: int = 0,
         uploader: Uploader | None = None,
-        extracts_all: bool = False,
+        extracts: Callable[[], bool] | None = None,
     ):
         self._dataset, self._config, self._start, self._uploader = dataset, config, start, uploader
-        self._extracts_all = extracts_all and uses_features(config)
+        self._extracts = extracts if uses_features(config) else None
 
     def __len__(self) -> int:
         return len(self._dataset) - self._start
@@ -89,7 +94,7 @@ class FramePreparation:
         frame, config = self._dataset[i + self._start], self._config
         prepared = PreparedFrame.of(frame, self._dataset.camera, config)
         is_kept = keeps_features(config, i + self._start)
-        if is_kept or self._extracts_all:
+        if needs_features(config, i + self._start) or (self._extracts is not None and self._extracts()):
             self._extract(prepared)
         if is_kept:
             prepared.features = cast(FramePixels, prepared.pixels).features
@@ -98,6 +103,15 @@ class FramePreparation:
         if self._uploader:
             prepared.pixels = self._uploader.send(cast(FramePixels, prepared.pixels))
         return prepared
+
+    def warm_up(self) -> None:
+        """Prepares a frame that is made up, so that the first one waits neither for memory nor for libraries."""
+        camera, config = self._dataset.camera, self._config
+        color = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width, 3), np.uint8)
+        middle_m = 0.5 * (config.dataset.min_depth_m + config.dataset.max_depth_m)
+        frame = RgbdFrame(0, 0.0, cv2.blur(color, (9, 9)), np.full(color.shape[:2], middle_m, np.float32))
+        self._extract(PreparedFrame.of(frame, camera, config))
+        FrameSignature.of(frame)
 
     def extract_ahead(self, frame: PreparedFrame, number: int) -> None:
         """Extracts image features of a frame of this that is on the CPU, if frame `number` of the run needs them.

@@ -167,6 +167,17 @@ def test_gains_that_are_all_alike_change_nothing_but_by_the_unknown(device, gene
     torch.testing.assert_close(poses[0][1][:, 5] + 0.7, poses[1][1][:, 5], rtol=0, atol=1e-5)
 
 
+def test_gains_may_be_a_column_of_a_table(device, generator):
+    """As the frames' are, which is not copied for each frame; the other columns are nothing to them."""
+    records = _painted(corner_pixels(POSE, generator, 400), 1.0).to(device)
+    keyframes = _keyframes([1.2, 0.8], device)
+    table = torch.full((2, 3), 7.0, device=device)
+    table[:, 1:2] = keyframes.exposure.log_gains
+    strided = keyframes._replace(exposure=keyframes.exposure._replace(log_gains=table[:, 1:2]))
+    for one, other in zip(_tracked(records, device, keyframes), _tracked(records, device, strided), strict=True):
+        assert torch.equal(one, other)
+
+
 def _tracked(records, device, keyframes, **changes):
     """Pose float32 [7] and statistics [iterations, 7] from a start that is off."""
     start = pose7(moved_pose(POSE, np.array([0.004, -0.003, 0.002]), 0.004), device)

@@ -12,6 +12,7 @@ from spslam.geometry import inverse, rotation_angle
 from spslam.slam import feature_store
 from spslam.slam.constraints import Constraints
 from spslam.slam.depth_keyframes import depth_image_intrinsics
+from spslam.slam.feature_keeper import EXPECTED_FRAMES, FeatureKeeper
 from spslam.slam.feature_store import FeatureStore
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
@@ -22,6 +23,8 @@ from spslam.slam.recovery import place_recognition
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
 from spslam.slam.recovery.feature_alignment import MIN_INLIERS, FeatureAlignment, joined_too, ratio_matches
 from spslam.slam.recovery.place_recognition import retrieve_by_features
+from spslam.slam.recovery.tracked_frame import TrackedFrame
+from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.state import SlamState
 from spslam.slam.system import SlamSystem
 from tests.system.sequences import Recorded, settings
@@ -269,3 +272,16 @@ def test_few_features_of_a_frame_that_is_hardly_seen_contradict_nothing(dataset,
     fit = frame.with_features(Fit(), pose)
     assert (fit.feature_share < 0.2) == contradicts
     assert fit.feature_inliers == many.agreeing
+
+
+@pytest.mark.parametrize(("is_asked", "eigenvalue"), [(True, 0.05), (False, 0.012)])
+def test_features_are_expected_for_a_while_after_some_were_asked_for(dataset, features, is_asked, eigenvalue):
+    """Or nearly, where surface leaves a direction almost so free."""
+    keeper = FeatureKeeper(settings(), dataset.camera, ShutterRectifier(dataset.camera, MAX_DEPTH_M))
+    plain = replace(TrackedFrame.untracked(torch.zeros(7), lost=True), fit=Fit(min_eigenvalue=0.05), occluded=True)
+    asked = replace(plain, features=features[0] if is_asked else None, fit=Fit(min_eigenvalue=eigenvalue))
+    expected = []
+    for tracked in (plain, asked, *[plain] * EXPECTED_FRAMES):
+        keeper.keep(None, None, None, tracked, None)
+        expected.append(keeper.are_expected)
+    assert expected == [False, *[True] * EXPECTED_FRAMES, False]
