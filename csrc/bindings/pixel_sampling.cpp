@@ -28,7 +28,7 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
 #ifndef SPS_CUDA
 // Places in the lists of numbers of sample_frame_pixels; spslam/ops/pixel_sampling.py fills them.
 enum class Scalar { kFx, kFy, kCx, kCy, kMinDepth, kMaxDepth, kMaxJump, kDepthImageUnit, kCount };
-enum class Integer { kNumPixels, kStepPx, kThumbnailStep, kDepthImageStep, kSeed, kStream, kFrame, kCount };
+enum class Integer { kNumPixels, kStepPx, kThumbnailStep, kDepthImageStep, kShared, kSeed, kStream, kFrame, kCount };
 
 PixelSampling load_sampling(const Scalars<Scalar>& scalars, const Integers<Integer>& integers) {
   constexpr std::int64_t kMaxSide = 65535;  // a record has 16 bits per coordinate
@@ -47,7 +47,8 @@ PixelSampling load_sampling(const Scalars<Scalar>& scalars, const Integers<Integ
           scalars.as<float>(Scalar::kMaxJump),
           integers.as<std::int32_t>(Integer::kThumbnailStep),
           integers.as<std::int32_t>(Integer::kDepthImageStep),
-          scalars.as<float>(Scalar::kDepthImageUnit)};
+          scalars.as<float>(Scalar::kDepthImageUnit),
+          integers.as<bool>(Integer::kShared)};
 }
 
 // Words that hold `count` numbers, of which `per_word` fit in one.

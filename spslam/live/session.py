@@ -36,6 +36,8 @@ from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 
+SAMPLING_THREADS = 4  # that share a frame beside a GPU
+
 
 def run_live(
     request: LiveRequest,
@@ -66,7 +68,7 @@ def run_live(
     device = resolve_device(request.config.device)
     with (
         library_threads_limited(),
-        kernel_threads_limited(device),
+        kernel_threads_limited(device, SAMPLING_THREADS),
         interpreter_shared(),
         explained_failures(device),
     ):

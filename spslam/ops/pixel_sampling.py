@@ -25,6 +25,7 @@ class PixelSampling:
         depth_image_step: distance of the pixels of the small depth and intensity images, px; the first lies at 0. With
             0 there are none.
         depth_image_unit: m, of the small image's depth.
+        shared: whether the kernels' threads (`set_num_threads`) share the frame; else the calling thread does it alone.
     """
 
     count: int
@@ -35,6 +36,7 @@ class PixelSampling:
     thumbnail_step: int
     depth_image_step: int = 0
     depth_image_unit: float = 1e-3
+    shared: bool = False
 
     def thumbnail_shape(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of the depth thumbnail of an image."""
@@ -68,7 +70,7 @@ def sample_frame_pixels(
     Pixel i of the result is number `sample_indices(seed, stream, frame, 0, P, valid)[i]` of the valid ones, row by
     row; its normal is that of `depth_normals`. Its record is three words: u | v << 16; the bits of the float32 depth
     (m); r | g << 8 | b << 16 | c << 24, c being |n . d| times 128, rounded and at most 255 (n the normal, d the ray
-    direction with camera z = 1; 0 = unknown). Runs on the calling thread, without Python's lock.
+    direction with camera z = 1; 0 = unknown). Runs without Python's lock.
 
     Args:
         depth: float32 [H, W] on the CPU, meters; not finite, 0 and outside the range is invalid.
@@ -83,7 +85,7 @@ def sample_frame_pixels(
         `thumbnail_step`-th pixel, two per word; the small depth image, uint16 [h', w'] in `depth_image_unit`, rounded
         (0 where invalid or beyond 65535), at every `depth_image_step`-th pixel, two per word; and of the same pixels
         the intensity image, uint8 [h', w'] (`LUMA_WEIGHTS`, 1/255), four per word. And the number of valid pixels.
-        Where that is 0, records and normals are 0. The same bits on every run.
+        Where that is 0, records and normals are 0. The same bits on every run, for any number of threads.
 
     Raises:
         ValueError: wrong shapes or devices, or a number out of range.
@@ -137,7 +139,7 @@ def _arguments(
     """The schema's scalars and integers: the enums Scalar and Integer in csrc/bindings/pixel_sampling.cpp."""
     scalars = [*camera, sampling.min_depth, sampling.max_depth, sampling.max_jump, sampling.depth_image_unit]
     steps = [sampling.step_px, sampling.thumbnail_step, sampling.depth_image_step]
-    return scalars, [sampling.count, *steps, *(int(part) for part in key)]
+    return scalars, [sampling.count, *steps, int(sampling.shared), *(int(part) for part in key)]
 
 
 @public_op()

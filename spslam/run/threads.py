@@ -23,11 +23,12 @@ def library_threads_limited() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def kernel_threads_limited(device: torch.device) -> Iterator[None]:
-    """On CUDA, restricts the CPU kernels to one thread: they only sample frames, one on each reading thread."""
+def kernel_threads_limited(device: torch.device, most: int = 1) -> Iterator[None]:
+    """On CUDA, restricts the CPU kernels to so many threads: they only sample frames, each reading thread one of its
+    own, or a live run one at a time with several."""
     threads = ops.get_num_threads()
     if device.type == "cuda":
-        ops.set_num_threads(1)
+        ops.set_num_threads(min(threads, most))
     try:
         yield
     finally:

@@ -103,15 +103,16 @@ class FramePixels:
         return other
 
 
-def sample_frame(frame: RgbdFrame, camera: Camera, config: Config) -> FramePixels:
+def sample_frame(frame: RgbdFrame, camera: Camera, config: Config, shared: bool = False) -> FramePixels:
     """Draws `pixels.per_frame` pixels with valid depth, with replacement, and finds their normals.
 
     Args:
         frame: color and depth; `frame.index` keys the draw.
         camera: pinhole intrinsics of the frame.
         config: sections `dataset` (depth range), `pixels` and `prior` (normals).
+        shared: whether the kernels' threads share the work, as where nothing else has any for them.
     """
-    sampling = _sampling(camera, config)
+    sampling = replace(_sampling(camera, config), shared=shared)
     buffer, num_valid = ops.sample_frame_pixels(
         torch.from_numpy(np.ascontiguousarray(frame.depth, np.float32)),
         torch.from_numpy(np.ascontiguousarray(frame.color)),

@@ -53,10 +53,11 @@ class PreparedFrame:
         return self.timestamp + self.offsets.depth
 
     @classmethod
-    def of(cls, frame: RgbdFrame, camera: Camera, config: Config) -> "PreparedFrame":
-        """Samples a frame of color, depth and time stamp, of pinhole intrinsics, for a run of a configuration."""
+    def of(cls, frame: RgbdFrame, camera: Camera, config: Config, shared: bool = False) -> "PreparedFrame":
+        """Samples a frame of color, depth and time stamp, of pinhole intrinsics, for a run of a configuration; `shared`
+        as of `sample_frame`."""
         began = time.perf_counter()
-        pixels = sample_frame(frame, camera, config)
+        pixels = sample_frame(frame, camera, config, shared)
         decode_ms = 1e3 * (time.perf_counter() - began)
         return cls(frame.index, frame.timestamp, pixels, decode_ms, offsets=frame.offsets)
 

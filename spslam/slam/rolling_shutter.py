@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # rad, m, during the readout, as in csrc/kernels/rolling_shutter.h: what moves by more has jumped.
 MAX_READOUT_MOTION = 0.15
 MIN_DEPTH_M = 0.05  # of a point that is projected
-BENT_PX = 0.25  # by which rows of an image must be off to matter, the first and the last
+BENT_PX = 0.5  # by which rows of an image must be off to matter, the first and the last
 
 
 class ShutterRectifier:

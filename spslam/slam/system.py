@@ -60,7 +60,7 @@ class SlamSystem(FramePipeline):
         check_frame("SlamSystem.process", frame.color, frame.depth, self.camera)
         if frame.index == UNNUMBERED:
             frame = replace(frame, index=self.state.frames.processed)
-        prepared = PreparedFrame.of(frame, self.camera, self.config)
+        prepared = PreparedFrame.of(frame, self.camera, self.config, shared=True)
         return self.submit(prepared, on_pose, defer_mapping).result()
 
     def open_map(self, folder: str | os.PathLike) -> None:

@@ -156,6 +156,24 @@ def test_the_key_decides(generator):
     assert all(not torch.equal(buffers[0], other) for other in buffers[2:])
 
 
+@pytest.mark.parametrize("shape", [(150, 90), (33, 64), (32, 5), (1, 40)])
+def test_threads_that_share_a_frame_sample_the_same(generator, shape):
+    depth, color = frame(generator)
+    rows, columns = (torch.arange(size) % known for size, known in zip(shape, depth.shape, strict=True))
+    depth, color = depth[rows][:, columns], color[rows][:, columns]
+    sampling = dataclasses.replace(SAMPLING, count=3000)
+    want, valid = ops.sample_frame_pixels(depth, color, *CAMERA, sampling, *KEY)
+    before = ops.get_num_threads()
+    try:
+        for threads in (1, 2, 5):
+            ops.set_num_threads(threads)
+            shared = dataclasses.replace(sampling, shared=True)
+            found, count = ops.sample_frame_pixels(depth, color, *CAMERA, shared, *KEY)
+            assert count == valid and torch.equal(found, want)
+    finally:
+        ops.set_num_threads(before)
+
+
 def test_threads_sample_side_by_side(generator):
     frames = [frame(generator, height=40 + 7 * i) for i in range(6)]
     want = [ops.sample_frame_pixels(*f, *CAMERA, SAMPLING, *KEY)[0] for f in frames]
@@ -202,7 +220,7 @@ def test_wrong_arguments_are_named(generator):
 
 def test_opcheck(generator):
     depth, color = frame(generator)
-    scalars, integers = [*CAMERA, 0.1, 6.0, 0.05, 1e-3], [100, 3, 16, 2, 7, 0, 3]
+    scalars, integers = [*CAMERA, 0.1, 6.0, 0.05, 1e-3], [100, 3, 16, 2, 0, 7, 0, 3]
     torch.library.opcheck(
         torch.ops.spslam.sample_frame_pixels,
         (depth, color, scalars, integers),

@@ -25,6 +25,7 @@ struct PixelSampling {
   std::int32_t thumbnail_step;    // px; the first pixel of the depth thumbnail lies at half of it
   std::int32_t depth_image_step;  // px; the first pixel of the small images lies at 0; 0: no small images
   float depth_image_unit;         // m, of its depth
+  bool shared;                    // whether several threads share the frame
 };
 
 // Where the results go.
