@@ -187,7 +187,7 @@ class LiveLoop:
         if border_px > 0:  # the recorder may still need the frame as it is
             frame = replace(frame, depth=frame.depth.copy())
             clear_border(frame.depth, border_px)
-        prepared = PreparedFrame.of(frame, system.camera, system.config, shared=True)
+        prepared = system.prepare(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         self.clock.decode_s += prepared.decode_ms / 1e3
         if self._uploader:

@@ -53,7 +53,8 @@ class Message(NamedTuple):
     def of(cls, frame: PreparedFrame, read_ms: float, slot: int, signature: FrameSignature | None = None) -> "Message":
         """Of a frame whose pixels are in a slot."""
         pixels = cast(FramePixels, frame.pixels)
-        described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, pixels.features)
+        features = cast(ImageFeatures | None, pixels.features)  # nobody extracts them meanwhile
+        described = (frame.index, frame.timestamp, frame.decode_ms, pixels.valid_depth_share, features)
         offsets = None if frame.offsets == AT_ONCE else (frame.offsets.depth, frame.offsets.color)
         return cls(read_ms, slot, *described, frame.features is not None, offsets, signature)
 

@@ -3,6 +3,7 @@
 ORB: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, as OpenCV implements it.
 """
 
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,6 +76,8 @@ def extract_features(pixels: FramePixels, camera: Camera, max_depth_m: float) ->
         camera: of all frames.
         max_depth_m: the largest depth that images hold.
     """
+    if isinstance(pixels.features, Future):
+        return pixels.features.result()
     if pixels.features is not None:
         return pixels.features
     return features_of_images(

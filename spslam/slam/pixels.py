@@ -21,6 +21,8 @@ from spslam.datasets.base import RgbdFrame
 from spslam.slam.depth_keyframes import depth_image_step, depth_unit
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from spslam.slam.image_features import ImageFeatures
 
 THUMBNAIL_STEP_PX = 16
@@ -38,7 +40,8 @@ class FramePixels:
         thumbnail_shape: rows and columns of the depth thumbnail.
         depth_image_shape: rows and columns of the depth and intensity images; 0 and 0 without.
         valid_depth_share: share of the image's pixels with usable depth.
-        features: of the images, where they were extracted ahead; on the CPU, and no part of the buffer.
+        features: of the images, where they were extracted ahead, or while they are; on the CPU, and no part of the
+            buffer.
     """
 
     buffer: torch.Tensor
@@ -46,7 +49,7 @@ class FramePixels:
     thumbnail_shape: tuple[int, int]
     depth_image_shape: tuple[int, int]
     valid_depth_share: float
-    features: ImageFeatures | None = None
+    features: ImageFeatures | Future[ImageFeatures] | None = None
 
     @property
     def count(self) -> int:

@@ -96,9 +96,8 @@ class FramePreparation:
         prepared = PreparedFrame.of(frame, self._dataset.camera, config)
         is_kept = keeps_features(config, i + self._start)
         if needs_features(config, i + self._start) or (self._extracts is not None and self._extracts()):
-            self._extract(prepared)
-        if is_kept:
-            prepared.features = cast(FramePixels, prepared.pixels).features
+            features = self._extract(prepared)
+            prepared.features = features if is_kept else None
         prepared.signature = FrameSignature.of(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         if self._uploader:
@@ -122,8 +121,9 @@ class FramePreparation:
         if needs_features(self._config, number):
             self._extract(frame)
 
-    def _extract(self, frame: PreparedFrame) -> None:
+    def _extract(self, frame: PreparedFrame) -> ImageFeatures:
         """Extracts the image features of a frame on the CPU, unless that was done."""
         pixels = cast(FramePixels, frame.pixels)
         features = extract_features(pixels, self._dataset.camera, self._config.dataset.max_depth_m)
         frame.pixels = replace(pixels, features=features)
+        return features

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from spslam.geometry import pose7_to_matrix
 from spslam.meshing import TriangleMesh, extract_mesh
 from spslam.run_folder import RunFolder
 from spslam.scene import Scene
+from spslam.slam.arrival import FrameArrival
 from spslam.slam.frame_pipeline import FramePipeline, PoseCallback
 from spslam.slam.frame_report import FrameReport
 from spslam.slam.interpreter import interpreter_shared
@@ -60,8 +62,15 @@ class SlamSystem(FramePipeline):
         check_frame("SlamSystem.process", frame.color, frame.depth, self.camera)
         if frame.index == UNNUMBERED:
             frame = replace(frame, index=self.state.frames.processed)
-        prepared = PreparedFrame.of(frame, self.camera, self.config, shared=True)
-        return self.submit(prepared, on_pose, defer_mapping).result()
+        return self.submit(self.prepare(frame), on_pose, defer_mapping).result()
+
+    def prepare(self, frame: RgbdFrame) -> PreparedFrame:
+        """The next frame as `submit` takes it; its images are checked already."""
+        return self._arrival.prepare(frame, self.state.frames.processed, self.features.are_expected)
+
+    @cached_property
+    def _arrival(self) -> FrameArrival:
+        return FrameArrival(self.config, self.camera, self.device)
 
     def open_map(self, folder: str | os.PathLike) -> None:
         """Goes on in the map of a finished run; call it before the first frame.
