@@ -130,8 +130,6 @@ def _serve(work: Work, shared: SharedFrames, connection: Connection) -> None:
     extracts = (lambda: bool(shared.wanted[0])) if _is_shared_out(work, MIN_EXTRACTING) else None
     preparation = FramePreparation(work.dataset, work.config, work.start, extracts=extracts)
     # That takes tenths of a second; meanwhile the loop's process loads kernels.
-    with contextlib.suppress(Exception):  # what is wrong with the data is said of the first frame
-        preparation.warm_up()
     with _shared_out(work, preparation, connection) as source:
         connection.send(True)
         connection.recv()
@@ -180,6 +178,7 @@ def _shared_out(work: Work, preparation: FramePreparation, connection: Connectio
         yield preparation
         return
     with contextlib.closing(forked):
+        forked.wait_until_ready()
         yield forked
 
 

@@ -5,7 +5,6 @@ some thirty calls per frame gives Python's global interpreter lock away and wait
 for its process, and copies the pixels that it has left in memory that both map.
 """
 
-import contextlib
 import mmap
 import multiprocessing
 import traceback
@@ -25,6 +24,7 @@ from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
 _POSITION_BYTES = 8  # of a frame's position
 _OWN_SLOT = 0  # each worker has memory for one frame
+_READY = b"ready"
 
 
 class WorkerEndedError(Exception):
@@ -80,6 +80,18 @@ class ForkedPreparation:
             self.close()
             raise
 
+    def wait_until_ready(self) -> None:
+        """Waits until all processes are; none has to be waited for by a frame then.
+
+        Raises:
+            WorkerEndedError: a process has ended.
+        """
+        for worker in self._workers:
+            try:
+                worker.connection.recv_bytes()
+            except DISCONNECTED:
+                raise worker.ended() from None
+
     def __len__(self) -> int:
         return self._length
 
@@ -129,10 +141,11 @@ def _work(
     # Else an end that is closed elsewhere stays open here, and nobody notices.
     for other in inherited:
         other.close()
-    # A process that was forked gets its memory page by page.
-    with contextlib.suppress(Exception):  # what is wrong with the data is said of the first frame
-        preparation.warm_up()
+    # A process that was forked gets its memory page by page: its first frame would take ten times as long as the next.
+    # What is wrong with that one is said when it is asked for.
+    _prepare(preparation, 0, memory)
     try:
+        connection.send_bytes(_READY)
         while True:
             position = int.from_bytes(connection.recv_bytes(), "little")
             connection.send(tuple(_prepare(preparation, position, memory)))

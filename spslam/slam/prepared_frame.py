@@ -5,9 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import cast
 
-import cv2
-import numpy as np
-
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset, RgbdFrame
@@ -103,15 +100,6 @@ class FramePreparation:
         if self._uploader:
             prepared.pixels = self._uploader.send(cast(FramePixels, prepared.pixels))
         return prepared
-
-    def warm_up(self) -> None:
-        """Prepares a frame that is made up, so that the first one waits neither for memory nor for libraries."""
-        camera, config = self._dataset.camera, self._config
-        color = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width, 3), np.uint8)
-        middle_m = 0.5 * (config.dataset.min_depth_m + config.dataset.max_depth_m)
-        frame = RgbdFrame(0, 0.0, cv2.blur(color, (9, 9)), np.full(color.shape[:2], middle_m, np.float32))
-        self._extract(PreparedFrame.of(frame, camera, config))
-        FrameSignature.of(frame)
 
     def extract_ahead(self, frame: PreparedFrame, number: int) -> None:
         """Extracts image features of a frame of this that is on the CPU, if frame `number` of the run needs them.

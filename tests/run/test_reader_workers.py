@@ -1,5 +1,6 @@
 """Frames prepared by processes that the reading process forks: the same frames, and what happens when one ends."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from spslam.errors import DatasetError, SpslamError
+from spslam.run import reader_workers
 from spslam.run.frame_feed import FrameFeed
 from spslam.run.reader_service import Work, _shared_out
 from spslam.slam.prepared_frame import FramePreparation
@@ -148,6 +150,13 @@ def test_processes_are_there_before_the_first_frame_is_requested():
         assert len(children(feed._process._process.pid)) == WORKERS
 
 
+def wait_for_the_end(_, connection, memory, inherited):
+    for other in inherited:
+        other.close()
+    with contextlib.suppress(EOFError):
+        connection.recv_bytes()
+
+
 def test_where_no_process_can_start_threads_read(monkeypatch):
     """And those that had started are ended."""
     started, fork = [], os.fork
@@ -159,6 +168,7 @@ def test_where_no_process_can_start_threads_read(monkeypatch):
         return started[0]
 
     monkeypatch.setattr(os, "fork", fork_once)
+    monkeypatch.setattr(reader_workers, "_work", wait_for_the_end)
     dataset = Recorded(3, is_random_access=True)
     work = Work(dataset, settings(), 0, WORKERS, 4, 4, 0, 0)
     preparation = FramePreparation(dataset, work.config)
