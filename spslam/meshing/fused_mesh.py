@@ -22,6 +22,11 @@ from spslam.scene import Scene
 MIN_WEIGHT = 0.005
 # And from this share of the largest weight nearby.
 MIN_SHARE = 0.01
+# A signed distance changes by no more than a voxel from one voxel to the next. So a voxel that lies this share of the
+# truncation of certain depth behind a surface, 1.25 voxels as a rule, is not beside free space: what seems to lie
+# between the two is a fringe, in the shadow of an edge, unless many views agree. With this share of the largest weight
+# nearby it counts as the side of a thing.
+BEHIND_TRUNCATION, BEHIND_SHARE = 0.625, 0.2
 # A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.
 _LATTICE = 1e-3
 
@@ -50,15 +55,20 @@ def extract_fused_mesh(
     """
     if (camera is None) != (poses is None):
         raise ValueError("extract_fused_mesh: camera and poses must be given together, got one of them")
-    known = volume.weights >= volume.least_weights(MIN_WEIGHT, MIN_SHARE)[:, None]
+    largest = volume.least_weights(0.0, 1.0)[:, None]
+    known = volume.weights >= (MIN_SHARE * largest).clamp(min=MIN_WEIGHT)
+    behind = volume.sdf < -BEHIND_TRUNCATION * volume.near_truncation
+    behind &= volume.weights < BEHIND_SHARE * largest
     values = torch.where(known, volume.sdf, torch.nan)
     if scene is not None:
         values = fill_with_scene(volume, values, scene)
     points, faces = march_blocks(volume.block_coords, values, volume.voxel_size)
-    vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
-    normals = vertex_normals(vertices, kept)
+    measured, fringes = _measured_vertices(volume, (known, behind), points)
+    normals = vertex_normals(points.cpu().numpy(), faces.cpu().numpy())
+    outside = ~fringes[faces].any(1)
+    faces, vertices = faces[outside], points.cpu().numpy()
+    kept = faces.cpu().numpy()
     if scene is not None:
-        measured = _measured_vertices(volume, known, points)
         kept = kept[_supported(scene, points, faces, measured, normals, (camera, poses))]
     kept = kept[in_large_component(vertices, kept, min_part_m2)]
     kept, used = compact(kept, len(vertices))
@@ -66,17 +76,26 @@ def extract_fused_mesh(
     return TriangleMesh(vertices[used], kept, colors, normals[used])
 
 
-def _measured_vertices(volume: ops.TsdfVolume, known: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Bool [K]: whether the two voxels that a vertex lies between were measured."""
-    flat = known.reshape(-1)
-    measured = [flat[:0]]
+def _measured_vertices(
+    volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor], points: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two bool [K]: whether the two voxels that a vertex lies between were measured, and if so, one is behind.
+
+    Args:
+        volume: what the vertices are of.
+        voxels: bool [B, 512] each, those that are known and those that may be behind a surface that ends.
+        points: float32 [K, 3], vertices.
+    """
+    known, behind = (each.reshape(-1) for each in voxels)
+    measured, fringes = [known[:0]], [known[:0]]
     for chunk in points.split(CHUNK_POINTS):
-        voxels = (chunk / volume.voxel_size).double()
+        at = (chunk / volume.voxel_size).double()
         # A coordinate along which a vertex lies on the lattice must not be rounded to the voxel beside it.
-        ends = ((voxels + _LATTICE).floor(), (voxels - _LATTICE).ceil())
-        rows = [_voxel_rows(volume, end.to(torch.int32)) for end in ends]
-        measured.append(torch.stack([(row >= 0) & flat[row.clamp(min=0)] for row in rows]).all(0))
-    return torch.cat(measured)
+        ends = ((at + _LATTICE).floor(), (at - _LATTICE).ceil())
+        rows = torch.stack([_voxel_rows(volume, end.to(torch.int32)) for end in ends])
+        measured.append(((rows >= 0) & known[rows.clamp(min=0)]).all(0))
+        fringes.append(measured[-1] & behind[rows.clamp(min=0)].any(0))
+    return torch.cat(measured), torch.cat(fringes)
 
 
 def _voxel_rows(volume: ops.TsdfVolume, voxels: torch.Tensor) -> torch.Tensor:

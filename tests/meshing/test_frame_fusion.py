@@ -120,6 +120,18 @@ class _Views(PosedFrames):
         return RgbdFrame(position, float(position), np.zeros((*depth.shape, 3), np.uint8), depth)
 
 
+def test_no_fringe_goes_on_behind_an_edge_that_few_views_saw():
+    """The edge of a board before a wall; most frames see only the board, or all see both."""
+    both = np.tile(np.where(np.arange(128) < 68, np.float32(1.005), np.float32(1.6)), (96, 1))
+    board = np.where(np.arange(128) < 64, both, np.float32(0))
+    behind = []
+    for frames in (_Views(both, *[board] * 9), _Views(*[both] * 10)):
+        vertices = extract_fused_mesh(fuse_frames(frames, FusionOptions(0.01, 500, EXACT)), min_part_m2=0).vertices
+        behind.append(int(((vertices[:, 2] > 1.0155) & (vertices[:, 2] < 1.5)).sum()))
+        assert vertices[:, 0].max() > 0.03  # as far as the pixels go
+    assert behind[0] == 0 and behind[1] > 50
+
+
 def test_a_ramp_stays_where_nothing_else_was_seen():
     """Steps of 0.6 m, smoothed; a frame that came before them has seen through the ramps, or none has."""
     steps = np.tile(np.where(np.arange(128) // 24 % 2, np.float32(1.0), np.float32(1.6)), (96, 1))
