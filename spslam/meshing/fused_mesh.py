@@ -135,7 +135,8 @@ def _colors(volume: ops.TsdfVolume, scene: Scene | None, points: torch.Tensor) -
     for chunk in points.split(CHUNK_POINTS):
         _, rgb, known = volume.query(chunk, min_weight=MIN_WEIGHT)
         known &= (rgb > 0).any(1)
-        if scene is not None and not bool(known.all()):
-            rgb = torch.where(known[:, None], rgb, scene.color(chunk))
+        if scene is not None:
+            others = torch.nonzero(~known)[:, 0]
+            rgb[others] = scene.color(chunk[others])
         colors.append((rgb * 255).round().clamp(0, 255).to(torch.uint8).cpu().numpy())
     return np.concatenate(colors)
