@@ -16,8 +16,8 @@ from spslam.meshing.visible_points import KeptFrames, read_seen
 
 # Every so many-th frame gives colors, and every so many-th of these is surveyed for detail, as frames next to each
 # other show the same; of short sequences more, up to all.
-_COLORED_EVERY, _SURVEYED_EVERY = 5, 4
-_LEAST_COLORED, _LEAST_SURVEYED = 120, 40
+_COLORED_EVERY, _SURVEYED_EVERY = 5, 8
+_LEAST_COLORED, _LEAST_SURVEYED = 120, 20
 # An edge is divided where colors in its middle are so many levels from the mean of its ends, and so many times what
 # noise makes of that.
 DETAIL_LEVELS, _DETAIL_DEVIATIONS = 4.0, 3.0
