@@ -22,11 +22,16 @@ from spslam.scene import Scene
 MIN_WEIGHT = 0.005
 # And from this share of the largest weight nearby.
 MIN_SHARE = 0.01
-# A signed distance changes by no more than a voxel from one voxel to the next. So a voxel that lies this share of the
-# truncation of certain depth behind a surface, 1.25 voxels as a rule, is not beside free space: what seems to lie
-# between the two is a fringe, in the shadow of an edge, unless many views agree. With this share of the largest weight
-# nearby it counts as the side of a thing.
-BEHIND_TRUNCATION, BEHIND_SHARE = 0.625, 0.2
+# A signed distance changes by no more than a voxel from one voxel to the next. Where it changes by more than the
+# truncation of certain depth, two voxels as a rule, and the voxel behind is more than this share of that behind a
+# surface, each was measured against another surface: what seems to lie between is a fringe, in the shadow of an edge.
+# Noise alone does this where few or slanted views saw a surface, so the voxel must be behind by so many deviations of
+# its mean more, that of a measurement of weight 1 being `_DEVIATION_M`, the s of `ops.measure_planes`. With this share
+# of the largest weight nearby it counts as the side of a thing.
+FRINGE_DEPTH, FRINGE_DEVIATIONS, FRINGE_SHARE = 0.5, 0.5, 0.3
+_DEVIATION_M = 0.003
+# From so many corners on a face is part of a fringe. With one it is the border of a surface, less than a voxel wide.
+_FRINGE_CORNERS = 2
 # A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.
 _LATTICE = 1e-3
 
@@ -45,7 +50,8 @@ def extract_fused_mesh(
         scene: a map of the same frames in the same world; None leaves holes where nothing was measured.
         camera: intrinsics of the views at `poses`.
         poses: float [F, 4, 4] T_world_camera. Surface of the map that no view sees from the front is left out.
-        min_part_m2: connected components with a smaller area, m^2, are removed.
+        min_part_m2: connected components with a smaller area, m^2, are removed. A part that only the removal
+            of fringes cuts off stays.
 
     Returns:
         The mesh; empty for an empty volume. The same input gives the same mesh.
@@ -57,20 +63,21 @@ def extract_fused_mesh(
         raise ValueError("extract_fused_mesh: camera and poses must be given together, got one of them")
     largest = volume.least_weights(0.0, 1.0)[:, None]
     known = volume.weights >= (MIN_SHARE * largest).clamp(min=MIN_WEIGHT)
-    behind = volume.sdf < -BEHIND_TRUNCATION * volume.near_truncation
-    behind &= volume.weights < BEHIND_SHARE * largest
+    slack = FRINGE_DEVIATIONS * _DEVIATION_M * volume.weights.rsqrt()
+    behind = volume.sdf + slack < -FRINGE_DEPTH * volume.near_truncation
+    behind &= volume.weights < FRINGE_SHARE * largest
     values = torch.where(known, volume.sdf, torch.nan)
     if scene is not None:
         values = fill_with_scene(volume, values, scene)
     points, faces = march_blocks(volume.block_coords, values, volume.voxel_size)
     measured, fringes = _measured_vertices(volume, (known, behind), points)
     normals = vertex_normals(points.cpu().numpy(), faces.cpu().numpy())
-    outside = ~fringes[faces].any(1)
-    faces, vertices = faces[outside], points.cpu().numpy()
-    kept = faces.cpu().numpy()
+    vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
     if scene is not None:
         kept = kept[_supported(scene, points, faces, measured, normals, (camera, poses))]
     kept = kept[in_large_component(vertices, kept, min_part_m2)]
+    # Only now: a landing that was seen at a grazing angle must not go as a whole because fringes around it do.
+    kept = kept[fringes.cpu().numpy()[kept].sum(1) < _FRINGE_CORNERS]
     kept, used = compact(kept, len(vertices))
     colors = _colors(volume, scene, points[torch.from_numpy(used).to(points.device)])
     return TriangleMesh(vertices[used], kept, colors, normals[used])
@@ -79,7 +86,7 @@ def extract_fused_mesh(
 def _measured_vertices(
     volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor], points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Two bool [K]: whether the two voxels that a vertex lies between were measured, and if so, one is behind.
+    """Two bool [K]: whether the two voxels that a vertex lies between were measured, and if so, it is a fringe's.
 
     Args:
         volume: what the vertices are of.
@@ -87,14 +94,17 @@ def _measured_vertices(
         points: float32 [K, 3], vertices.
     """
     known, behind = (each.reshape(-1) for each in voxels)
+    sdf = volume.sdf.reshape(-1)
     measured, fringes = [known[:0]], [known[:0]]
     for chunk in points.split(CHUNK_POINTS):
         at = (chunk / volume.voxel_size).double()
         # A coordinate along which a vertex lies on the lattice must not be rounded to the voxel beside it.
         ends = ((at + _LATTICE).floor(), (at - _LATTICE).ceil())
         rows = torch.stack([_voxel_rows(volume, end.to(torch.int32)) for end in ends])
-        measured.append(((rows >= 0) & known[rows.clamp(min=0)]).all(0))
-        fringes.append(measured[-1] & behind[rows.clamp(min=0)].any(0))
+        found, rows = rows >= 0, rows.clamp(min=0)
+        measured.append((found & known[rows]).all(0))
+        steep = (sdf[rows[0]] - sdf[rows[1]]).abs() > volume.near_truncation
+        fringes.append(measured[-1] & steep & behind[rows].any(0))
     return torch.cat(measured), torch.cat(fringes)
 
 
