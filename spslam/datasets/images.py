@@ -139,12 +139,18 @@ def depth_in_meters(stored: np.ndarray, units_per_meter: float | None, invalid: 
     """
     if units_per_meter is None:
         units_per_meter = 1000.0 if stored.dtype == np.uint16 else 1.0
+    if stored.dtype == np.uint16:
+        # Factors of 0 and 1, and a conversion of its own: masks and mixed types take twice as long.
+        for value in invalid:
+            stored = stored * (stored != value).astype(np.uint16)
+        depth = stored.astype(np.float32)
+        depth /= np.float32(units_per_meter)
+        return depth
     with np.errstate(over="ignore", invalid="ignore"):  # infinity and NaN are not measured
         depth = np.divide(stored, np.float32(units_per_meter), dtype=np.float32, casting="same_kind")
     for value in invalid:
         depth[stored == value] = 0
-    if stored.dtype != np.uint16:
-        depth[~np.isfinite(depth) | (depth < 0)] = 0
+    depth[~np.isfinite(depth) | (depth < 0)] = 0
     return depth
 
 

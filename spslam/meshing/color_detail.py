@@ -12,17 +12,19 @@ from spslam import ops
 from spslam.meshing.frame_fusion import PosedFrames, on_device
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.subdivision import MeshEdges, mesh_edges, midpoints, split_edges
-from spslam.meshing.visible_points import read_seen
+from spslam.meshing.visible_points import KeptFrames, read_seen
 
 # Every so many-th frame gives colors, and every so many-th of these is surveyed for detail, as frames next to each
 # other show the same; of short sequences more, up to all.
-_COLORED_EVERY, _SURVEYED_EVERY = 5, 4
-_LEAST_COLORED, _LEAST_SURVEYED = 120, 40
+_COLORED_EVERY, _SURVEYED_EVERY = 5, 8
+_LEAST_COLORED, _LEAST_SURVEYED = 120, 20
 # An edge is divided where colors in its middle are so many levels from the mean of its ends, and so many times what
 # noise makes of that.
 DETAIL_LEVELS, _DETAIL_DEVIATIONS = 4.0, 3.0
 # What the color that a vertex has counts, in pixels per m^2 of a frame: all where none sees it, else next to nothing.
 _OWN_WEIGHT = 100.0
+# So many bytes of the surveyed frames are kept, as these are looked at again.
+_KEPT_BYTES, _PIXEL_BYTES = 1 << 27, 7
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,8 @@ def color_mesh(
     """Gives a mesh the colors of frames, and vertices in the middle of edges where these vary in between.
 
     A vertex has the mean of the colors with which frames see it, weighted by the pixels that they have for its surface,
-    which has the least mean squared error. The surface stays where it is, see `split_edges`. Frames are read once for
-    each subdivision and once for the colors, but not all of them.
+    which has the least mean squared error. The surface stays where it is, see `split_edges`. Frames are looked at once
+    for each subdivision and once for the colors, but not all of them.
 
     Args:
         mesh: of these frames. Its colors are kept where no frame sees it.
@@ -58,12 +60,13 @@ def color_mesh(
 
     Returns:
         The mesh, and the number of frames that colors are of; frames that can't be read are left out. Memory beside the
-        meshes: 50 bytes per vertex and 90 per edge. The same input gives the same bytes.
+        meshes: 50 bytes per vertex and 90 per edge, and at most 128 MiB of frames. The same input gives the same bytes.
     """
     parts = [parts] if isinstance(parts, PosedFrames) else parts
     count = sum(len(part) for part in parts)
     colored = min(_COLORED_EVERY, max(count // _LEAST_COLORED, 1))
     surveyed = colored * min(_SURVEYED_EVERY, max(count // (colored * _LEAST_SURVEYED), 1))
+    parts = _keeping(parts, [len(part) for part in thinned(parts, surveyed)])
     device, survey, looked_at = torch.device(device), thinned(parts, surveyed), 0
     for _ in range(options.subdivisions):
         edges = mesh_edges(mesh.faces, len(mesh.vertices))
@@ -75,6 +78,17 @@ def color_mesh(
         mesh = split_edges(mesh, edges, chosen, ((first + second + 1) // 2).astype(np.uint8))
     views = thinned(parts, colored)
     return replace(mesh, colors=_mean_colors(mesh, (views, options.noise, device))), sum(map(len, views))
+
+
+def _keeping(parts: Sequence[PosedFrames], surveyed: Sequence[int]) -> list[KeptFrames]:
+    """The parts, of which so many frames each that are read first are kept, as far as `_KEPT_BYTES` go."""
+    kept, left = [], _KEPT_BYTES
+    for part, count in zip(parts, surveyed, strict=True):
+        frame_bytes = part.dataset.camera.width * part.dataset.camera.height * _PIXEL_BYTES
+        most = min(count, left // frame_bytes)
+        left -= most * frame_bytes
+        kept.append(KeptFrames(part.dataset, part.indices, part.poses, part.noise, most))
+    return kept
 
 
 def thinned(parts: Sequence[PosedFrames], every: int) -> list[PosedFrames]:

@@ -22,6 +22,16 @@ from spslam.scene import Scene
 MIN_WEIGHT = 0.005
 # And from this share of the largest weight nearby.
 MIN_SHARE = 0.01
+# A signed distance changes by no more than a voxel from one voxel to the next. Where it changes by more than the
+# truncation of certain depth, two voxels as a rule, and the voxel behind is more than this share of that behind a
+# surface, each was measured against another surface: what seems to lie between is a fringe, in the shadow of an edge.
+# Noise alone does this where few or slanted views saw a surface, so the voxel must be behind by so many deviations of
+# its mean more, that of a measurement of weight 1 being `_DEVIATION_M`, the s of `ops.measure_planes`. With this share
+# of the largest weight nearby it counts as the side of a thing.
+FRINGE_DEPTH, FRINGE_DEVIATIONS, FRINGE_SHARE = 0.5, 0.5, 0.3
+_DEVIATION_M = 0.003
+# From so many corners on a face is part of a fringe. With one it is the border of a surface, less than a voxel wide.
+_FRINGE_CORNERS = 2
 # A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.
 _LATTICE = 1e-3
 
@@ -40,7 +50,8 @@ def extract_fused_mesh(
         scene: a map of the same frames in the same world; None leaves holes where nothing was measured.
         camera: intrinsics of the views at `poses`.
         poses: float [F, 4, 4] T_world_camera. Surface of the map that no view sees from the front is left out.
-        min_part_m2: connected components with a smaller area, m^2, are removed.
+        min_part_m2: connected components with a smaller area, m^2, are removed. A part that only the removal
+            of fringes cuts off stays.
 
     Returns:
         The mesh; empty for an empty volume. The same input gives the same mesh.
@@ -50,33 +61,51 @@ def extract_fused_mesh(
     """
     if (camera is None) != (poses is None):
         raise ValueError("extract_fused_mesh: camera and poses must be given together, got one of them")
-    known = volume.weights >= volume.least_weights(MIN_WEIGHT, MIN_SHARE)[:, None]
+    largest = volume.least_weights(0.0, 1.0)[:, None]
+    known = volume.weights >= (MIN_SHARE * largest).clamp(min=MIN_WEIGHT)
+    slack = FRINGE_DEVIATIONS * _DEVIATION_M * volume.weights.rsqrt()
+    behind = volume.sdf + slack < -FRINGE_DEPTH * volume.near_truncation
+    behind &= volume.weights < FRINGE_SHARE * largest
     values = torch.where(known, volume.sdf, torch.nan)
     if scene is not None:
         values = fill_with_scene(volume, values, scene)
     points, faces = march_blocks(volume.block_coords, values, volume.voxel_size)
+    measured, fringes = _measured_vertices(volume, (known, behind), points)
+    normals = vertex_normals(points.cpu().numpy(), faces.cpu().numpy())
     vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
-    normals = vertex_normals(vertices, kept)
     if scene is not None:
-        measured = _measured_vertices(volume, known, points)
         kept = kept[_supported(scene, points, faces, measured, normals, (camera, poses))]
     kept = kept[in_large_component(vertices, kept, min_part_m2)]
+    # Only now: a landing that was seen at a grazing angle must not go as a whole because fringes around it do.
+    kept = kept[fringes.cpu().numpy()[kept].sum(1) < _FRINGE_CORNERS]
     kept, used = compact(kept, len(vertices))
     colors = _colors(volume, scene, points[torch.from_numpy(used).to(points.device)])
     return TriangleMesh(vertices[used], kept, colors, normals[used])
 
 
-def _measured_vertices(volume: ops.TsdfVolume, known: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Bool [K]: whether the two voxels that a vertex lies between were measured."""
-    flat = known.reshape(-1)
-    measured = [flat[:0]]
+def _measured_vertices(
+    volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor], points: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two bool [K]: whether the two voxels that a vertex lies between were measured, and if so, it is a fringe's.
+
+    Args:
+        volume: what the vertices are of.
+        voxels: bool [B, 512] each, those that are known and those that may be behind a surface that ends.
+        points: float32 [K, 3], vertices.
+    """
+    known, behind = (each.reshape(-1) for each in voxels)
+    sdf = volume.sdf.reshape(-1)
+    measured, fringes = [known[:0]], [known[:0]]
     for chunk in points.split(CHUNK_POINTS):
-        voxels = (chunk / volume.voxel_size).double()
+        at = (chunk / volume.voxel_size).double()
         # A coordinate along which a vertex lies on the lattice must not be rounded to the voxel beside it.
-        ends = ((voxels + _LATTICE).floor(), (voxels - _LATTICE).ceil())
-        rows = [_voxel_rows(volume, end.to(torch.int32)) for end in ends]
-        measured.append(torch.stack([(row >= 0) & flat[row.clamp(min=0)] for row in rows]).all(0))
-    return torch.cat(measured)
+        ends = ((at + _LATTICE).floor(), (at - _LATTICE).ceil())
+        rows = torch.stack([_voxel_rows(volume, end.to(torch.int32)) for end in ends])
+        found, rows = rows >= 0, rows.clamp(min=0)
+        measured.append((found & known[rows]).all(0))
+        steep = (sdf[rows[0]] - sdf[rows[1]]).abs() > volume.near_truncation
+        fringes.append(measured[-1] & steep & behind[rows].any(0))
+    return torch.cat(measured), torch.cat(fringes)
 
 
 def _voxel_rows(volume: ops.TsdfVolume, voxels: torch.Tensor) -> torch.Tensor:
@@ -116,7 +145,8 @@ def _colors(volume: ops.TsdfVolume, scene: Scene | None, points: torch.Tensor) -
     for chunk in points.split(CHUNK_POINTS):
         _, rgb, known = volume.query(chunk, min_weight=MIN_WEIGHT)
         known &= (rgb > 0).any(1)
-        if scene is not None and not bool(known.all()):
-            rgb = torch.where(known[:, None], rgb, scene.color(chunk))
+        if scene is not None:
+            others = torch.nonzero(~known)[:, 0]
+            rgb[others] = scene.color(chunk[others])
         colors.append((rgb * 255).round().clamp(0, 255).to(torch.uint8).cpu().numpy())
     return np.concatenate(colors)

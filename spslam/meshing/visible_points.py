@@ -3,11 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import torch
 
 from spslam import ops
+from spslam.datasets.base import RgbdFrame
 from spslam.meshing.frame_fusion import PosedFrames, frame_intrinsics, on_device, pose7_on
+
+
+@dataclass(frozen=True)
+class KeptFrames(PosedFrames):
+    """Frames of which those that are read first are kept, also by what is made of these by `dataclasses.replace`.
+
+    Attributes:
+        most: how many, but for as many more as threads read at once.
+        kept: those, by their indices in the dataset.
+    """
+
+    most: int = 0
+    kept: dict[int, RgbdFrame] = field(default_factory=dict)
+
+    def __getitem__(self, position: int) -> RgbdFrame:
+        index = int(self.indices[position])
+        frame = self.kept.get(index)
+        if frame is None:
+            frame = super().__getitem__(position)
+            if len(self.kept) < self.most:
+                self.kept[index] = frame
+        return frame
 
 
 def read_seen(

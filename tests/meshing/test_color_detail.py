@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from spslam import ops
+from spslam.meshing import color_detail
 from spslam.meshing.color_detail import ColorOptions, color_mesh, thinned
 from spslam.meshing.render import render_colors
 from spslam.meshing.subdivision import mesh_edges
@@ -160,6 +161,27 @@ def test_vertices_that_no_frame_sees_keep_their_color():
     assert hidden.any() and (colored.colors[hidden] == GRAY).all() and used == 12
     unread, _ = color_mesh(mesh, frames(WALL, broken=range(12)), OPTIONS)
     assert np.array_equal(unread.faces, mesh.faces) and (unread.colors == GRAY).all()
+
+
+def test_frames_that_are_looked_at_again_are_read_once(board, monkeypatch):
+    mesh, views = board
+    meshes, reads = [], []
+    for kept_bytes in (1 << 27, 0):
+        monkeypatch.setattr(color_detail, "_KEPT_BYTES", kept_bytes)
+        counting = _Counting.of(views)
+        meshes.append(color_mesh(mesh, counting, ColorOptions(NOISE, 2))[0])
+        reads.append(len(counting.dataset.indices))
+    assert reads == [24, 3 * 24]
+    assert np.array_equal(meshes[0].colors, meshes[1].colors)
+    assert np.array_equal(meshes[0].vertices, meshes[1].vertices)
+
+
+class _Counting(_Noisy):
+    """Tells what was read."""
+
+    def read(self, index):
+        self.__dict__.setdefault("indices", []).append(index)
+        return super().read(index)
 
 
 def test_every_so_many_th_frame_through_all_parts():

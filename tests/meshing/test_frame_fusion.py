@@ -120,6 +120,47 @@ class _Views(PosedFrames):
         return RgbdFrame(position, float(position), np.zeros((*depth.shape, 3), np.uint8), depth)
 
 
+@pytest.mark.parametrize(
+    ("before", "behind", "weight", "stays"),
+    [
+        (1.5, 1.5, 1.0, False),
+        (1.5, 0.9, 1.0, True),  # not deep
+        (0.4, 1.5, 1.0, True),  # no larger change than the truncation
+        (1.5, 1.5, 2.0, True),  # many views agree
+        (1.5, 1.5, 0.05, True),  # within the noise of a mean
+        (1.5, 1.9, 0.05, False),
+    ],
+)
+def test_no_fringe_goes_on_between_voxels_that_measured_different_surfaces(before, behind, weight, stays):
+    """A floor that was seen often; in the air above it, voxels before and behind nothing, in voxels from it."""
+    mesh = extract_fused_mesh(_floor_and_fringe(before, behind, weight), min_part_m2=0)
+    above = mesh.vertices[:, 2] > 0.03
+    assert (~above).sum() == 16 * 16
+    assert above.sum() == (9 * 16 if stays else 0)
+
+
+def _floor_and_fringe(before, behind, weight, weight_at_ends=None):
+    """16 x 16 x 16 voxels of 1 cm: a floor at z = 1.5, and from z = 7 on what is before x = 7.5 is behind a surface."""
+    volume = ops.TsdfVolume(0.01)
+    volume.add_blocks(torch.cartesian_prod(*[torch.arange(2, dtype=torch.int32)] * 3))
+    local = torch.cartesian_prod(*[torch.arange(8)] * 3)
+    x, y, z = (volume.block_coords[:, None] * 8 + local[None]).unbind(-1)
+    upper = torch.where(x < 8, -behind, before)
+    volume.sdf.copy_(0.01 * torch.where(z > 6, upper, (z - 1.5).clamp(max=2)))
+    weights = torch.where((y - 7.5).abs() < 4, weight, weight if weight_at_ends is None else weight_at_ends)
+    volume.weights.copy_(torch.where(z > 6, weights, 4.0) * ((z - 5).abs() > 1))
+    return volume
+
+
+def test_what_only_the_removal_of_a_fringe_cuts_off_stays():
+    """Of 8 x 15 cm above the floor the ends, 8 x 4 cm each, were seen by many; parts below 100 cm2 go."""
+    upper = []
+    for weight in (1.0, 2.0):
+        mesh = extract_fused_mesh(_floor_and_fringe(1.5, 1.5, weight, 2.0), min_part_m2=0.01)
+        upper.append(len(np.unique(mesh.vertices[mesh.vertices[:, 2] > 0.03, 1])))
+    assert upper == [10, 16]
+
+
 def test_a_ramp_stays_where_nothing_else_was_seen():
     """Steps of 0.6 m, smoothed; a frame that came before them has seen through the ramps, or none has."""
     steps = np.tile(np.where(np.arange(128) // 24 % 2, np.float32(1.0), np.float32(1.6)), (96, 1))
