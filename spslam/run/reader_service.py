@@ -27,8 +27,8 @@ from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 
 _SLOT_BYTES = 4  # of a slot's number
 _WORD_BYTES = 4
-# So many processes extract image features while the loop wants some, so that it waits for few; that takes as long as all
-# else, and fewer would hold the loop up.
+# So many processes extract image features while the loop wants some, so that it waits for few; that takes as long as
+# all else, and fewer would hold the loop up.
 MIN_EXTRACTING = 4
 
 

@@ -116,7 +116,8 @@ def test_what_cannot_be_recovered_stays_lost(dataset, system, pixels):
     start = moved(dataset.poses()[10], 50.0, 90.0)
     problem = TrackingProblem(system.state.scene, pixels.records, start, 10)
     estimate = system.tracker.track(problem)
-    result = system.recovery.resolve(problem, estimate, pixels, Elsewhere(system.state), to_be_mapped=False)
+    features = system.features.of(pixels)
+    result = system.recovery.resolve(problem, estimate, pixels, Elsewhere(system.state), False, features)
     assert result.lost and not result.relocalized
     assert torch.equal(result.pose, start)
 
