@@ -53,6 +53,13 @@ def test_batches_of_any_shape_and_empty_batches():
     assert geometry.pose7_to_matrix(np.zeros((0, 7))).shape == (0, 4, 4)
 
 
+def test_one_rotation_is_that_of_a_batch():
+    """One matrix is worked out in plain numbers; each of the four ways to divide comes up."""
+    axes = np.concatenate([Rotation.random(40, random_state=3).as_matrix(), np.diag([1.0, -1.0, -1.0])[None]])
+    alone = np.stack([geometry.matrix_to_quaternion(each) for each in axes])
+    np.testing.assert_allclose(alone, geometry.matrix_to_quaternion(axes), rtol=0, atol=EXACT)
+
+
 def test_orthonormalize_returns_the_nearest_rotation():
     generator = np.random.default_rng(2)
     rotations = Rotation.random(30, random_state=2).as_matrix()

@@ -54,6 +54,16 @@ def test_rotation_vectors_and_matrices_are_inverse():
     np.testing.assert_allclose(rotation_vectors(rotation_matrices(vectors)), vectors, atol=1e-9)
 
 
+@pytest.mark.parametrize("length", [0.0, 1e-10, 1e-5, 0.3, 3.1])
+def test_one_vector_and_matrix_are_those_of_a_batch(length):
+    vectors = np.random.default_rng(1).normal(size=(20, 3))
+    vectors *= length / np.linalg.norm(vectors, axis=1, keepdims=True)
+    matrices = rotation_matrices(vectors)
+    np.testing.assert_allclose(np.stack([rotation_matrices(each) for each in vectors]), matrices, rtol=0, atol=1e-14)
+    alone = np.stack([rotation_vectors(each) for each in matrices])
+    np.testing.assert_allclose(alone, rotation_vectors(matrices), rtol=0, atol=1e-14)
+
+
 def test_chain_alone_is_kept():
     truth = circle(20)
     pairs = [(i, i - 1) for i in range(1, 20)]

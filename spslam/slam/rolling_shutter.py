@@ -11,7 +11,7 @@ import numpy as np
 from spslam import ops
 from spslam.camera import Camera
 from spslam.pose_graph import rotation_vectors
-from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
+from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_shape, depth_unit
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import pose_matrix
@@ -39,8 +39,8 @@ class ShutterRectifier:
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
         self._image_intrinsics = depth_image_intrinsics(camera)
         self._size = camera.height, camera.width
-        self._image_rows = -(-camera.height // depth_image_step(camera))
-        self._is_flat = min(self._image_rows, -(-camera.width // depth_image_step(camera))) < 2  # nothing between rows
+        rows, columns = depth_image_shape(camera)
+        self._image_rows, self._is_flat = rows, min(rows, columns) < 2  # nothing is between fewer rows
 
     def seconds(self, state: SlamState, history: FrameHistory, depth_time: float) -> float | None:
         """Since when the camera is known to move to the next frame, s; None where that does not matter.

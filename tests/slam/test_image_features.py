@@ -1,5 +1,6 @@
 """Image features: where they are, what they match, which pose they give, and how they are kept."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from spslam.geometry import inverse, rotation_angle
+from spslam.camera import Camera
+from spslam.geometry import inverse, pose_from, rotation_angle
+from spslam.pose_graph import rotation_matrices
 from spslam.slam import feature_store
 from spslam.slam.constraints import Constraints
 from spslam.slam.depth_keyframes import depth_image_intrinsics
@@ -21,7 +24,13 @@ from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery import place_recognition
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
-from spslam.slam.recovery.feature_alignment import MIN_INLIERS, FeatureAlignment, joined_too, ratio_matches
+from spslam.slam.recovery.feature_alignment import (
+    INDEPENDENT_FEATURES,
+    MIN_INLIERS,
+    FeatureAlignment,
+    joined_too,
+    ratio_matches,
+)
 from spslam.slam.recovery.place_recognition import retrieve_by_features
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier
@@ -285,3 +294,28 @@ def test_features_are_expected_for_a_while_after_some_were_asked_for(dataset, fe
         keeper.keep(None, None, None, tracked, None)
         expected.append(keeper.are_expected)
     assert expected == [False, *[True] * EXPECTED_FRAMES, False]
+
+
+def test_equations_of_features_are_those_of_their_errors():
+    """Gradient and matrix by differences of half the squared errors, where all points count alike."""
+    random = np.random.default_rng(4)
+    camera = Camera(fx=300.0, fy=290.0, cx=160.0, cy=120.0, width=320, height=240)
+    alignment = FeatureAlignment(random_features(0, 0), camera)
+    pose = pose_from(rotation_matrices(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 0.5]))
+    local = random.uniform([-1, -1, 1.5], [1, 1, 3], (30, 3))
+    points = local @ pose[:3, :3].T + pose[:3, 3]
+    wide_px = 1e5  # errors are so small beside it that no weight falls
+    positions = random.uniform([0, 0], [320, 240], (30, 2))
+
+    def errors(step):
+        at = pose_from(rotation_matrices(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+        x, y, z = at[:3, :3].T @ (points - at[:3, 3]).T
+        projected = np.stack([300 * x / z + 160, 290 * y / z + 120], 1)
+        return (projected - positions).ravel() * math.sqrt(min(1.0, INDEPENDENT_FEATURES / 30)) / wide_px
+
+    small = 1e-6 * np.eye(6)
+    jacobian = np.stack([(errors(one) - errors(-one)) / 2e-6 for one in small], 1)
+    agreeing, matrix, gradient = alignment._normal_equations(points, positions, pose, wide_px)
+    assert agreeing == 30
+    np.testing.assert_allclose(matrix, jacobian.T @ jacobian, rtol=0, atol=1e-4 * np.abs(matrix).max())
+    np.testing.assert_allclose(gradient, jacobian.T @ errors(np.zeros(6)), rtol=0, atol=1e-4 * np.abs(gradient).max())
