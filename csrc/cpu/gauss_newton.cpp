@@ -88,6 +88,7 @@ template <>
 void track_gauss_newton<Cpu>(Cpu, const SceneView& scene, const std::int32_t* pixels, std::int64_t num_records,
                              const GaussNewtonOptions& options, void* workspace, float* pose, float* stats,
                              float* hessian) {
+  if (options.wanted && *options.wanted != 1.0f) return;
   const PackedMlp<float> net(kGeometryDecoder, scene.geometry_params);
   double terms[kJointTerms], joint[kJointNormals];
   EarlierFrames frames{};

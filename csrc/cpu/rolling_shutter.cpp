@@ -42,7 +42,9 @@ void rectify_lanes(FrameImages images, ReadoutMotion readout, ShutterCamera came
 
 template <>
 void rectify_shutter_records<Cpu>(Cpu device, const std::int32_t* records, std::int64_t num_records,
-                                  const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out) {
+                                  const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out,
+                                  const float* wanted) {
+  if (wanted && *wanted != 1.0f) return;
   const ReadoutMotion readout = readout_motion(motion);
   for_each(device, num_records,
            [&](std::int64_t i) { rectify_record(readout, camera, records + kPixelWords * i, out + kPixelWords * i); });

@@ -153,6 +153,7 @@ __global__ void __launch_bounds__(kThreads, 1)
     track_kernel(const __grid_constant__ SceneView scene, const std::int32_t* pixels, std::int64_t num_records,
                  const __grid_constant__ GaussNewtonOptions options, double* partials, float* pose, float* stats,
                  float* hessian) {
+  if (options.wanted && *options.wanted != 1.0f) return;  // all blocks alike: none waits for another
   // Devices without tensor cores for tf32 compute in float32.
   constexpr Precision kUsed = fused::kArchitecture < fused::kTensorArchitecture ? Precision::kFp32 : kPrecision;
   __shared__ GeometryNetwork<kUsed> network;

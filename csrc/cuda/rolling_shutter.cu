@@ -21,8 +21,10 @@ __device__ __forceinline__ void rectify_image_pixel(const FrameImages& images, c
 
 template <>
 void rectify_shutter_records<Cuda>(Cuda device, const std::int32_t* records, std::int64_t num_records,
-                                   const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out) {
+                                   const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out,
+                                   const float* wanted) {
   for_each(device, num_records, [=] __device__(std::int64_t i) {
+    if (wanted && *wanted != 1.0f) return;
     rectify_record(readout_motion(motion), camera, records + kPixelWords * i, out + kPixelWords * i);
   });
 }

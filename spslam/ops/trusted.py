@@ -8,7 +8,7 @@ refuse what would have a kernel read or write where nothing is. Nothing is cast 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
@@ -24,6 +24,32 @@ if TYPE_CHECKING:
     from spslam.ops.rolling_shutter import ShutterMotion
     from spslam.ops.scene_view import Intrinsics, SceneView
     from spslam.ops.sensor_noise import SensorNoise
+
+
+class MovingFrame(NamedTuple):
+    """What `track_frame` takes of a frame.
+
+    Attributes:
+        records: int32 [P, 3], P >= 1.
+        depth, intensity: uint16 in `unit` m and uint8 [h, w].
+        poses: float32 [2, 7] of the two frames before, the last one second.
+        readout: float32 [1] s.
+        seconds: from the last frame to this one.
+        size: rows and columns of the images that the records are of.
+        image_intrinsics: of `depth` and `intensity`.
+        unit: m.
+    """
+
+    records: torch.Tensor
+    depth: torch.Tensor
+    intensity: torch.Tensor
+    poses: torch.Tensor
+    readout: torch.Tensor
+    seconds: float
+    size: tuple[int, int]
+    image_intrinsics: Intrinsics
+    unit: float
+
 
 _NO_REFERENCE: tuple[list, list] = ([], [])
 _NO_KEYFRAMES: tuple[list, list, list] = ([], [], [])
@@ -83,6 +109,47 @@ def track_gauss_newton(
         *options.arguments(intrinsics),
         *(_NO_REFERENCE if reference is None else reference.arguments()),
         *(_NO_KEYFRAMES if depth_keyframes is None else depth_keyframes.arguments()),
+    )
+
+
+def track_frame(
+    scene: SceneView,
+    frame: MovingFrame,
+    limits: tuple[float, float, float],
+    intrinsics: Intrinsics,
+    options: GaussNewtonOptions,
+    noise: torch.Tensor | None,
+    reference: ReferenceImage | None,
+    depth_keyframes: DepthKeyframes | None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A frame of a moving camera in one call: `predict_frame`, `track_gauss_newton` from that pose, and
+    `rectify_shutter_frame` by the pose found.
+
+    Where that pose has turned from the predicted one by more than `limits` allow, predicted motion has bent the frame:
+    its records are rectified by the pose found, and it is tracked again from there. A frame that is found far from the
+    prediction is not, as it may have to be looked for elsewhere first.
+
+    Args:
+        scene, intrinsics, options, noise, reference, depth_keyframes: as of `track_gauss_newton`, for either pass.
+        frame: as it was read.
+        limits: by how much the pose may differ from the prediction: rad during the time of the readout, more of which
+            bends the frame; m and rad, more of which is far.
+
+    Returns:
+        float32 [95 + 14 iterations], so that the host reads all in one go: the outcome (0 settled, 1 bent and tracked
+        again, 2 far), the predicted pose, the readout that counted (s), and twice the pose, H and the statistics of
+        each iteration: what was found at first, and in the end; int32 [P, 3] the records as the predicted motion
+        rectifies them; int32 [P, 3], uint16 [h, w] and uint8 [h, w] records and images as that of the pose found does.
+    """
+    tensors = frame.records, frame.depth, frame.intensity, frame.poses, frame.readout
+    return torch.ops.spslam.track_frame(
+        *scene.arguments(),
+        [*tensors] if noise is None else [*tensors, noise],
+        *options.arguments(intrinsics),
+        *(_NO_REFERENCE if reference is None else reference.arguments()),
+        *(_NO_KEYFRAMES if depth_keyframes is None else depth_keyframes.arguments()),
+        # The enum MotionScalar in csrc/bindings/track_frame.cpp.
+        [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, *limits],
     )
 
 
@@ -232,6 +299,13 @@ def optimize_map_(
 @torch.library.register_fake("spslam::rectify_shutter_frame")
 def _(records, depth, intensity, *_):
     return torch.empty_like(records), torch.empty_like(depth), torch.empty_like(intensity)
+
+
+@torch.library.register_fake("spslam::track_frame")
+def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *_):
+    records, depth, intensity, poses = frame[:4]
+    outputs = torch.empty_like(records), torch.empty_like(records), torch.empty_like(depth), torch.empty_like(intensity)
+    return poses.new_empty(95 + 14 * integers[1]), *outputs
 
 
 @torch.library.register_fake("spslam::predict_frame")

@@ -61,7 +61,6 @@ class ConstraintSource:
         pixels: FramePixels,
         depth_time: float | None = None,
         color_offset: float = 0.0,
-        shutter: ops.ShutterMotion | None = None,
     ) -> Constraints:
         """The constraints of the next frame.
 
@@ -70,7 +69,6 @@ class ConstraintSource:
             pixels: of the frame.
             depth_time: when its depth image was taken, s; None where that is not known.
             color_offset: from there to its color image, s, as stamps say.
-            shutter: as of `Constraints`.
         """
         from_start = pixels.valid_depth_share < LITTLE_DEPTH_SHARE
         keyframes = history.depth_keyframes(depth_time, color_offset)
@@ -78,7 +76,7 @@ class ConstraintSource:
             keyframes = keyframes._replace(timing=None)
         if keyframes is not None and not self._color:
             keyframes = keyframes._replace(intensities=None, timing=None, exposure=None)
-        return Constraints(history.noise, self._reference(history), keyframes, from_start, shutter)
+        return Constraints(history.noise, self._reference(history), keyframes, from_start)
 
     def _reference(self, history: FrameHistory) -> ops.ReferenceImage | None:
         mapped = history.last_mapped(self._mapping_every) if self._references else None

@@ -22,7 +22,7 @@ from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.interpreter import interpreter_shared
-from spslam.slam.localizer import Localizer
+from spslam.slam.localizer import LocalizedFrame, Localizer
 from spslam.slam.mapper import Mapper, MappingTask
 from spslam.slam.multi_map import MultiMap
 from spslam.slam.pixels import FramePixels
@@ -153,14 +153,10 @@ class FramePipeline:
         features = self.features.of(read)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
-        pixels, constraints, predicted, shutter = read, Constraints(), None, None
+        constraints = Constraints()
         if not begins_map:
-            predicted, shutter, pixels = self._predict(read, frame.depth_time)
-            times = frame.depth_time, frame.offsets.color
-            constraints = self.constraints.gather(self.history, pixels, *times, shutter)
-        tracked = self._track(pixels, predicted, constraints, number, events, features)
-        shutter = None if shutter is None or tracked.lost else shutter._replace(pose=tracked.pose)
-        pixels = read if shutter is None else self._rectifier.frame(read, shutter)
+            constraints = self.constraints.gather(self.history, read, frame.depth_time, frame.offsets.color)
+        tracked, shutter, pixels = self._track(frame, features, constraints, number, events)
         self._store(frame, pixels, constraints, tracked, features, shutter)
         if not begins_map:
             self._tell(on_pose, tracked)
@@ -277,38 +273,32 @@ class FramePipeline:
         events.upload = (frame.pixels.begin, frame.pixels.end)
         return frame.pixels.received()
 
-    def _predict(
-        self, read: FramePixels, depth_time: float
-    ) -> tuple[torch.Tensor, ops.ShutterMotion | None, FramePixels]:
-        """The next pose, how the camera moves to it (None where that does not matter), and the frame as that has it."""
-        state = self.state
-        seconds = self._rectifier.seconds(state, self.history, depth_time) if self._measures_timing else None
-        if seconds is None:
-            return self.tracker.predict(state.frames), None, read
-        shutter, pixels = self._rectifier.predict(read, state, seconds)
-        return shutter.pose, shutter, pixels
-
     def _track(
-        self,
-        pixels: FramePixels,
-        predicted: torch.Tensor | None,
-        constraints: Constraints,
-        number: int,
-        events: FrameEvents,
-        features: FrameFeatures,
-    ) -> TrackedFrame:
-        """Finds the pose; `predicted` is None where there is no map yet."""
-        if predicted is None:
+        self, frame: PreparedFrame, features: FrameFeatures, constraints: Constraints, number: int, events: FrameEvents
+    ) -> LocalizedFrame:
+        """Finds the pose, and rectifies the frame by the motion to it where that matters."""
+        state, read = self.state, features.pixels
+        if not self._has_map:
             first = pose_tensor(self.first_pose, self.device)
-            return TrackedFrame.untracked(first, lost=self._has_too_little_depth(pixels))
+            return LocalizedFrame(TrackedFrame.untracked(first, lost=self._has_too_little_depth(read)), None, read)
         begin = self._record()
-        if self.state.frames.is_anywhere:
-            has_depth = not self._has_too_little_depth(pixels)
-            tracked = self._other_maps.find_camera(pixels, number, self.history.noise, has_depth)
+        if state.frames.is_anywhere:
+            has_depth = not self._has_too_little_depth(read)
+            found = LocalizedFrame(
+                self._other_maps.find_camera(read, number, self.history.noise, has_depth), None, read
+            )
+        elif self._has_too_little_depth(read):
+            found = LocalizedFrame(TrackedFrame.untracked(self.tracker.predict(state.frames), lost=True), None, read)
         else:
-            tracked = self.localize(pixels, predicted, number, self._is_mapping_turn(number), constraints, features)
+            seconds = None
+            if self._measures_timing:
+                seconds = self._rectifier.seconds(state, self.history, frame.depth_time)
+            to_be_mapped = self._is_mapping_turn(number)
+            found = self._localizer.next_frame(
+                state, features, self.history, constraints, seconds, to_be_mapped, self.while_tracking
+            )
         events.tracking = (begin, self._record())
-        return tracked
+        return found
 
     def _store(
         self,

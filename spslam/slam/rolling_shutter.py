@@ -75,6 +75,26 @@ class ShutterRectifier:
         )
         return ops.ShutterMotion(before, predicted, seconds, readout), pixels.having(records=records)
 
+    @property
+    def bent_turn(self) -> float:
+        """As of `Tracker.follow`, rad."""
+        return 2 * BENT_PX / self._image_intrinsics.fy  # a readout takes no longer than a frame
+
+    def moving(self, pixels: FramePixels, state: SlamState, seconds: float) -> ops.trusted.MovingFrame:
+        """A frame as it was read, for `Tracker.follow`; the arguments are those of `predict`."""
+        count = len(state.frames)
+        return ops.trusted.MovingFrame(
+            pixels.records,
+            pixels.depth_image,
+            pixels.intensity_image,
+            state.frames.pose_rows[count - 2 : count],
+            state.noise.readout,
+            seconds,
+            self._size,
+            self._image_intrinsics,
+            self._unit,
+        )
+
     def frame(self, pixels: FramePixels, motion: ops.ShutterMotion) -> FramePixels:
         """The frame with its records and images rectified."""
         records, depth, intensity = ops.trusted.rectify_shutter_frame(
@@ -96,10 +116,8 @@ class ShutterRectifier:
             motion: that motion.
             turn_deg: by how much the camera turned otherwise since the frame before, degrees; NaN bends nothing.
         """
-        turn_px = self._image_intrinsics.fy * math.radians(turn_deg)
-        if not turn_px > 2 * BENT_PX:  # a readout takes no longer than a frame
-            return False
-        return turn_px * abs(float(motion.readout)) > 2 * BENT_PX * motion.seconds
+        turn = math.radians(turn_deg)
+        return turn > self.bent_turn and turn * abs(float(motion.readout)) > self.bent_turn * motion.seconds
 
     def features(self, features: ImageFeatures, motion: ops.ShutterMotion) -> ImageFeatures:
         """Image features of the frame as it was read, rectified; waits for the device."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +14,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.constraints import Constraints
-from spslam.slam.fit import Fit, min_eigenvalue, prediction_error
+from spslam.slam.fit import FAR_CM, FAR_DEG, Fit, min_eigenvalue, prediction_error
 from spslam.slam.frame_table import FrameTable
 from spslam.slam.render_options import render_options
 
@@ -22,6 +23,7 @@ LEAST_DEVIATION_M = 0.003  # of a pixel
 # A plain wall's map moves the camera along it by its own noise, by centimeters a frame, before the brightness of depth
 # keyframes has a say: directions of less information than this, per pixel and m^2, wait for them.
 HELD_INFORMATION = 0.1
+FOLLOWED_HEAD = 9  # numbers of `ops.trusted.track_frame` before what it found: outcome, prediction and readout
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,35 @@ class PoseEstimate:
         return None if self.equations is None else self.equations.hessian / self.equations.variance
 
 
+class FrameOutcome(IntEnum):
+    """What the first pass says of a frame that is followed: FrameOutcome of csrc/include/spslam/track_frame.h."""
+
+    SETTLED = 0  # its pose stands
+    BENT = 1  # the frame was rectified by that, and tracked again
+    FAR = 2  # its pose is far from the prediction: the frame is to be tracked on
+
+
+@dataclass(frozen=True)
+class FollowedFrame:
+    """A frame of a moving camera that was predicted, rectified and tracked in one call.
+
+    Attributes:
+        problem: the frame, as predicted motion rectifies it.
+        motion: that motion.
+        outcome: of the first pass.
+        estimate: by the last pass.
+        first_pose: float32 [7] by the first pass.
+        rectified: records, depth and intensity of the frame as the motion to the estimated pose rectifies them.
+    """
+
+    problem: TrackingProblem
+    motion: ops.ShutterMotion
+    outcome: FrameOutcome
+    estimate: PoseEstimate
+    first_pose: torch.Tensor
+    rectified: list[torch.Tensor]
+
+
 class Tracker:
     """Tracks one frame at a time; holds no state but scratch. Whether a pose is to be trusted is not decided here.
 
@@ -133,11 +164,59 @@ class Tracker:
         if tracking.optimizer == "adam":
             return self._track_adam(problem, iterations)
         found = self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
-        if not found.measured.is_far_from_prediction:
-            return found
+        return self.track_on(problem, found) if found.measured.is_far_from_prediction else found
+
+    def track_on(self, problem: TrackingProblem, found: PoseEstimate) -> PoseEstimate:
+        """Tracks on from a pose far from the prediction, maybe half-way; stays there if that leads off the map."""
         further = self.track_from(problem, found.pose)
-        is_on_map = further.measured.inlier_share >= tracking.min_inlier_share
-        return replace(further if is_on_map else found, iterations=iterations + tracking.iterations)
+        is_on_map = further.measured.inlier_share >= self.config.tracking.min_inlier_share
+        return replace(further if is_on_map else found, iterations=found.iterations + further.iterations)
+
+    def can_follow(self, frames: FrameTable) -> bool:
+        """Whether `follow` tracks the next frame as `track` does: its speed is known, and it is none of the first."""
+        tracking = self.config.tracking
+        return tracking.optimizer == "gauss_newton" and frames.knows_speed and len(frames) > tracking.first_frames
+
+    def follow(
+        self,
+        scene: Scene,
+        frame: ops.trusted.MovingFrame,
+        bent_turn: float,
+        number: int,
+        constraints: Constraints,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> FollowedFrame:
+        """Predicts a frame's pose, rectifies it and tracks it, and again where predicted motion has bent it.
+
+        Args:
+            scene: the map, not changed.
+            frame: as it was read.
+            bent_turn: turn from the prediction during the readout, more of which bends the frame, rad.
+            number: of the frame; keys the random draws.
+            constraints: residual terms in addition to the map's.
+            meanwhile: as of `track`.
+        """
+        tracking = self.config.tracking
+        found, *outputs = ops.trusted.track_frame(
+            scene.view(),
+            frame,
+            (bent_turn, FAR_CM / 100, math.radians(FAR_DEG)),
+            self.intrinsics,
+            self._options(scene, number, tracking.iterations, tracking.kernel_start_m),
+            constraints.noise,
+            constraints.reference,
+            constraints.depth_keyframes_of(tracking.iterations),
+        )
+        if meanwhile is not None:
+            meanwhile()
+        numbers, size = found.tolist(), (found.numel() - FOLLOWED_HEAD) // 2
+        outcome, predicted = FrameOutcome(int(numbers[0])), found[1:8]
+        iterations = tracking.iterations * (2 if outcome == FrameOutcome.BENT else 1)
+        estimate = self._estimate(found[-size:], numbers[-size:], numbers[1:8], iterations)
+        motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, found[8:FOLLOWED_HEAD])
+        constraints = replace(constraints, shutter=motion)
+        problem = TrackingProblem(scene, outputs[0], predicted, number, constraints)
+        return FollowedFrame(problem, motion, outcome, estimate, found[FOLLOWED_HEAD : FOLLOWED_HEAD + 7], outputs[1:])
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
         """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
@@ -174,26 +253,12 @@ class Tracker:
         kernel_start_m: float,
         meanwhile: Callable[[], None] | None = None,
     ) -> PoseEstimate:
-        tracking = self.config.tracking
         found = ops.trusted.track_gauss_newton(
             problem.scene.view(),
             problem.records,
             start,
             self.intrinsics,
-            ops.GaussNewtonOptions(
-                num_pixels=tracking.pixels,
-                iterations=iterations,
-                truncation=problem.scene.settings.truncation_m,
-                kernel_start=kernel_start_m,
-                kernel_end=tracking.kernel_end_m,
-                damping=tracking.damping,
-                seed=self.config.seed,
-                stream=ops.RandomStream.TRACKING_PIXELS,
-                frame=problem.frame,
-                score_kernel=self._score_kernel_m,
-                held_information=HELD_INFORMATION,
-                tf32=self.config.precision == "tf32",
-            ),
+            self._options(problem.scene, problem.frame, iterations, kernel_start_m),
             problem.constraints.noise,
             problem.constraints.reference,
             problem.constraints.depth_keyframes_of(iterations),
@@ -203,11 +268,41 @@ class Tracker:
         # Waits for the device, once: whether the pose is trusted decides what is done next.
         is_predicted = start is problem.predicted
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
-        start_numbers, pose_numbers = numbers[:7], numbers[7:14]
         size = found.numel()
-        mean_square, inlier_share, _, _, mean_robust_weight, _, _ = numbers[size - 7 : size]
-        predicted = start_numbers if is_predicted else numbers[size:]
-        error_cm, error_deg = prediction_error(predicted, pose_numbers)
+        predicted = numbers[:7] if is_predicted else numbers[size:]
+        return self._estimate(found[7:], numbers[7:size], predicted, iterations)
+
+    def _options(self, scene: Scene, number: int, iterations: int, kernel_start_m: float) -> ops.GaussNewtonOptions:
+        tracking = self.config.tracking
+        return ops.GaussNewtonOptions(
+            num_pixels=tracking.pixels,
+            iterations=iterations,
+            truncation=scene.settings.truncation_m,
+            kernel_start=kernel_start_m,
+            kernel_end=tracking.kernel_end_m,
+            damping=tracking.damping,
+            seed=self.config.seed,
+            stream=ops.RandomStream.TRACKING_PIXELS,
+            frame=number,
+            score_kernel=self._score_kernel_m,
+            held_information=HELD_INFORMATION,
+            tf32=self.config.precision == "tf32",
+        )
+
+    def _estimate(
+        self, found: torch.Tensor, numbers: list[float], predicted: list[float], iterations: int
+    ) -> PoseEstimate:
+        """What an op of tracking found: pose, H and the statistics of each iteration.
+
+        Args:
+            found: float32 [43 + 7 iterations].
+            numbers: the same, read.
+            predicted: pose.
+            iterations: that were made.
+        """
+        pose = numbers[:7]
+        mean_square, inlier_share, _, _, mean_robust_weight, _, _ = numbers[-7:]
+        error_cm, error_deg = prediction_error(predicted, pose)
         fit = Fit(
             residual_cm=100 * math.sqrt(max(mean_square, 0.0)),
             inlier_share=inlier_share,
@@ -215,6 +310,7 @@ class Tracker:
             prediction_error_cm=error_cm,
             prediction_error_deg=error_deg,
         )
-        variance = max(mean_square, LEAST_DEVIATION_M**2) * tracking.pixels / INDEPENDENT_PIXELS
-        equations = SurfaceEquations(numbers[14:50], tracking.pixels, variance)
-        return PoseEstimate(found[7:14], iterations, fit, equations, tuple(pose_numbers), found[-2:])
+        pixels = self.config.tracking.pixels
+        variance = max(mean_square, LEAST_DEVIATION_M**2) * pixels / INDEPENDENT_PIXELS
+        equations = SurfaceEquations(numbers[7:43], pixels, variance)
+        return PoseEstimate(found[:7], iterations, fit, equations, tuple(pose), found[-2:])

@@ -87,6 +87,101 @@ def test_what_tracking_finds_is_one_tensor(device):
     assert torch.equal(found.nan_to_num(), parts.nan_to_num())
 
 
+NEVER = 1e9
+
+
+def moving_frame(device, rows=60):
+    """A frame of a moving camera, and what it is tracked by."""
+    call = track(torch.Generator().manual_seed(3), device, rows)
+    _, _, records, images = frames(device)
+    poses = torch.stack([records["motion"].before, records["motion"].pose])
+    frame = ops.trusted.MovingFrame(
+        call["pixels"],
+        images["depth"],
+        images["intensity"],
+        poses,
+        records["motion"].readout + 0.01,
+        records["motion"].seconds,
+        (records["height"], records["width"]),
+        images["intrinsics"],
+        images["unit"],
+    )
+    return frame, call
+
+
+def followed(frame, call, limits):
+    """Outcome, all that is found, and the tensors, by one call."""
+    others = [call.get(name) for name in ("noise", "reference", "depth_keyframes")]
+    found, *tensors = ops.trusted.track_frame(
+        call["scene"], frame, limits, call["intrinsics"], call["options"], *others
+    )
+    return int(found[0]), found[1:], tensors
+
+
+def step_by_step(frame, call, is_bent):
+    """The same by the ops that the call is made of."""
+    others = [call.get(name) for name in ("noise", "reference", "depth_keyframes")]
+
+    def tracked(records, start):
+        return ops.trusted.track_gauss_newton(
+            call["scene"], records, start, call["intrinsics"], call["options"], *others
+        )[7:]
+
+    arguments = frame.poses, 1, frame.readout, frame.seconds, frame.records, call["intrinsics"], frame.size
+    predicted, readout, records = ops.trusted.predict_frame(*arguments)
+    motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, readout)
+    first = found = tracked(records, predicted)
+    if is_bent:
+        bent, height, width = torch.empty_like(frame.records), *frame.size
+        by_first = motion._replace(pose=first[:7])
+        ops.trusted.rectify_shutter_records_(bent, frame.records, by_first, call["intrinsics"], height, width)
+        found = tracked(bent, first[:7].clone())
+    images = ops.trusted.rectify_shutter_frame(
+        frame.records, frame.depth, frame.intensity, motion._replace(pose=found[:7]), call["intrinsics"], frame.size,
+        frame.image_intrinsics, frame.unit,
+    )  # fmt: skip
+    return torch.cat([predicted, readout, first, found]), [records, *images]
+
+
+@pytest.mark.parametrize(
+    ("limits", "outcome"),
+    [((NEVER, NEVER, NEVER), 0), ((0.0, NEVER, NEVER), 1), ((0.0, 0.0, NEVER), 2), ((0.0, NEVER, 0.0), 2)],
+)
+def test_following_a_frame_is_predicting_rectifying_and_tracking_it(device, limits, outcome):
+    frame, call = moving_frame(device)
+    got, numbers, tensors = followed(frame, call, limits)
+    assert got == outcome
+    expected, others = step_by_step(frame, call, is_bent=outcome == 1)
+    assert torch.equal(numbers.nan_to_num(), expected.nan_to_num())
+    for one, other in zip(tensors, others, strict=True):
+        assert one.dtype == other.dtype and torch.equal(one.cpu().float(), other.cpu().float())
+    assert not torch.equal(tensors[0], frame.records) and not torch.equal(tensors[1], tensors[0])
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_limit_counts_from_the_predicted_pose(device, place):
+    frame, call = moving_frame(device)
+    _, numbers, _ = followed(frame, call, (NEVER, NEVER, NEVER))
+    predicted, first = numbers[:7].double(), numbers[8:15].double()
+    turn = 4 * torch.asin(min((first[:4] - predicted[:4]).norm(), (first[:4] + predicted[:4]).norm()) / 2)
+    way = (first[4:] - predicted[4:]).norm()
+    share = abs(float(frame.readout)) / frame.seconds  # of a turn that counts as bent
+    exact = float((turn * min(share, 1), way, turn)[place])
+    assert exact > 0
+    for factor, outcome in ((0.999, 2 if place else 1), (1.001, 0)):
+        limits = [NEVER] * 3
+        limits[place] = factor * exact
+        assert followed(frame, call, tuple(limits))[0] == outcome
+
+
+def test_a_pose_of_nan_stands(device):
+    frame, call = moving_frame(device)
+    poses = frame.poses.clone()
+    poses[0, 4] = torch.nan
+    outcome, numbers, _ = followed(frame._replace(poses=poses), call, (0.0, 0.0, 0.0))
+    assert outcome == 0 and bool(numbers[4].isnan())
+
+
 def raw_calls(device):
     """The ops' own arguments."""
     timed, _, records, images = frames(device)
@@ -102,7 +197,17 @@ def raw_calls(device):
         (torch.ops.spslam.measure_frame_.default, [*measured, *keyframes.arguments()]),
         (torch.ops.spslam.rectify_shutter_frame.default, [*rectified, numbers, *size]),
         (torch.ops.spslam.predict_frame.default, predicted),
+        (torch.ops.spslam.track_frame.default, raw_tracking(device)),
     )
+
+
+def raw_tracking(device):
+    """Those of `track_frame`."""
+    frame, call = moving_frame(device)
+    scene, options = call["scene"].arguments(), call["options"].arguments(call["intrinsics"])
+    tensors = [frame.records, frame.depth, frame.intensity, frame.poses, frame.readout, call["noise"]]
+    numbers = [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, NEVER, NEVER, NEVER]
+    return [*scene, tensors, *options, *call["reference"].arguments(), [], [], [], numbers]
 
 
 def test_opcheck(device):
@@ -130,10 +235,23 @@ def test_opcheck(device):
         (2, 3, lambda records: records[:, :2]),
         (2, 4, lambda numbers: [*numbers[:4], 0.0]),
         (2, 5, lambda height: 1),
+        (3, 3, lambda tensors: tensors[:4]),
+        (3, 3, lambda tensors: [tensors[0][:, :2], *tensors[1:]]),
+        (3, 3, lambda tensors: [tensors[0][:0], *tensors[1:]]),
+        (3, 3, lambda tensors: [tensors[0], tensors[1][0], *tensors[2:]]),
+        (3, 3, lambda tensors: [*tensors[:2], tensors[2][1:], *tensors[3:]]),
+        (3, 3, lambda tensors: [*tensors[:3], tensors[3][:, :6], *tensors[4:]]),
+        (3, 3, lambda tensors: [*tensors[:4], tensors[4][:0], tensors[5]]),
+        (3, 3, lambda tensors: [*tensors[:5], tensors[5][:3]]),
+        (3, 11, lambda numbers: numbers[1:]),
+        (3, 11, lambda numbers: [*numbers[:4], 1, *numbers[5:]]),
+        (3, 11, lambda numbers: [*numbers[:6], 0.0, *numbers[7:]]),
+        (3, 11, lambda numbers: [*numbers[:7], 0.0, *numbers[8:]]),
+        (3, 3, lambda tensors: [*tensors[:3], tensors[3][:1], *tensors[4:]]),
     ],
 )
 def test_the_bindings_refuse_what_would_read_elsewhere(device, place, argument, bad):
     op, call = raw_calls(device)[place]
     call[argument] = bad(call[argument])
-    with pytest.raises(RuntimeError, match="(measure_frame_|rectify_shutter_[a-z_]*|predict_frame): "):
+    with pytest.raises(RuntimeError, match="(measure_frame_|rectify_shutter_[a-z_]*|predict_frame|track_frame): "):
         op(*call)

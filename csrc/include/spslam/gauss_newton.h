@@ -14,6 +14,7 @@ namespace spslam {
 constexpr int kTrackingStatSize = 5;
 // Of tracking: these, and after the step the natural logarithm of the frame's gain and the variance of its steps.
 constexpr int kFrameStatSize = kTrackingStatSize + 2;
+constexpr int kHessianSize = 36;  // of a pose, by rows
 
 // How a camera came to a frame: from the pose in a row of a table, in so many seconds; a negative row: unknown. And by
 // how much later the frame's color was taken than its depth, s, as the stamps of the two say.
@@ -88,6 +89,7 @@ struct GaussNewtonOptions {
   const float* noise;  // [kSensorNoiseSize], the fields of SensorNoise; null weighs all depths alike, no intensities
   ReferenceImage reference;
   DepthKeyframes depth_keyframes;
+  const float* wanted;  // [1], on the device: nothing is done unless it is 1; null: it is
 };
 #undef SPS_DECLARE_FIELD
 

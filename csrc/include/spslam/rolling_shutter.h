@@ -21,10 +21,12 @@ struct ShutterCamera {
   std::int64_t height, width;
 };
 
-// records [num_records, 3] to out, which may be the same.
+// records [num_records, 3] to out, which may be the same. `wanted` [1], on the device: nothing is done unless it is 1;
+// null: it is.
 template <class Device>
 void rectify_shutter_records(Device device, const std::int32_t* records, std::int64_t num_records,
-                             const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out);
+                             const ShutterMotion& motion, const ShutterCamera& camera, std::int32_t* out,
+                             const float* wanted = nullptr);
 
 // Depth (in `unit` m, 0 where unknown) and intensity, both [height, width] of the camera.
 struct FrameImages {

@@ -69,6 +69,18 @@ class Recovery:
             on_host=None if numbers is None else (estimate.pose, numbers),
         )
 
+    def settled(self, estimate: PoseEstimate, history: FrameHistory, to_be_mapped: bool) -> TrackedFrame | None:
+        """What `resolve` finds where the estimate's fit decides; None where more has to be asked.
+
+        Args:
+            estimate: the tracker's result.
+            history: the frames before.
+            to_be_mapped: whether the frame is to be mapped if its pose is trusted.
+        """
+        tracked = self.judge(estimate)
+        is_questioned = self._is_in_doubt(tracked, history) or self._may_have_slid(tracked)
+        return None if is_questioned or (to_be_mapped and _may_be_occluded(tracked)) else tracked
+
     def resolve(
         self,
         problem: TrackingProblem,
@@ -89,13 +101,12 @@ class Recovery:
             features: of the frame as it was read.
         """
         tracked = self.judge(estimate)
-        if history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked):
+        if self._is_in_doubt(tracked, history):
             tracked = self._recover(problem, tracked, pixels, history, self._image(problem, history, features))
         else:
             if self._may_have_slid(tracked):
                 tracked = self._held(problem, tracked, pixels, history, features)
-            is_unchecked = math.isnan(tracked.fit.occluded_share)
-            if to_be_mapped and is_unchecked and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT:
+            if to_be_mapped and _may_be_occluded(tracked):
                 tracked = self._check_occlusion(problem, tracked, pixels, history)
         if not tracked.lost or tracked.consistent_frames:
             return tracked
@@ -117,6 +128,9 @@ class Recovery:
         is_trusted = is_somewhere and probability <= tracking.lost_threshold
         occluded = self._confidence.is_occluded(fit)
         return {"error_probability": probability, "lost": not is_trusted, "occluded": occluded}
+
+    def _is_in_doubt(self, tracked: TrackedFrame, history: FrameHistory) -> bool:
+        return history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked)
 
     def _is_unpredicted(self, history: FrameHistory) -> bool:
         """Whether nothing says how far the camera has moved; a pose that slid from the last one fits a young map."""
@@ -357,6 +371,11 @@ class Recovery:
         if frames >= CONSISTENT_FRAMES:
             return replace(tracked, lost=False, consistent_frames=0)
         return replace(tracked, lost=True, consistent_frames=frames)
+
+
+def _may_be_occluded(tracked: TrackedFrame) -> bool:
+    """Whether that is to be checked before the frame is mapped: it fits badly, and nobody has looked yet."""
+    return math.isnan(tracked.fit.occluded_share) and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT
 
 
 def _is_consistent(fit: Fit) -> bool:
