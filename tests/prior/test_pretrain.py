@@ -161,6 +161,7 @@ def test_validation_is_reproducible():
 
 
 @pytest.mark.slow
+@pytest.mark.sweep
 def test_a_minute_of_training_reduces_the_error(tmp_path):
     provenance = pretrain(tmp_path / "prior.safetensors", PretrainSettings(steps=400))
     mean = provenance["validation"]["mean"]

@@ -186,7 +186,8 @@ def test_any_two_cameras_give_as_good_a_path(color, depth, place, view):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("view", ["depth", pytest.param("color", marks=pytest.mark.sweep)])
+@pytest.mark.sweep
+@pytest.mark.parametrize("view", ["depth", "color"])
 def test_full_sizes_give_as_good_a_path(view):
     color = Lens(wide(1280, 720), "brown", BROWN)
     check("1280x720 Brown, depth 640x480, side by side", color, Lens(wide(640, 480)), extrinsics(), view)
