@@ -1,5 +1,7 @@
 """Further initial poses for tracking, from projective ICP against earlier frames; needs no map."""
 
+from functools import cached_property
+
 import torch
 
 from spslam import ops
@@ -15,24 +17,24 @@ ITERATIONS = 20  # converge from 10 cm and 10 degrees; 15 do not always
 
 
 class IcpAlignment:
-    """Poses of one frame by ICP against earlier ones, from any initial pose.
-
-    Attributes:
-        vertices, normals, intrinsics: the frame's surface maps, see `surface_maps`.
-    """
+    """Poses of one frame by ICP against earlier ones, from any initial pose."""
 
     def __init__(self, pixels: FramePixels, camera: Camera):
-        self._camera = camera
-        self.vertices, self.normals, self.intrinsics = surface_maps(pixels, camera)
+        self._pixels, self._camera = pixels, camera
+
+    @cached_property
+    def maps(self) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:
+        """The frame's `surface_maps`, made where they are first asked for: few doubtful frames need them."""
+        return surface_maps(self._pixels, self._camera)
 
     def pose(self, earlier: EarlierFrame, start: torch.Tensor) -> torch.Tensor:
         """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
         earlier_to_world = pose_matrix(earlier.pose)
         earlier_to_frame = pose_tensor(compose(inverse(pose_matrix(start)), earlier_to_world), start.device)
         points = unpack_points(earlier.records[:POINTS], self._camera)
-        maps = self.vertices, self.normals
+        vertices, normals, intrinsics = self.maps
         earlier_to_frame, _, _ = ops.projective_icp(
-            points, *maps, earlier_to_frame, self.intrinsics, iterations=ITERATIONS
+            points, vertices, normals, earlier_to_frame, intrinsics, iterations=ITERATIONS
         )
         return pose_tensor(compose(earlier_to_world, inverse(pose_matrix(earlier_to_frame))), start.device)
 

@@ -50,10 +50,10 @@ class Verifier:
             history: the frames before.
             pixels: the frame's, to compare its brightness.
         """
-        rows = history.compared_rows()
+        rows, (vertices, _, intrinsics) = history.compared_rows(), alignment.maps
         counts, best = surface_counts(
-            alignment.vertices,
-            alignment.intrinsics,
+            vertices,
+            intrinsics,
             pose,
             history.poses[rows],
             history.depth_thumbnails[rows],
