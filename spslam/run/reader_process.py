@@ -63,7 +63,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._memory, self._wanted = shared
         self._blank, self._uploader, self._kind = blank, uploader, kind
         self._in_use: deque[tuple[int, Upload]] = deque()
-        self._has_started = self._is_locked = False
+        self._has_started = self._has_ended = self._is_locked = False
         # Each frame asks; `Connection.poll` would make another one each time.
         self._poll = select.poll()
         self._poll.register(connection.fileno(), select.POLLIN)
@@ -138,7 +138,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
 
     def is_ready(self) -> bool:
         """Whether the next frame, or what there is instead, is there; the first has to be requested."""
-        return self._has_started and not self._connection.closed and bool(self._poll.poll(0))
+        is_reading = self._has_started and not self._has_ended and not self._connection.closed
+        return is_reading and bool(self._poll.poll(0))
 
     def __next__(self) -> PreparedFrame | DatasetError:
         try:
@@ -148,6 +149,9 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
                 self._process.wait(_EXIT_TIMEOUT_S)
             self.close()
             raise SpslamError(_describe_exit(self._process.returncode)) from None
+        except StopIteration:  # closing takes as long as some ten frames: the run waits for it after the last one
+            self._has_ended = True
+            raise
         except BaseException:
             self.close()
             raise
@@ -165,7 +169,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
             self._uploader.unlock_pages(self._memory)
 
     def _receive(self) -> PreparedFrame | DatasetError:
-        if self._connection.closed:
+        if self._has_ended or self._connection.closed:
             raise StopIteration
         if not self._has_started:
             self._connection.send(None)

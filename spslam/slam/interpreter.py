@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 # s, for which a thread may hold the interpreter while another waits for it. Python's own 5 ms are as long as a frame on
 # a GPU: tracking would wait for them when it comes back from a kernel while the keyframe graph's thread runs.
-INTERPRETER_SHARE_S = 1e-4
+INTERPRETER_SHARE_S = 2e-5
 _HALF_A_STEP_S = 5e-7  # Python cuts intervals to whole microseconds; what it says of one may be less than that
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from spslam.slam.device_events import StreamEvent
+from spslam.slam.device_events import StreamEvent, current_stream
 from spslam.slam.pixels import FramePixels
 
 
@@ -27,7 +27,7 @@ class Upload:
 
     def received(self) -> FramePixels:
         """The pixels, for work submitted to the current stream from now on; does not wait."""
-        stream = torch.cuda.current_stream(self.pixels.buffer.device)
+        stream = current_stream(self.pixels.buffer.device)
         stream.wait_event(self.end.event)
         # Their memory must not be given to another upload while this stream may read it.
         self.pixels.buffer.record_stream(stream)

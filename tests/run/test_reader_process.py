@@ -162,6 +162,9 @@ def test_slots_are_freed_when_their_uploads_are_complete(can_lock, notes):
     for frame in frames:
         want = sample_frame(dataset[frame.index], dataset.camera, config)
         assert torch.equal(frame.pixels.pixels.buffer, want.buffer)
+    assert uploader.notes == ["lock"]  # what takes long is left to the end of the run
+    assert not reader.is_ready() and next(reader, None) is None
+    reader.close()
     assert uploader.notes == notes
 
 
