@@ -6,7 +6,21 @@ namespace spslam::bindings {
 namespace {
 
 // Places in the op's lists of numbers for the motion; spslam/ops/trusted.py fills them.
-enum class MotionScalar { kFx, kFy, kCx, kCy, kHeight, kWidth, kSeconds, kUnit, kBentTurn, kFarWay, kFarTurn, kCount };
+enum class MotionScalar {
+  kFx,
+  kFy,
+  kCx,
+  kCy,
+  kHeight,
+  kWidth,
+  kSeconds,
+  kUnit,
+  kBentTurn,
+  kFarWay,
+  kFarTurn,
+  kAgainIterations,
+  kCount
+};
 enum class FrameTensor { kRecords, kDepth, kIntensity, kPoses, kReadout, kNoise, kCount };
 
 // All that tracking finds, in one tensor, which is read at once: the outcome, the pose predicted, the readout, and what
@@ -44,11 +58,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> track_frame(
       {scene_tensors, scene_scalars, plane_layout, scalars, integers, reference, reference_scalars, depth_keyframes,
        depth_keyframe_scalars, depth_keyframe_integers},
       frame.size() == kTensors ? &tensor(FrameTensor::kNoise) : nullptr);
-  const std::int64_t count = records.size(0), iterations = arguments.options.iterations;
+  const std::int64_t count = records.size(0), iterations = arguments.options.iterations,
+                     again_iterations = moved.as<std::int64_t>(MotionScalar::kAgainIterations);
+  check_count(kName, "again_iterations", again_iterations);
   const float unit = moved.as<float>(MotionScalar::kUnit);
   const FrameTracking call{
       arguments.scene(),
       arguments.options,
+      again_iterations,
       data<std::int32_t>(records),
       count,
       {data<std::uint16_t>(depth), data<std::uint8_t>(intensity), unit},
@@ -60,8 +77,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> track_frame(
       {load_intrinsics(moved), depth.size(0), depth.size(1)},
       {moved[MotionScalar::kBentTurn], moved[MotionScalar::kFarWay], moved[MotionScalar::kFarTurn]}};
   constexpr std::int64_t kHead = 1 + kPoseSize + 1;  // outcome, predicted pose, readout
-  const std::int64_t size = TrackedPose::size(iterations);
-  Tensor found = empty(poses, {kHead + 2 * size}, ScalarType::Float);
+  const std::int64_t first = TrackedPose::size(iterations), again = TrackedPose::size(again_iterations);
+  Tensor found = empty(poses, {kHead + first + again}, ScalarType::Float);
   Tensor predicted = empty(records, {count, 3}, ScalarType::Int), out = empty(records, {count, 3}, ScalarType::Int);
   Tensor out_depth = empty(depth, {depth.size(0), depth.size(1)}, ScalarType::UInt16);
   Tensor out_intensity = empty(depth, {depth.size(0), depth.size(1)}, ScalarType::Byte);
@@ -72,7 +89,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> track_frame(
                        numbers + 1,
                        numbers + 1 + kPoseSize,
                        TrackedPose(numbers + kHead),
-                       TrackedPose(numbers + kHead + size),
+                       TrackedPose(numbers + kHead + first),
                        mutable_data<std::int32_t>(predicted),
                        {mutable_data<std::int32_t>(out), mutable_data<std::uint16_t>(out_depth),
                         mutable_data<std::uint8_t>(out_intensity)}});

@@ -26,6 +26,9 @@ struct TrackFrameLaunch {
     decide(out);
     // Both only of a bent frame.
     GaussNewtonOptions again = call_.options;
+    again.iterations = call_.again_iterations;
+    again.kernel_start = again.kernel_end;
+    again.depth_keyframes.first_iteration = 0;
     again.wanted = out.outcome;
     rectify_shutter_records(device_, call_.records, call_.num_records, motion(out, out.first.pose), call_.camera,
                             unbent_, out.outcome);
@@ -49,14 +52,17 @@ struct TrackFrameLaunch {
     for_each(device_, kPoseSize, [=] SPS_HOST_DEVICE(std::int64_t i) { to[i] = from[i]; });
   }
 
-  // What was found first stands, unless it is tracked again from there.
+  // What was found first stands, its last statistics for all that the second pass would have, unless it is tracked
+  // again from there.
   void decide(const TrackedFrameOutput& out) {
+    constexpr std::int64_t kNumbers = TrackedPose::size(0);
     const PredictionLimits limits = call_.limits;
     const float *predicted = out.predicted, *first = out.first.pose, *readout = out.readout;
+    const float* last = out.first.stats + kFrameStatSize * (call_.options.iterations - 1);
     float *outcome = out.outcome, *found = out.found.pose;
     const float seconds = call_.seconds;
-    for_each(device_, TrackedPose::size(call_.options.iterations), [=] SPS_HOST_DEVICE(std::int64_t i) {
-      found[i] = first[i];
+    for_each(device_, TrackedPose::size(call_.again_iterations), [=] SPS_HOST_DEVICE(std::int64_t i) {
+      found[i] = i < kNumbers ? first[i] : last[(i - kNumbers) % kFrameStatSize];
       if (i == 0) *outcome = static_cast<float>(frame_outcome(limits, predicted, first, *readout, seconds));
     });
   }

@@ -116,6 +116,7 @@ def track_frame(
     scene: SceneView,
     frame: MovingFrame,
     limits: tuple[float, float, float],
+    again_iterations: int,
     intrinsics: Intrinsics,
     options: GaussNewtonOptions,
     noise: torch.Tensor | None,
@@ -130,15 +131,17 @@ def track_frame(
     prediction is not, as it may have to be looked for elsewhere first.
 
     Args:
-        scene, intrinsics, options, noise, reference, depth_keyframes: as of `track_gauss_newton`, for either pass.
+        scene, intrinsics, options, noise, reference, depth_keyframes: as of `track_gauss_newton`, for the first pass.
         frame: as it was read.
         limits: by how much the pose may differ from the prediction: rad during the time of the readout, more of which
             bends the frame; m and rad, more of which is far.
+        again_iterations: A of the second pass, which begins near: with the last kernel, and keyframes from the start.
 
     Returns:
-        float32 [95 + 14 iterations], so that the host reads all in one go: the outcome (0 settled, 1 bent and tracked
-        again, 2 far), the predicted pose, the readout that counted (s), and twice the pose, H and the statistics of
-        each iteration: what was found at first, and in the end; int32 [P, 3] the records as the predicted motion
+        float32 [95 + 7 (iterations + A)], so that the host reads all in one go: the outcome (0 settled, 1 bent and
+        tracked again, 2 far), the predicted pose, the readout that counted (s), and twice the pose, H and the
+        statistics of each iteration: what was found at first, and in the end (the last statistics A times, where
+        nothing was tracked again); int32 [P, 3] the records as the predicted motion
         rectifies them; int32 [P, 3], uint16 [h, w] and uint8 [h, w] records and images as that of the pose found does.
     """
     tensors = frame.records, frame.depth, frame.intensity, frame.poses, frame.readout
@@ -149,7 +152,7 @@ def track_frame(
         *(_NO_REFERENCE if reference is None else reference.arguments()),
         *(_NO_KEYFRAMES if depth_keyframes is None else depth_keyframes.arguments()),
         # The enum MotionScalar in csrc/bindings/track_frame.cpp.
-        [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, *limits],
+        [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, *limits, again_iterations],
     )
 
 
@@ -302,10 +305,10 @@ def _(records, depth, intensity, *_):
 
 
 @torch.library.register_fake("spslam::track_frame")
-def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *_):
+def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *others):
     records, depth, intensity, poses = frame[:4]
     outputs = torch.empty_like(records), torch.empty_like(records), torch.empty_like(depth), torch.empty_like(intensity)
-    return poses.new_empty(95 + 14 * integers[1]), *outputs
+    return poses.new_empty(95 + 7 * int(integers[1] + others[-1][-1])), *outputs
 
 
 @torch.library.register_fake("spslam::predict_frame")

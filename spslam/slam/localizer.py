@@ -143,7 +143,7 @@ class Localizer:
         shutter, read = problem.constraints.shutter, features.pixels
         if shutter is not None and self._rectifier.bends(shutter, estimate.measured.prediction_error_deg):
             problem, pixels = self._rectified(problem, read, shutter._replace(pose=estimate.pose))
-            again = self._tracker.track_from(problem, estimate.pose)
+            again = self._tracker.track_again(problem, estimate.pose)
             estimate = replace(again, iterations=estimate.iterations + again.iterations)
         return self._resolved(problem, pixels, estimate, features, history, to_be_mapped)
 
@@ -165,7 +165,7 @@ class Localizer:
         if not self._rectifier.bends(shutter, _turn_deg(shutter.pose, tracked.pose)):
             return tracked
         problem, pixels = self._rectified(problem, features.pixels, shutter._replace(pose=tracked.pose))
-        estimate = self._tracker.track_from(problem, tracked.pose)
+        estimate = self._tracker.track_again(problem, tracked.pose)
         found = self._recovery.resolve(problem, estimate, pixels, history, to_be_mapped, features)
         return tracked if found.lost else found.after(tracked)
 

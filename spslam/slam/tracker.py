@@ -23,6 +23,9 @@ LEAST_DEVIATION_M = 0.003  # of a pixel
 # A plain wall's map moves the camera along it by its own noise, by centimeters a frame, before the brightness of depth
 # keyframes has a say: directions of less information than this, per pixel and m^2, wait for them.
 HELD_INFORMATION = 0.1
+FOUND_NUMBERS = 43  # of a pose and H
+# Of the second pass over a frame that was bent, by a pixel or so: it begins where the first one ended.
+AGAIN_ITERATIONS = 4
 FOLLOWED_HEAD = 9  # numbers of `ops.trusted.track_frame` before what it found: outcome, prediction and readout
 
 
@@ -201,6 +204,7 @@ class Tracker:
             scene.view(),
             frame,
             (bent_turn, FAR_CM / 100, math.radians(FAR_DEG)),
+            AGAIN_ITERATIONS,
             self.intrinsics,
             self._options(scene, number, tracking.iterations, tracking.kernel_start_m),
             constraints.noise,
@@ -209,9 +213,9 @@ class Tracker:
         )
         if meanwhile is not None:
             meanwhile()
-        numbers, size = found.tolist(), (found.numel() - FOLLOWED_HEAD) // 2
+        numbers, size = found.tolist(), FOUND_NUMBERS + 7 * AGAIN_ITERATIONS
         outcome, predicted = FrameOutcome(int(numbers[0])), found[1:8]
-        iterations = tracking.iterations * (2 if outcome == FrameOutcome.BENT else 1)
+        iterations = tracking.iterations + (AGAIN_ITERATIONS if outcome == FrameOutcome.BENT else 0)
         estimate = self._estimate(found[-size:], numbers[-size:], numbers[1:8], iterations)
         motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, found[8:FOLLOWED_HEAD])
         constraints = replace(constraints, shutter=motion)
@@ -222,6 +226,12 @@ class Tracker:
         """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
         tracking = self.config.tracking
         return self._gauss_newton(problem, start, tracking.iterations, tracking.kernel_start_m)
+
+    def track_again(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
+        """The pose of a frame that was rectified anew, near the pose float32 [7] that this is by."""
+        constraints = replace(problem.constraints, keyframes_from_start=True)
+        kernel_m = self.config.tracking.kernel_end_m
+        return self._gauss_newton(replace(problem, constraints=constraints), start, AGAIN_ITERATIONS, kernel_m)
 
     def _track_adam(self, problem: TrackingProblem, iterations: int) -> PoseEstimate:
         tracking = self.config.tracking
@@ -312,5 +322,5 @@ class Tracker:
         )
         pixels = self.config.tracking.pixels
         variance = max(mean_square, LEAST_DEVIATION_M**2) * pixels / INDEPENDENT_PIXELS
-        equations = SurfaceEquations(numbers[7:43], pixels, variance)
+        equations = SurfaceEquations(numbers[7:FOUND_NUMBERS], pixels, variance)
         return PoseEstimate(found[:7], iterations, fit, equations, tuple(pose), found[-2:])

@@ -1,5 +1,7 @@
 """Ops of a frame that are several public ones in one call: the same bits as those; what the bindings refuse."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -88,12 +90,14 @@ def test_what_tracking_finds_is_one_tensor(device):
 
 
 NEVER = 1e9
+AGAIN = 3  # iterations of the second pass
 
 
 def moving_frame(device, rows=60):
     """A frame of a moving camera, and what it is tracked by."""
     call = track(torch.Generator().manual_seed(3), device, rows)
-    _, _, records, images = frames(device)
+    _, plain, records, images = frames(device)
+    call["depth_keyframes"] = plain["depth_keyframes"]._replace(first_iteration=1)
     poses = torch.stack([records["motion"].before, records["motion"].pose])
     frame = ops.trusted.MovingFrame(
         call["pixels"],
@@ -113,29 +117,29 @@ def followed(frame, call, limits):
     """Outcome, all that is found, and the tensors, by one call."""
     others = [call.get(name) for name in ("noise", "reference", "depth_keyframes")]
     found, *tensors = ops.trusted.track_frame(
-        call["scene"], frame, limits, call["intrinsics"], call["options"], *others
+        call["scene"], frame, limits, AGAIN, call["intrinsics"], call["options"], *others
     )
     return int(found[0]), found[1:], tensors
 
 
 def step_by_step(frame, call, is_bent):
     """The same by the ops that the call is made of."""
-    others = [call.get(name) for name in ("noise", "reference", "depth_keyframes")]
 
-    def tracked(records, start):
-        return ops.trusted.track_gauss_newton(
-            call["scene"], records, start, call["intrinsics"], call["options"], *others
-        )[7:]
+    def tracked(records, start, options, keyframes):
+        arguments = call["scene"], records, start, call["intrinsics"], options, call["noise"], call["reference"]
+        return ops.trusted.track_gauss_newton(*arguments, keyframes)[7:]
 
     arguments = frame.poses, 1, frame.readout, frame.seconds, frame.records, call["intrinsics"], frame.size
     predicted, readout, records = ops.trusted.predict_frame(*arguments)
     motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, readout)
-    first = found = tracked(records, predicted)
+    first = tracked(records, predicted, call["options"], call["depth_keyframes"])
+    found = torch.cat([first[:43], first[-7:].repeat(AGAIN)])
     if is_bent:
         bent, height, width = torch.empty_like(frame.records), *frame.size
         by_first = motion._replace(pose=first[:7])
         ops.trusted.rectify_shutter_records_(bent, frame.records, by_first, call["intrinsics"], height, width)
-        found = tracked(bent, first[:7].clone())
+        near = replace(call["options"], iterations=AGAIN, kernel_start=call["options"].kernel_end)
+        found = tracked(bent, first[:7].clone(), near, call["depth_keyframes"]._replace(first_iteration=0))
     images = ops.trusted.rectify_shutter_frame(
         frame.records, frame.depth, frame.intensity, motion._replace(pose=found[:7]), call["intrinsics"], frame.size,
         frame.image_intrinsics, frame.unit,
@@ -206,8 +210,8 @@ def raw_tracking(device):
     frame, call = moving_frame(device)
     scene, options = call["scene"].arguments(), call["options"].arguments(call["intrinsics"])
     tensors = [frame.records, frame.depth, frame.intensity, frame.poses, frame.readout, call["noise"]]
-    numbers = [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, NEVER, NEVER, NEVER]
-    return [*scene, tensors, *options, *call["reference"].arguments(), [], [], [], numbers]
+    numbers = [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, NEVER, NEVER, NEVER, AGAIN]
+    return [*scene, tensors, *options, *call["reference"].arguments(), *call["depth_keyframes"].arguments(), numbers]
 
 
 def test_opcheck(device):

@@ -41,10 +41,10 @@ class Parts:
         self.tracked.append(problem.records)
         return PoseEstimate(FIRST, 8, Fit(prediction_error_deg=self.error_deg), None)
 
-    def track_from(self, problem, start):
+    def track_again(self, problem, start):
         assert problem.records is problem.constraints.shutter.pose is start
         self.tracked.append(problem.records)
-        return PoseEstimate(AGAIN, 8, Fit(prediction_error_deg=self.error_deg), None)
+        return PoseEstimate(AGAIN, 4, Fit(prediction_error_deg=self.error_deg), None)
 
     def resolve(self, problem, estimate, pixels, history, to_be_mapped, features):
         assert pixels.records is problem.records
@@ -79,7 +79,7 @@ def test_a_frame_that_turned_otherwise_is_rectified_by_what_was_found_and_decide
     parts = Parts(2.0, None)
     found = localized(parts)
     assert parts.tracked[0] is STILL and parts.tracked[1] is FIRST
-    assert found.pose is AGAIN and found.iterations == 16
+    assert found.pose is AGAIN and found.iterations == 12
     assert len(parts.resolved) == 1
 
 
@@ -90,7 +90,7 @@ def test_a_frame_recovered_elsewhere_is_tracked_and_decided_on_again():
     parts = Parts(0.5, RECOVERED, None)
     found = localized(parts)
     assert parts.tracked[1] is TURNED
-    assert found.pose is AGAIN and found.iterations == 24 + 8
+    assert found.pose is AGAIN and found.iterations == 24 + 4
     assert found.recovered and found.features is RECOVERED.features
     assert parts.resolved[0][1] is parts.resolved[1][1]  # image features are extracted once
 

@@ -22,8 +22,9 @@ struct PredictionLimits {
 
 struct FrameTracking {
   SceneView scene;
-  GaussNewtonOptions options;   // of either pass
-  const std::int32_t* records;  // [num_records, 3] as they were read
+  GaussNewtonOptions options;     // of the first pass
+  std::int64_t again_iterations;  // of the second one, which begins near: with kernel_end, and keyframes from the start
+  const std::int32_t* records;    // [num_records, 3] as they were read
   std::int64_t num_records;
   FrameImages images;          // as they were read
   const float *before, *last;  // [7] poses of the two frames before
@@ -35,12 +36,14 @@ struct FrameTracking {
 
 // Parts of what tracking finds.
 struct TrackedPose {
-  float *pose, *hessian, *stats;  // [7], [36], [iterations, kFrameStatSize]
+  float *pose, *hessian, *stats;  // [7], [36], [iterations, kFrameStatSize]: of the pass that found it
 
   // In one piece, in this order.
   explicit TrackedPose(float* numbers) : pose(numbers), hessian(pose + kPoseSize), stats(hessian + kHessianSize) {}
 
-  static std::int64_t size(std::int64_t iterations) { return kPoseSize + kHessianSize + iterations * kFrameStatSize; }
+  static constexpr std::int64_t size(std::int64_t iterations) {
+    return kPoseSize + kHessianSize + iterations * kFrameStatSize;
+  }
 };
 
 struct TrackedFrameOutput {
