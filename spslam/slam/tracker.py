@@ -25,7 +25,7 @@ LEAST_DEVIATION_M = 0.003  # of a pixel
 HELD_INFORMATION = 0.1
 FOUND_NUMBERS = 43  # of a pose and H
 # Of the second pass over a frame that was bent, by a pixel or so: it begins where the first one ended.
-AGAIN_ITERATIONS = 4
+AGAIN_ITERATIONS = 3
 FOLLOWED_HEAD = 9  # numbers of `ops.trusted.track_frame` before what it found: outcome, prediction and readout
 
 
