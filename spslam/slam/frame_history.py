@@ -168,9 +168,9 @@ class FrameHistory:
     def features(self, row: int) -> ImageFeatures | None:
         """Image features of the frame in a row, if they are kept or its images still are; may wait for the device."""
         store, newest = self._state.features, self._state.newest
-        if row in store.frames:
-            return store[store.frames.index(row)]
-        return newest.features() if newest is not None and row == newest.number else None
+        if newest is not None and row == newest.number:
+            return newest.features()  # all of them, with positions
+        return store[store.frames.index(row)] if row in store.frames else None
 
     def feature_rows(self) -> list[int]:
         """Rows of the frames with a trusted pose whose image features are kept, ascending."""

@@ -18,6 +18,10 @@ DESCRIPTOR_BYTES = 32
 COUNT = 1000  # features of a frame at most
 DETECTED = 2000  # of which the strongest of each cell are taken first, so that they cover the image
 CELL_COLUMNS = 20  # of the grid over the image
+RANGE_COLUMNS = 160  # of the image that the range of depth is looked for in
+FARTHEST = 0.98  # quantile of known depth that is taken for its range
+HOLE_SHARE = 1 / 24  # of the image's width: features nearer to known depth may be on a hole's rim
+FAR_SHARE = 0.6  # of the range, where the rim lies
 EDGE_PX = 16  # without keypoints at the image's edge; half a patch, as OpenCV's 31 px leave little of a small image
 FAST_THRESHOLD = 7  # gray levels; ORB-SLAM's lower one: plain walls have faint corners too
 
@@ -30,11 +34,14 @@ class ImageFeatures:
         descriptors: uint8 [N, 32], compared by Hamming distance.
         positions: float32 [N, 2] in px of the intensity image.
         points: float32 [N, 3] surface points in camera axes, m; 0 where the depth is unknown.
+        beyond_m: float32 [N], the range of depth beyond which a feature lies, m; 0 where its depth is known, or may be
+            a hole's. None where that was not found out.
     """
 
     descriptors: np.ndarray
     positions: np.ndarray
     points: np.ndarray
+    beyond_m: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -102,7 +109,10 @@ def features_of_images(intensity: np.ndarray, depth: np.ndarray, camera: Camera,
     positions = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     response = np.fromiter((keypoint.response for keypoint in keypoints), np.float32, len(keypoints))
     order = _spread(positions, response, intensity.shape[1])[:COUNT]
-    return ImageFeatures(descriptors[order], positions[order], _points(positions[order], depth, camera, max_depth_m))
+    positions = positions[order]
+    points = _points(positions, depth, camera, max_depth_m)
+    beyond = np.where(points[:, 2] > 0, 0, _beyond_m(positions, depth, max_depth_m))
+    return ImageFeatures(descriptors[order], positions, points, beyond.astype(np.float32))
 
 
 def _spread(positions: np.ndarray, response: np.ndarray, columns: int) -> np.ndarray:
@@ -113,6 +123,24 @@ def _spread(positions: np.ndarray, response: np.ndarray, columns: int) -> np.nda
     _, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
     rank = np.arange(len(order)) - np.repeat(first, counts)
     return order[np.lexsort((-response[order], rank))]
+
+
+def _beyond_m(positions: np.ndarray, depth: np.ndarray, max_depth_m: float) -> np.ndarray:
+    """The range of depth in an image, m, at positions [N, 2] well inside an area without depth whose nearest rim is
+    about as far as anything; 0 elsewhere: what is too near, and holes on surfaces and at edges, have nearer rims."""
+    step = max(depth.shape[1] // RANGE_COLUMNS, 1)
+    coarse = depth[::step, ::step]
+    known = coarse > 0
+    if known.all() or not known.any():
+        return np.zeros(len(positions))
+    farthest = float(np.quantile(coarse[known], FARTHEST))
+    unknown = (~known).astype(np.uint8)
+    distance, rims = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    depth_of_rim = np.zeros(int(rims.max()) + 1)
+    depth_of_rim[rims[known]] = coarse[known]
+    is_beyond = (distance > HOLE_SHARE * coarse.shape[1]) & (depth_of_rim[rims] > FAR_SHARE * farthest)
+    column, row = np.minimum((positions / step).astype(np.int64), (coarse.shape[1] - 1, coarse.shape[0] - 1)).T
+    return np.where(is_beyond[row, column], farthest * depth_unit(max_depth_m), 0)
 
 
 def _points(positions: np.ndarray, depth: np.ndarray, camera: Camera, max_depth_m: float) -> np.ndarray:

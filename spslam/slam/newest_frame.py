@@ -60,12 +60,12 @@ class NewestFrame:
             write_rows(copies, [self._poses, self._poses], [0, 1], [shutter.before, shutter.pose])
 
     def features(self) -> ImageFeatures:
-        """The frame's, rectified, those of which the depth is known; waits for the device."""
+        """The frame's, rectified, those without depth too; waits for the device."""
         features = self._read.extracted
         if self._seconds > 0:
             motion = ops.ShutterMotion(self._poses[0], self._poses[1], self._seconds, self._readout)
             features = self._rectifier.features(features, motion)
-        return features.with_depth()
+        return features
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All that a checkpoint needs."""

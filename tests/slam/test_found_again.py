@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from spslam.slam.fit import Fit
+from spslam.slam.recovery.doubtful_frame import preferred_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
-from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery, _by_features
+from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import Tracker
 from tests.system.sequences import Recorded, settings
@@ -86,7 +87,7 @@ def with_features(found, inliers, share=1.0, lost=False, weight=CERTAIN.mean_rob
 )
 def test_surface_and_image_features_decide_between_trusted_poses(other, times, decides):
     likeliest = with_features(0.05, 100)
-    assert _by_features(likeliest, [likeliest, other], times) is (other if decides else likeliest)
+    assert preferred_by_features(likeliest, [likeliest, other], times) is (other if decides else likeliest)
 
 
 @pytest.mark.parametrize(
@@ -120,4 +121,4 @@ def test_of_results_that_are_one_pose_that_with_most_agreement_stands_for_all(re
 
 def test_few_image_features_decide_nothing():
     likeliest, other = with_features(0.05, 20), with_features(0.1, 50)
-    assert _by_features(likeliest, [likeliest, other], 1.2) is likeliest
+    assert preferred_by_features(likeliest, [likeliest, other], 1.2) is likeliest

@@ -1,6 +1,5 @@
 """Image features: where they are, what they match, which pose they give, and how they are kept."""
 
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,8 +9,7 @@ import pytest
 import torch
 
 from spslam.camera import Camera
-from spslam.geometry import inverse, pose_from, rotation_angle
-from spslam.pose_graph import rotation_matrices
+from spslam.geometry import inverse, rotation_angle
 from spslam.slam import feature_store
 from spslam.slam.constraints import Constraints
 from spslam.slam.depth_keyframes import depth_image_intrinsics
@@ -25,7 +23,6 @@ from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery import place_recognition
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
 from spslam.slam.recovery.feature_alignment import (
-    INDEPENDENT_FEATURES,
     MIN_INLIERS,
     FeatureAlignment,
     joined_too,
@@ -296,26 +293,37 @@ def test_features_are_expected_for_a_while_after_some_were_asked_for(dataset, fe
     assert expected == [False, *[True] * EXPECTED_FRAMES, False]
 
 
-def test_equations_of_features_are_those_of_their_errors():
-    """Gradient and matrix by differences of half the squared errors, where all points count alike."""
-    random = np.random.default_rng(4)
-    camera = Camera(fx=300.0, fy=290.0, cx=160.0, cy=120.0, width=320, height=240)
-    alignment = FeatureAlignment(random_features(0, 0), camera)
-    pose = pose_from(rotation_matrices(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 0.5]))
-    local = random.uniform([-1, -1, 1.5], [1, 1, 3], (30, 3))
-    points = local @ pose[:3, :3].T + pose[:3, 3]
-    wide_px = 1e5  # errors are so small beside it that no weight falls
-    positions = random.uniform([0, 0], [320, 240], (30, 2))
+def blocks(depth):
+    """Features of random blocks before a depth image uint16 [120, 160], 10 m being 65535."""
+    intensity = np.kron(np.random.default_rng(3).integers(0, 255, (15, 20), np.uint8), np.ones((8, 8), np.uint8))
+    camera = Camera(fx=150.0, fy=150.0, cx=79.5, cy=59.5, width=160, height=120)
+    return features_of_images(intensity, depth, camera, 10.0)
 
-    def errors(step):
-        at = pose_from(rotation_matrices(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
-        x, y, z = at[:3, :3].T @ (points - at[:3, 3]).T
-        projected = np.stack([300 * x / z + 160, 290 * y / z + 120], 1)
-        return (projected - positions).ravel() * math.sqrt(min(1.0, INDEPENDENT_FEATURES / 30)) / wide_px
 
-    small = 1e-6 * np.eye(6)
-    jacobian = np.stack([(errors(one) - errors(-one)) / 2e-6 for one in small], 1)
-    agreeing, matrix, gradient = alignment._normal_equations(points, positions, pose, wide_px)
-    assert agreeing == 30
-    np.testing.assert_allclose(matrix, jacobian.T @ jacobian, rtol=0, atol=1e-4 * np.abs(matrix).max())
-    np.testing.assert_allclose(gradient, jacobian.T @ errors(np.zeros(6)), rtol=0, atol=1e-4 * np.abs(gradient).max())
+def test_what_has_no_depth_behind_what_is_farthest_is_beyond_the_range():
+    """On a floor that ends at 4 m, or where nothing is known around."""
+    depth = np.zeros((120, 160), np.uint16)
+    depth[70:] = np.linspace(4.0, 1.0, 50)[:, None] / 10 * 65535
+    found = blocks(depth)
+    rows = found.positions[:, 1]
+    assert (found.points[:, 2] > 0)[rows > 71].all()
+    assert not found.beyond_m[rows > 64].any()  # next to it
+    assert (np.abs(found.beyond_m[rows < 60] - 4.0) < 0.1).all() and (rows < 60).sum() > 20
+    assert found.with_depth().beyond_m is None
+
+
+@pytest.mark.parametrize("hole", [slice(40, 46), slice(20, 100)])
+def test_holes_are_not_beyond_the_range(hole):
+    """Small ones anywhere; large ones on what is near beside something far."""
+    depth = np.full((120, 160), 0.1 * 65535, np.uint16)
+    depth[:, 140:] = 0.5 * 65535
+    depth[hole, 30:110] = 0
+    found = blocks(depth)
+    column, row = found.positions.T
+    inside = (column > 31) & (column < 109) & (row > hole.start + 1) & (row < hole.stop - 2)
+    assert inside.sum() > 2 and not found.points[inside, 2].any()
+    assert not found.beyond_m.any()
+
+
+def test_an_image_without_depth_has_no_range():
+    assert not blocks(np.zeros((120, 160), np.uint16)).beyond_m.any()

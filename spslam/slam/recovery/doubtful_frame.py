@@ -11,6 +11,7 @@ from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches
 from spslam.slam.recovery.icp_alignment import IcpAlignment
+from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import TrackingProblem
 
 REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones features say where colors are, not depth
@@ -36,7 +37,8 @@ class DoubtfulFrame:
         alignment: by ICP.
         image: by image features; None where these are not used.
         matches: of the image's features with those of earlier frames.
-        late_px: by how much its colors may be off where it moves, see `with_speed`.
+        late_px: by how much its colors may be off where it moves, see `compared`.
+        near: all matches with the last frame and with the stored ones before it.
     """
 
     problem: TrackingProblem
@@ -46,6 +48,12 @@ class DoubtfulFrame:
     image: FeatureAlignment | None = None
     matches: tuple[FeatureMatches, ...] = ()
     late_px: float = 0.0
+    near: tuple[FeatureMatches, ...] = ()
+
+    def compared(self, row: int, anchors: Sequence[int]) -> "DoubtfulFrame":
+        """The frame with its matches with the last frame, in a row, and with stored ones; its speed by the former."""
+        last = self.matched([row])
+        return replace(self.with_speed(row, last), near=(*last, *self.matched(anchors)))
 
     def matched(self, rows: Sequence[int]) -> list[FeatureMatches]:
         """Matches with the features of the earlier frames in rows that have some."""
@@ -94,3 +102,17 @@ class DoubtfulFrame:
         """Whether colors are where depth is, as far as was measured: neither late nor of another lens."""
         noise = self.problem.constraints.noise
         return noise is None or float(noise[3]) <= REGISTERED_PX**2
+
+
+def preferred_by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: float = 1.0) -> TrackedFrame:
+    """The likeliest result, or a trusted one with which surface and image features agree that many times more.
+
+    On a young map, or far away, one that has slid along a wall fits as well; one that stopped half-way may be nearer to
+    the prediction. So many more features than agree by chance: in a plain corridor as many agree 14 cm farther on.
+    """
+    known = [other for other in others if not other.lost and not math.isnan(other.fit.feature_share)]
+    seen = [other for other in known if other.fit.feature_inliers >= MIN_DECIDING]
+    best = max(seen, key=lambda other: other.agreement, default=found)
+    count = found.fit.feature_inliers
+    by_chance = 1 + 1 / math.sqrt(count) if count > 0 else 1.0
+    return best if best.agreement > max(times, by_chance) * found.agreement else found

@@ -21,6 +21,7 @@ from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.poses import pose_matrix, pose_tensor
+from spslam.slam.recovery.feature_equations import SeenRays, point_equations, ray_equations
 
 MAX_RATIO = 0.8  # of the distances to the best and to the second-best match
 MAX_ERROR_DEG = 0.33  # of a reprojected point, as seen from the camera: 3 px of a Kinect's 640
@@ -30,9 +31,6 @@ RANSAC_ITERATIONS = 500
 RANSAC_CONFIDENCE = 0.999
 HELD_ITERATIONS = 6  # at most; none after one that moved the pose by less than SMALL_STEP
 SMALL_STEP = 1e-5  # m and rad, a hundredth of what either matters
-INDEPENDENT_FEATURES = 50  # as many a frame's are worth: those of one earlier frame are off by the same
-WIDE = 3.0  # times the error of an inlier, the width of the robust kernel
-MIN_DEPTH_M = 0.05
 COMPARED = 250  # of the strongest features, to find out which of many frames look alike
 MIN_ALIKE = 12  # matches of these
 
@@ -46,12 +44,14 @@ class FeatureMatches:
         positions: float64 [M, 2] in px of the intensity image.
         agreeing: how many of them agree with the pose that they give.
         motion_px: by how much they moved in the image since the earlier frame, their median; 0 without any.
+        rays: what was matched beyond the range of depth; None where that is not kept of the earlier frame.
     """
 
     points: np.ndarray
     positions: np.ndarray
     agreeing: int = 0
     motion_px: float = 0.0
+    rays: SeenRays | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -99,10 +99,18 @@ class FeatureAlignment:
             one.astype(np.float64) for one in (earlier.points[pairs[:, 1]], self.features.positions[pairs[:, 0]])
         )
         known = local[:, 2] > 0
-        before = (local[known] @ self._matrix.T)[:, :2] / local[known, 2:]
-        moved = np.linalg.norm(positions[known] - before, axis=1)
+        rays = None
+        if earlier.beyond_m is not None:
+            beyond_m = earlier.beyond_m[pairs[:, 1]]
+            is_far = beyond_m > 0
+            before = earlier.positions[pairs[is_far, 1]].astype(np.float64)
+            directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ np.linalg.inv(self._matrix).T
+            rays = SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions[is_far], beyond_m[is_far])
+        local, positions = local[known], positions[known]
+        before = (local @ self._matrix.T)[:, :2] / local[:, 2:]
+        moved = np.linalg.norm(positions - before, axis=1)
         motion_px = float(np.median(moved)) if len(moved) else 0.0
-        return FeatureMatches(local @ to_world[:3, :3].T + to_world[:3, 3], positions, motion_px=motion_px)
+        return FeatureMatches(local @ to_world[:3, :3].T + to_world[:3, 3], positions, 0, motion_px, rays)
 
     def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
@@ -135,7 +143,8 @@ class FeatureAlignment:
     ) -> torch.Tensor | None:
         """The pose that surface and image features agree on best; None where fewer than `MIN_INLIERS` agree.
 
-        Gauss-Newton on reprojection errors with Geman-McClure's weights, beside the equations of surface.
+        Gauss-Newton on reprojection errors with Geman-McClure's weights, beside the equations of surface. What was seen
+        beyond the range of depth takes part too: it tells how the camera has turned.
 
         Args:
             pose: float32 [7], where surface has put the camera.
@@ -145,13 +154,18 @@ class FeatureAlignment:
         """
         points = np.concatenate([np.zeros((0, 3)), *(one.points for one in matches)])
         positions = np.concatenate([np.zeros((0, 2)), *(one.positions for one in matches)])
+        rays = [one.rays for one in matches if one.rays is not None and len(one.rays)]
         at = before = pose_matrix(pose)
         error_px = max(self.max_error_px, late_px)
         for _ in range(HELD_ITERATIONS):
             lever = 1.0 if self._motion is None else self._motion.lever(at)
-            agreeing, features, toward = self._normal_equations(points, positions, self._color_pose(at), error_px)
+            color_pose = self._color_pose(at)
+            agreeing, features, toward = point_equations(self._matrix, points, positions, color_pose, error_px)
             if agreeing < MIN_INLIERS:
                 return None
+            for seen in rays:
+                _, by_rays, toward_rays = ray_equations(self._matrix, seen, color_pose, error_px, agreeing)
+                features, toward = features + by_rays, toward + toward_rays
             change = np.r_[at[:3, 3] - before[:3, 3], rotation_vectors(at[:3, :3] @ before[:3, :3].T)]
             normal = information + lever**2 * features
             step = -np.linalg.solve(normal + np.eye(6), information @ change + lever * toward)
@@ -159,31 +173,6 @@ class FeatureAlignment:
             if np.abs(step).max() < SMALL_STEP:
                 break
         return pose_tensor(at, pose.device)
-
-    def _normal_equations(
-        self, points: np.ndarray, positions: np.ndarray, pose: np.ndarray, error_px: float
-    ) -> tuple[int, np.ndarray, np.ndarray]:
-        """How many points agree with a pose, and what all want: matrix [6, 6] and gradient [6] of a step of the pose.
-
-        In camera axes, with a = x/z and b = y/z, a point's derivatives by a step (m, rad) are
-        f_x (-1/z, 0, a/z, ab, -(1 + a^2), b) and f_y (0, -1/z, b/z, 1 + b^2, -ab, -a).
-        """
-        local = pose[:3, :3].T @ (points - pose[:3, 3]).T
-        front = local[2] > MIN_DEPTH_M
-        if not front.all():
-            local, positions = local[:, front], positions[front]
-        (a, b), nearness, (fx, fy) = local[:2] / local[2], 1 / local[2], np.diag(self._matrix)[:2]
-        residuals = self._matrix[:2, :2] @ np.stack([a, b]) + self._matrix[:2, 2:] - positions.T
-        ratio = (residuals**2).sum(0) / error_px**2
-        agreeing = int((ratio < 1).sum())
-        share = min(1.0, INDEPENDENT_FEATURES / max(agreeing, 1)) / error_px**2
-        root = math.sqrt(share) / (1 + ratio / WIDE**2)  # of Geman-McClure's weight
-        zero, ab = np.zeros_like(a), a * b
-        rows = ((-nearness, zero, a * nearness, ab, -(1 + a**2), b), (zero, -nearness, b * nearness, 1 + b**2, -ab, -a))
-        jacobians = np.concatenate([focal * root * np.stack(row) for focal, row in zip((fx, fy), rows, strict=True)], 1)
-        to_world = np.kron(np.eye(2), pose[:3, :3])
-        matrix, gradient = jacobians @ jacobians.T, jacobians @ (root * residuals).ravel()
-        return agreeing, to_world @ matrix @ to_world.T, to_world @ gradient
 
     def _color_pose(self, pose: np.ndarray) -> np.ndarray:
         return pose if self._motion is None else self._motion.color_pose(pose)

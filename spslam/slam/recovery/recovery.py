@@ -13,7 +13,7 @@ from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
-from spslam.slam.recovery.doubtful_frame import MIN_DECIDING, DoubtfulFrame
+from spslam.slam.recovery.doubtful_frame import MIN_DECIDING, DoubtfulFrame, preferred_by_features
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches, joined_too
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
@@ -164,21 +164,29 @@ class Recovery:
         if row is None or image is None or tracked.information is None:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
-        matches = frame.matched([row])
-        frame = frame.with_speed(row, matches)
-        matches += frame.matched(self._anchors(history, row))
-        pose = image.held(tracked.pose, tracked.information, matches, frame.late_px)
-        if pose is None and sum(map(len, matches)) >= MIN_DECIDING:
-            return self._recover(problem, tracked, pixels, history, image)  # it has slid too far to be held
-        if pose is None:
+        held, has_matches = self._hold(frame.compared(row, self._anchors(history, row)), tracked)
+        if held is not None:
+            return held
+        if not has_matches:
             return replace(tracked, features=image.read)
-        estimate = self._tracker.measure(problem, pose)
+        return self._recover(problem, tracked, pixels, history, image)  # it has slid too far to be held
+
+    def _hold(self, frame: DoubtfulFrame, tracked: TrackedFrame) -> tuple[TrackedFrame | None, bool]:
+        """The frame at the pose that surface and image features agree on; None where they don't, and whether there are
+        enough matches with the frames near it to say so."""
+        image = frame.image
+        if image is None or tracked.information is None:
+            return None, False
+        matches = frame.near
+        pose = image.held(tracked.pose, tracked.information, matches, frame.late_px)
+        if pose is None:
+            return None, sum(map(len, matches)) >= MIN_DECIDING
+        estimate = self._tracker.measure(frame.problem, pose)
         frame = replace(frame, matches=tuple(image.counted(one, pose) for one in matches))
         held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.read)
         held = self._judged(held)
-        if held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted:
-            return held
-        return self._recover(problem, tracked, pixels, history, image)
+        fits = held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted
+        return held if fits else None, True
 
     def _check_occlusion(
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
@@ -227,6 +235,11 @@ class Recovery:
                 found = self._likeliest(frame, candidates, seen=seen)
         if found is None or found.lost:
             found = self._relocalize(frame, candidates)
+        elif self._may_have_slid(found):
+            # Tracked on from where features had put it, it may have slid along what surface leaves free.
+            held, _ = self._hold(frame, found)
+            held = None if held is None else self._verify(frame, held)
+            found = found if held is None or held.lost else held
         iterations += sum(candidate.iterations for candidate in candidates)
         return replace(found, iterations=iterations, features=frame.image.read if frame.image else None)
 
@@ -253,9 +266,8 @@ class Recovery:
         if row is None:
             return frame, []
         last = history.frame(row)
-        matches = frame.matched([row])
-        frame = frame.with_speed(row, matches)
-        frame, by_features = self._match(frame, [*matches, *frame.matched(self._anchors(history, row))])
+        frame = frame.compared(row, self._anchors(history, row))
+        frame, by_features = self._match(frame, frame.near)
         from_poses = (*by_features, frame.problem.predicted, last.pose)
         return frame, [*by_features, *(frame.alignment.pose(last, start) for start in from_poses)]
 
@@ -263,7 +275,7 @@ class Recovery:
         """Rows of the newest stored frames with image features before `row`: from frame to frame a pose may slide."""
         return [known for known in history.feature_rows() if known < row - 1][-ANCHORS:]
 
-    def _match(self, frame: DoubtfulFrame, found: list[FeatureMatches]) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
+    def _match(self, frame: DoubtfulFrame, found: Sequence[FeatureMatches]) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
         """The frame with those of the matches found that agree on a pose, and these poses."""
         if frame.image is None:
             return frame, []
@@ -320,10 +332,10 @@ class Recovery:
         found = min(verified, key=lambda tracked: self._rank(tracked, anywhere))
         if anywhere:
             return found
-        found = _by_features(found, verified)
+        found = preferred_by_features(found, verified)
         if seen is None or not (found.lost or seen.weight > found.weight - MAX_FEATURE_NOISE):
             return found
-        return _by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
+        return preferred_by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
 
     @staticmethod
     def _favored(candidates: Sequence[TrackedFrame], i: int) -> float:
@@ -381,17 +393,3 @@ def _may_be_occluded(tracked: TrackedFrame) -> bool:
 def _is_consistent(fit: Fit) -> bool:
     """Whether the pose is about where the frames before predict it; False where nothing does."""
     return fit.prediction_error_cm < CONSISTENT_CM and fit.prediction_error_deg < CONSISTENT_DEG
-
-
-def _by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: float = 1.0) -> TrackedFrame:
-    """The likeliest result, or a trusted one with which surface and image features agree that many times more.
-
-    On a young map, or far away, one that has slid along a wall fits as well; one that stopped half-way may be nearer to
-    the prediction. So many more features than agree by chance: in a plain corridor as many agree 14 cm farther on.
-    """
-    known = [other for other in others if not other.lost and not math.isnan(other.fit.feature_share)]
-    seen = [other for other in known if other.fit.feature_inliers >= MIN_DECIDING]
-    best = max(seen, key=lambda other: other.agreement, default=found)
-    count = found.fit.feature_inliers
-    by_chance = 1 + 1 / math.sqrt(count) if count > 0 else 1.0
-    return best if best.agreement > max(times, by_chance) * found.agreement else found

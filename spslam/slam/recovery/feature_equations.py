@@ -1,0 +1,118 @@
+"""What image features want of a pose: normal equations of their reprojection errors, with robust weights."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+INDEPENDENT_FEATURES = 50  # as many a frame's are worth: those of one earlier frame are off by the same
+WIDE = 3.0  # times the error of an inlier, the width of the robust kernel
+MIN_DEPTH_M = 0.05
+
+
+@dataclass(frozen=True)
+class SeenRays:
+    """What an earlier frame saw beyond the range of its depth, and where the frame shows it.
+
+    Attributes:
+        origin: float64 [3], where the earlier frame's camera stood, in the world, m.
+        directions: float64 [M, 3] in the world, 1 along the camera's axis.
+        positions: float64 [M, 2] in px of the intensity image.
+        beyond_m: float64 [M], the range beyond which it lies, m.
+    """
+
+    origin: np.ndarray
+    directions: np.ndarray
+    positions: np.ndarray
+    beyond_m: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def point_equations(
+    matrix: np.ndarray, points: np.ndarray, positions: np.ndarray, pose: np.ndarray, error_px: float
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """How many points agree with a pose, and what all want of it.
+
+    Args:
+        matrix: float64 [3, 3] of the camera.
+        points: float64 [M, 3] in the world, m.
+        positions: float64 [M, 2] where the frame shows them, px.
+        pose: float64 [4, 4] T_world_camera.
+        error_px: of a position that agrees.
+
+    Returns:
+        How many; float64 [6, 6] and [6]: matrix and gradient of a step of the pose (m, rad) in world axes.
+    """
+    local = pose[:3, :3].T @ (points - pose[:3, 3]).T
+    front = local[2] > MIN_DEPTH_M
+    if not front.all():
+        local, positions = local[:, front], positions[front]
+    residuals, jacobians = _reprojected(matrix, local, 1 / local[2], positions)
+    return _weighted(residuals, jacobians, pose, error_px)
+
+
+def ray_equations(
+    matrix: np.ndarray, seen: SeenRays, pose: np.ndarray, error_px: float, least: int = 0
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """`point_equations` of what lies beyond the range z of depth: at a nearness of 1/2z, give or take as much.
+
+    The derivative d of a position by the nearness says how far it may be off along its epipolar line: errors there
+    count by e / sqrt(e^2 + (|d| / 2z)^2) of those across it, e being `error_px`. So rays tell how the camera has
+    turned, and, the farther it has moved, the more where to, but not how far.
+
+    Args:
+        matrix, pose, error_px: as there.
+        seen: the rays.
+        least: each weighs at most as one of so many that agree.
+    """
+    to_camera, nearness = pose[:3, :3].T, 0.5 / seen.beyond_m
+    moved = to_camera @ (seen.origin - pose[:3, 3])
+    local = to_camera @ seen.directions.T + nearness * moved[:, None]
+    front, positions = local[2] > MIN_DEPTH_M, seen.positions
+    if not front.all():
+        local, nearness, positions = local[:, front], nearness[front], positions[front]
+    residuals, jacobians = _reprojected(matrix, local, nearness / local[2], positions)
+    along = matrix[:2, :2] @ ((moved[:2, None] - local[:2] / local[2] * moved[2]) / local[2])
+    length = np.sqrt((along**2).sum(0))
+    along /= np.maximum(length, np.finfo(float).tiny)
+    less = along * (1 - error_px / np.sqrt(error_px**2 + (nearness * length) ** 2))
+    residuals = residuals - less * (along * residuals).sum(0)
+    jacobians = jacobians - less[:, None] * (along[:, None] * jacobians).sum(0)
+    return _weighted(residuals, jacobians, pose, error_px, least)
+
+
+def _reprojected(
+    matrix: np.ndarray, local: np.ndarray, nearness: np.ndarray, positions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors [2, M] px of points [3, M] in camera axes, and their derivatives [2, 6, M] by a step of the pose.
+
+    With a = x/z and b = y/z, a point's derivatives by a step (m, rad) in camera axes are
+    f_x (-1/z, 0, a/z, ab, -(1 + a^2), b) and f_y (0, -1/z, b/z, 1 + b^2, -ab, -a).
+
+    Args:
+        matrix: of the camera.
+        local: the points, which may be scaled.
+        nearness: [M] their 1/z, 1/m.
+        positions: [M, 2] where they are shown.
+    """
+    (a, b), (fx, fy) = local[:2] / local[2], np.diag(matrix)[:2]
+    residuals = matrix[:2, :2] @ np.stack([a, b]) + matrix[:2, 2:] - positions.T
+    zero, ab = np.zeros_like(a), a * b
+    rows = ((-nearness, zero, a * nearness, ab, -(1 + a**2), b), (zero, -nearness, b * nearness, 1 + b**2, -ab, -a))
+    return residuals, np.stack([focal * np.stack(row) for focal, row in zip((fx, fy), rows, strict=True)])
+
+
+def _weighted(
+    residuals: np.ndarray, jacobians: np.ndarray, pose: np.ndarray, error_px: float, least: int = 0
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """How many errors are below `error_px`, matrix and gradient; of errors [2, M] and derivatives [2, 6, M]."""
+    ratio = (residuals**2).sum(0) / error_px**2
+    agreeing = int((ratio < 1).sum())
+    share = min(1.0, INDEPENDENT_FEATURES / max(agreeing, least, 1)) / error_px**2
+    root = math.sqrt(share) / (1 + ratio / WIDE**2)  # of Geman-McClure's weight
+    weighted = np.concatenate([*(root * jacobians)], 1)
+    to_world = np.kron(np.eye(2), pose[:3, :3])
+    normal, gradient = weighted @ weighted.T, weighted @ (root * residuals).ravel()
+    return agreeing, to_world @ normal @ to_world.T, to_world @ gradient
