@@ -9,6 +9,7 @@ from spslam.geometry import pose_from, rotation_angle
 from spslam.pose_graph import rotation_matrices
 from spslam.slam.recovery.feature_equations import (
     INDEPENDENT_FEATURES,
+    NEARNESS_DEVIATION,
     SeenRays,
     point_equations,
     ray_equations,
@@ -91,7 +92,7 @@ def test_equations_of_rays_are_those_of_errors_across_their_epipolar_lines(rando
     positions = positions_at(POSE, nearness) + random.normal(0, 1e-3, (COUNT, 2))
     along = (positions_at(POSE, nearness + 1e-5) - positions_at(POSE, nearness - 1e-5)) / 2e-5
     assert np.linalg.norm(along, axis=1).min() > 5  # the camera has moved so far that it matters
-    deviation = error_px**2 * np.eye(2) + nearness**2 * along[:, :, None] * along[:, None]
+    deviation = error_px**2 * np.eye(2) + (NEARNESS_DEVIATION * nearness) ** 2 * along[:, :, None] * along[:, None]
     roots = np.linalg.cholesky(np.linalg.inv(deviation))  # of the information, lower
     share = math.sqrt(min(1.0, INDEPENDENT_FEATURES / COUNT))
 

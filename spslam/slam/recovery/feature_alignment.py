@@ -1,7 +1,7 @@
 """Initial poses for tracking from image features: they need neither a start nor the map.
 
 Features of an earlier frame are matched with the frame's (ratio test, Lowe 2004); the pose is that of a perspective
-three-point solver within RANSAC (OpenCV's `solvePnPRansac`, of its USAC kind), refined on all inliers.
+three-point solver within RANSAC (OpenCV's `solvePnPRansac`), refined on all inliers.
 """
 
 import math
@@ -116,8 +116,15 @@ class FeatureAlignment:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
         if len(matches) < MIN_INLIERS:
             return None
-        is_found, _, rotation, translation, inliers = cv2.solvePnPRansac(
-            matches.points, matches.positions, self._matrix.copy(), None, params=self._ransac
+        is_found, rotation, translation, inliers = cv2.solvePnPRansac(
+            matches.points,
+            matches.positions,
+            self._matrix,
+            None,
+            iterationsCount=RANSAC_ITERATIONS,
+            reprojectionError=self.max_error_px,
+            confidence=RANSAC_CONFIDENCE,
+            flags=cv2.SOLVEPNP_AP3P,
         )
         if not is_found or inliers is None:
             return None
@@ -196,15 +203,6 @@ class FeatureAlignment:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""
         count = len(ratio_matches(self._descriptors[:COMPARED], earlier.descriptors[:COMPARED]))
         return count if count >= MIN_ALIKE else 0
-
-    @cached_property
-    def _ransac(self) -> cv2.UsacParams:
-        """Truncated squared errors decide (MSAC): they find more that agree than a count does, in half of the time."""
-        params = cv2.UsacParams()
-        params.score, params.loMethod = cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_NULL  # all inliers refine the pose after
-        params.threshold, params.confidence = self.max_error_px, RANSAC_CONFIDENCE
-        params.maxIterations = RANSAC_ITERATIONS
-        return params
 
     @cached_property
     def _descriptors(self) -> torch.Tensor:

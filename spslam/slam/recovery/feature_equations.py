@@ -8,6 +8,8 @@ import numpy as np
 INDEPENDENT_FEATURES = 50  # as many a frame's are worth: those of one earlier frame are off by the same
 WIDE = 3.0  # times the error of an inlier, the width of the robust kernel
 MIN_DEPTH_M = 0.05
+# Of what was seen without depth, by its expected nearness: what seems to lie beyond the range may be nearer.
+NEARNESS_DEVIATION = 4.0
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,11 @@ def point_equations(
 def ray_equations(
     matrix: np.ndarray, seen: SeenRays, pose: np.ndarray, error_px: float, least: int = 0
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """`point_equations` of what lies beyond the range z of depth: at a nearness of 1/2z, give or take as much.
+    """`point_equations` of what lies beyond the range z of depth: at a nearness n = 1/2z, give or take 4 n.
 
     The derivative d of a position by the nearness says how far it may be off along its epipolar line: errors there
-    count by e / sqrt(e^2 + (|d| / 2z)^2) of those across it, e being `error_px`. So rays tell how the camera has
-    turned, and, the farther it has moved, the more where to, but not how far.
+    count by e / sqrt(e^2 + (4 n |d|)^2) of those across it, e being `error_px`. So rays tell how the camera has turned,
+    and, the farther it has moved, the more where to, but not how far.
 
     Args:
         matrix, pose, error_px: as there.
@@ -77,7 +79,7 @@ def ray_equations(
     along = matrix[:2, :2] @ ((moved[:2, None] - local[:2] / local[2] * moved[2]) / local[2])
     length = np.sqrt((along**2).sum(0))
     along /= np.maximum(length, np.finfo(float).tiny)
-    less = along * (1 - error_px / np.sqrt(error_px**2 + (nearness * length) ** 2))
+    less = along * (1 - error_px / np.sqrt(error_px**2 + (NEARNESS_DEVIATION * nearness * length) ** 2))
     residuals = residuals - less * (along * residuals).sum(0)
     jacobians = jacobians - less[:, None] * (along[:, None] * jacobians).sum(0)
     return _weighted(residuals, jacobians, pose, error_px, least)
