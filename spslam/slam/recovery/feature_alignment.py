@@ -92,25 +92,29 @@ class FeatureAlignment:
         self.max_error_px = max(k.fx * math.tan(math.radians(MAX_ERROR_DEG)), MIN_ERROR_PX)
 
     def matches(self, earlier: ImageFeatures, pose: torch.Tensor) -> FeatureMatches:
-        """Matches with the features of an earlier frame whose color image is of a pose float32 [7]."""
-        pairs = ratio_matches(self._descriptors, earlier.descriptors)
+        """Matches with the features of an earlier frame whose color image is of a pose float32 [7]: those with depth
+        among themselves, and those beyond its range among all."""
         to_world = pose_matrix(pose)
+        measured = earlier.with_depth() if len(earlier.positions) else earlier  # of stored ones no others are kept
+        pairs = ratio_matches(self._descriptors, measured.descriptors)
         local, positions = (
-            one.astype(np.float64) for one in (earlier.points[pairs[:, 1]], self.features.positions[pairs[:, 0]])
+            one.astype(np.float64) for one in (measured.points[pairs[:, 1]], self.features.positions[pairs[:, 0]])
         )
-        known = local[:, 2] > 0
-        rays = None
-        if earlier.beyond_m is not None:
-            beyond_m = earlier.beyond_m[pairs[:, 1]]
-            is_far = beyond_m > 0
-            before = earlier.positions[pairs[is_far, 1]].astype(np.float64)
-            directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ np.linalg.inv(self._matrix).T
-            rays = SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions[is_far], beyond_m[is_far])
-        local, positions = local[known], positions[known]
         before = (local @ self._matrix.T)[:, :2] / local[:, 2:]
         moved = np.linalg.norm(positions - before, axis=1)
         motion_px = float(np.median(moved)) if len(moved) else 0.0
-        return FeatureMatches(local @ to_world[:3, :3].T + to_world[:3, 3], positions, 0, motion_px, rays)
+        points = local @ to_world[:3, :3].T + to_world[:3, 3]
+        return FeatureMatches(points, positions, motion_px=motion_px, rays=self._rays(earlier, to_world))
+
+    def _rays(self, earlier: ImageFeatures, to_world: np.ndarray) -> SeenRays | None:
+        if earlier.beyond_m is None or not earlier.beyond_m.any():
+            return None
+        pairs = ratio_matches(self._descriptors, earlier.descriptors)
+        row, known = pairs[earlier.beyond_m[pairs[:, 1]] > 0].T
+        before = earlier.positions[known].astype(np.float64)
+        directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ np.linalg.inv(self._matrix).T
+        positions = self.features.positions[row].astype(np.float64)
+        return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, earlier.beyond_m[known])
 
     def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
