@@ -124,7 +124,6 @@ class GaussNewtonOptions:
 # Names and bounds, in the order of SPS_GAUSS_NEWTON_SCALARS in csrc/include/spslam/gauss_newton.h.
 _SCALARS = {field.name: field.metadata for field in dataclasses.fields(GaussNewtonOptions) if field.metadata}
 _ITERATIONS = 1  # among the integers
-_STATISTICS = 7  # of an iteration: kFrameStatSize of csrc/include/spslam/gauss_newton.h
 
 
 @public_op()
@@ -196,7 +195,7 @@ def track_gauss_newton(
     if depth_keyframes is not None:
         depth_keyframes.check(name, like=scene.embeddings)
     found = trusted.track_gauss_newton(scene, pixels, pose, intrinsics, options, noise, reference, depth_keyframes)
-    return found[7:14], found[50:].view(-1, _STATISTICS), found[14:50].view(6, 6)
+    return found[7:14], found[50:].view(-1, trusted.STATISTICS), found[14:50].view(6, 6)
 
 
 @public_op()
@@ -251,7 +250,7 @@ def _(before, last):
 
 @torch.library.register_fake("spslam::track_gauss_newton")
 def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *_):
-    return frame[1].new_empty(50 + _STATISTICS * integers[_ITERATIONS])
+    return frame[1].new_empty(50 + trusted.STATISTICS * integers[_ITERATIONS])
 
 
 @torch.library.register_fake("spslam::gauss_newton_poses")

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from spslam.ops.rolling_shutter import ShutterMotion
     from spslam.ops.scene_view import Intrinsics, SceneView
     from spslam.ops.sensor_noise import SensorNoise
+# Of the tensors that tracking returns: numbers of a pose and H, of the statistics of an iteration (kFrameStatSize of
+# csrc/include/spslam/gauss_newton.h), and of what stands before both in `track_frame`.
+FOUND_NUMBERS, STATISTICS, FOLLOWED_HEAD = 43, 7, 9
 
 
 class MovingFrame(NamedTuple):
@@ -308,7 +311,7 @@ def _(records, depth, intensity, *_):
 def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *others):
     records, depth, intensity, poses = frame[:4]
     outputs = torch.empty_like(records), torch.empty_like(records), torch.empty_like(depth), torch.empty_like(intensity)
-    return poses.new_empty(95 + 7 * int(integers[1] + others[-1][-1])), *outputs
+    return poses.new_empty(FOLLOWED_HEAD + 2 * FOUND_NUMBERS + STATISTICS * int(integers[1] + others[-1][-1])), *outputs
 
 
 @torch.library.register_fake("spslam::predict_frame")

@@ -1,5 +1,6 @@
 """What processes that read send for each frame, whose pixels they leave in memory that both sides map."""
 
+from dataclasses import replace
 from typing import NamedTuple, cast
 
 import torch
@@ -59,8 +60,7 @@ class Message(NamedTuple):
 
     def pixels(self, blank: FramePixels, buffer: torch.Tensor) -> FramePixels:
         """The frame's pixels: those of a blank frame with another buffer, int32 [words]."""
-        shapes = blank.capacity, blank.thumbnail_shape, blank.depth_image_shape
-        return FramePixels(buffer, *shapes, self.valid_depth_share, self.features)
+        return replace(blank, buffer=buffer, valid_depth_share=self.valid_depth_share, features=self.features)
 
     def frame(self, pixels: FramePixels | Upload) -> PreparedFrame:
         """The frame with these pixels."""

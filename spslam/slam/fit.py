@@ -51,7 +51,10 @@ class Fit:
 
 
 def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:
-    """Distance (cm) and angle (degrees) between two poses of seven numbers each; NaN where one of them is."""
+    """Distance (cm) and angle (degrees) between two poses of seven numbers each; NaN where one of them is.
+
+    As csrc/kernels/frame_outcome.h has it on a device, where a frame that is followed is decided on.
+    """
     near, far = (math.dist(predicted[:4], [sign * number for number in pose[:4]]) for sign in (1, -1))
     chord = min(near, far, 2.0) if near == near else math.nan  # 2 sin(angle / 4), exact for small angles too
     return 100 * math.dist(predicted[4:], pose[4:]), math.degrees(4 * math.asin(chord / 2))

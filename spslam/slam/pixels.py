@@ -97,8 +97,7 @@ class FramePixels:
 
     def holding(self, buffer: torch.Tensor) -> FramePixels:
         """The same in another buffer, to which the words were copied."""
-        shapes = self.capacity, self.thumbnail_shape, self.depth_image_shape
-        return FramePixels(buffer, *shapes, self.valid_depth_share, self.features)
+        return replace(self, buffer=buffer)
 
     def having(self, **views: torch.Tensor) -> FramePixels:
         """The same, but for views by their names, which are tensors of their own; the buffer is as it was read."""

@@ -23,10 +23,8 @@ LEAST_DEVIATION_M = 0.003  # of a pixel
 # A plain wall's map moves the camera along it by its own noise, by centimeters a frame, before the brightness of depth
 # keyframes has a say: directions of less information than this, per pixel and m^2, wait for them.
 HELD_INFORMATION = 0.1
-FOUND_NUMBERS = 43  # of a pose and H
 # Of the second pass over a frame that was bent, by a pixel or so: it begins where the first one ended.
 AGAIN_ITERATIONS = 3
-FOLLOWED_HEAD = 9  # numbers of `ops.trusted.track_frame` before what it found: outcome, prediction and readout
 
 
 @dataclass(frozen=True)
@@ -213,14 +211,15 @@ class Tracker:
         )
         if meanwhile is not None:
             meanwhile()
-        numbers, size = found.tolist(), FOUND_NUMBERS + 7 * AGAIN_ITERATIONS
+        head = ops.trusted.FOLLOWED_HEAD
+        numbers, size = found.tolist(), ops.trusted.FOUND_NUMBERS + ops.trusted.STATISTICS * AGAIN_ITERATIONS
         outcome, predicted = FrameOutcome(int(numbers[0])), found[1:8]
         iterations = tracking.iterations + (AGAIN_ITERATIONS if outcome == FrameOutcome.BENT else 0)
         estimate = self._estimate(found[-size:], numbers[-size:], numbers[1:8], iterations)
-        motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, found[8:FOLLOWED_HEAD])
+        motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, found[8:head])
         constraints = replace(constraints, shutter=motion)
         problem = TrackingProblem(scene, outputs[0], predicted, number, constraints)
-        return FollowedFrame(problem, motion, outcome, estimate, found[FOLLOWED_HEAD : FOLLOWED_HEAD + 7], outputs[1:])
+        return FollowedFrame(problem, motion, outcome, estimate, found[head : head + 7], outputs[1:])
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
         """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
@@ -322,5 +321,5 @@ class Tracker:
         )
         pixels = self.config.tracking.pixels
         variance = max(mean_square, LEAST_DEVIATION_M**2) * pixels / INDEPENDENT_PIXELS
-        equations = SurfaceEquations(numbers[7:FOUND_NUMBERS], pixels, variance)
+        equations = SurfaceEquations(numbers[7 : ops.trusted.FOUND_NUMBERS], pixels, variance)
         return PoseEstimate(found[:7], iterations, fit, equations, tuple(pose), found[-2:])

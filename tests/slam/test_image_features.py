@@ -22,12 +22,7 @@ from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery import place_recognition
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
-from spslam.slam.recovery.feature_alignment import (
-    MIN_INLIERS,
-    FeatureAlignment,
-    joined_too,
-    ratio_matches,
-)
+from spslam.slam.recovery.feature_alignment import MIN_INLIERS, FeatureAlignment, joined_too, ratio_matches
 from spslam.slam.recovery.place_recognition import retrieve_by_features
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier

@@ -16,6 +16,7 @@ from spslam.datasets.registry import open_sequence
 from spslam.evaluation.trajectory_metrics import ate
 from spslam.geometry import inverse
 from spslam.pose_graph import rotation_matrices
+from spslam.slam import fit, rolling_shutter, tracker
 from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
 from spslam.slam.image_features import extract_features
@@ -24,6 +25,7 @@ from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.feature_alignment import FeatureAlignment
 from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.system import SlamSystem
+from spslam.slam.tracker import FrameOutcome
 from tests.system.sequences import Recorded, settings
 
 CPU = torch.device("cpu")
@@ -149,6 +151,37 @@ def test_a_known_readout_is_compensated_for_and_a_resumed_system_goes_on_alike(t
         resumed.process(dataset[i])
     assert torch.equal(resumed.state.frames.poses, system.state.frames.poses)
     assert torch.equal(resumed.state.pixels.records, system.state.pixels.records)
+
+
+@pytest.mark.parametrize(
+    ("bent_px", "far_cm", "outcome"),
+    [(1e6, 1e6, FrameOutcome.SETTLED), (1e-3, 1e6, FrameOutcome.BENT), (1e-3, 0.0, FrameOutcome.FAR)],
+)
+def test_a_frame_that_is_followed_in_one_call_is_tracked_as_step_by_step(bent_px, far_cm, outcome, monkeypatch):
+    """The same bytes, whatever the first pass says of it."""
+    monkeypatch.setattr(rolling_shutter, "BENT_PX", bent_px)
+    for module in (fit, tracker):
+        monkeypatch.setattr(module, "FAR_CM", far_cm)
+    follow, outcomes, dataset, found = tracker.Tracker.follow, [], Recorded(16), []
+
+    def followed(*arguments):
+        frame = follow(*arguments)
+        outcomes.append(frame.outcome)
+        return frame
+
+    monkeypatch.setattr(tracker.Tracker, "follow", followed)
+    for in_one_call in (True, False):
+        if not in_one_call:
+            monkeypatch.setattr(tracker.Tracker, "can_follow", lambda self, frames: False)
+        system = SlamSystem(settings("device=cpu", preset="fast"), dataset.camera, dataset.poses()[0])
+        timing = system.state.noise.tensors()
+        timing["timing"][1], timing["timing_state"][1] = 0.02, torch.tensor([0.02, 1e6], dtype=torch.float64)
+        for i in range(len(dataset)):
+            system.process(dataset[i])
+        state = system.state
+        found.append((state.frames.poses, state.frames.gains, state.pixels.records, state.depth_keyframes.images.int()))
+    assert len(outcomes) > 3 and set(outcomes) == {outcome}
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
 def turning(delay_ms, readout_ms, *overrides):

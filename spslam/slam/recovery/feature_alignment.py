@@ -107,6 +107,7 @@ class FeatureAlignment:
         return FeatureMatches(points, positions, motion_px=motion_px, rays=self._rays(earlier, to_world))
 
     def _rays(self, earlier: ImageFeatures, to_world: np.ndarray) -> SeenRays | None:
+        """Matches beyond the range of an earlier frame's depth, whose color image is of a pose float64 [4, 4]."""
         if earlier.beyond_m is None or not earlier.beyond_m.any():
             return None
         pairs = ratio_matches(self._descriptors, earlier.descriptors)
@@ -114,7 +115,8 @@ class FeatureAlignment:
         before = earlier.positions[known].astype(np.float64)
         directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ np.linalg.inv(self._matrix).T
         positions = self.features.positions[row].astype(np.float64)
-        return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, earlier.beyond_m[known])
+        beyond_m = earlier.beyond_m[known].astype(np.float64)
+        return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, beyond_m)
 
     def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
