@@ -9,7 +9,7 @@ from spslam.geometry import pose_from, rotation_angle
 from spslam.pose_graph import rotation_matrices
 from spslam.slam.recovery.feature_equations import (
     INDEPENDENT_FEATURES,
-    NEARNESS_DEVIATION,
+    INVERSE_DEPTH_DEVIATION,
     SeenRays,
     point_equations,
     ray_equations,
@@ -79,8 +79,8 @@ def test_points_behind_the_camera_tell_nothing(random):
 
 
 def test_equations_of_rays_are_those_of_errors_across_their_epipolar_lines(random):
-    """As if the nearness of each were solved for too, from what it is expected to be and as firmly."""
-    beyond_m, nearness = 4.0, 0.125
+    """As if the inverse depth of each were solved for too, from what it is expected to be and as firmly."""
+    beyond_m, inverse_depth = 4.0, 0.125
     origin = POSE[:3, 3] + np.array([0.1, 0.05, -0.2])
     directions = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (COUNT, 3))) - POSE[:3, 3]
     error_px = 3.0
@@ -89,15 +89,17 @@ def test_equations_of_rays_are_those_of_errors_across_their_epipolar_lines(rando
         x, y, z = MATRIX @ (pose[:3, :3].T @ (directions + at * (origin - pose[:3, 3])).T)
         return np.stack([x / z, y / z], 1)
 
-    positions = positions_at(POSE, nearness) + random.normal(0, 1e-3, (COUNT, 2))
-    along = (positions_at(POSE, nearness + 1e-5) - positions_at(POSE, nearness - 1e-5)) / 2e-5
+    positions = positions_at(POSE, inverse_depth) + random.normal(0, 1e-3, (COUNT, 2))
+    along = (positions_at(POSE, inverse_depth + 1e-5) - positions_at(POSE, inverse_depth - 1e-5)) / 2e-5
     assert np.linalg.norm(along, axis=1).min() > 5  # the camera has moved so far that it matters
-    deviation = error_px**2 * np.eye(2) + (NEARNESS_DEVIATION * nearness) ** 2 * along[:, :, None] * along[:, None]
+    deviation = (
+        error_px**2 * np.eye(2) + (INVERSE_DEPTH_DEVIATION * inverse_depth) ** 2 * along[:, :, None] * along[:, None]
+    )
     roots = np.linalg.cholesky(np.linalg.inv(deviation))  # of the information, lower
     share = math.sqrt(min(1.0, INDEPENDENT_FEATURES / COUNT))
 
     def errors(step):
-        off = positions_at(stepped(POSE, step), nearness) - positions
+        off = positions_at(stepped(POSE, step), inverse_depth) - positions
         return share * np.einsum("nji,nj->ni", roots, off).ravel()
 
     check_equations(ray_equations(MATRIX, rays_of(origin, directions, positions, beyond_m), POSE, error_px), errors)

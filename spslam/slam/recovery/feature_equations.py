@@ -8,8 +8,8 @@ import numpy as np
 INDEPENDENT_FEATURES = 50  # as many a frame's are worth: those of one earlier frame are off by the same
 WIDE = 3.0  # times the error of an inlier, the width of the robust kernel
 MIN_DEPTH_M = 0.05
-# Of what was seen without depth, by its expected nearness: what seems to lie beyond the range may be nearer.
-NEARNESS_DEVIATION = 4.0
+# Of what was seen without depth, by its expected inverse depth: what seems to lie beyond the range may be nearer.
+INVERSE_DEPTH_DEVIATION = 4.0
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ def point_equations(
 def ray_equations(
     matrix: np.ndarray, seen: SeenRays, pose: np.ndarray, error_px: float, least: int = 0
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """`point_equations` of what lies beyond the range z of depth: at a nearness n = 1/2z, give or take 4 n.
+    """`point_equations` of what lies beyond the range z of depth: at an inverse depth n = 1/2z, give or take 4 n.
 
-    The derivative d of a position by the nearness says how far it may be off along its epipolar line: errors there
+    The derivative d of a position by the inverse depth says how far it may be off along its epipolar line: errors there
     count by e / sqrt(e^2 + (4 n |d|)^2) of those across it, e being `error_px`. So rays tell how the camera has turned,
     and, the farther it has moved, the more where to, but not how far.
 
@@ -69,24 +69,24 @@ def ray_equations(
         seen: the rays.
         least: each weighs at most as one of so many that agree.
     """
-    to_camera, nearness = pose[:3, :3].T, 0.5 / seen.beyond_m
+    to_camera, inverse_depth = pose[:3, :3].T, 0.5 / seen.beyond_m
     moved = to_camera @ (seen.origin - pose[:3, 3])
-    local = to_camera @ seen.directions.T + nearness * moved[:, None]
+    local = to_camera @ seen.directions.T + inverse_depth * moved[:, None]
     front, positions = local[2] > MIN_DEPTH_M, seen.positions
     if not front.all():
-        local, nearness, positions = local[:, front], nearness[front], positions[front]
-    residuals, jacobians = _reprojected(matrix, local, nearness / local[2], positions)
+        local, inverse_depth, positions = local[:, front], inverse_depth[front], positions[front]
+    residuals, jacobians = _reprojected(matrix, local, inverse_depth / local[2], positions)
     along = matrix[:2, :2] @ ((moved[:2, None] - local[:2] / local[2] * moved[2]) / local[2])
     length = np.sqrt((along**2).sum(0))
     along /= np.maximum(length, np.finfo(float).tiny)
-    less = along * (1 - error_px / np.sqrt(error_px**2 + (NEARNESS_DEVIATION * nearness * length) ** 2))
+    less = along * (1 - error_px / np.sqrt(error_px**2 + (INVERSE_DEPTH_DEVIATION * inverse_depth * length) ** 2))
     residuals = residuals - less * (along * residuals).sum(0)
     jacobians = jacobians - less[:, None] * (along[:, None] * jacobians).sum(0)
     return _weighted(residuals, jacobians, pose, error_px, least)
 
 
 def _reprojected(
-    matrix: np.ndarray, local: np.ndarray, nearness: np.ndarray, positions: np.ndarray
+    matrix: np.ndarray, local: np.ndarray, inverse_depth: np.ndarray, positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors [2, M] px of points [3, M] in camera axes, and their derivatives [2, 6, M] by a step of the pose.
 
@@ -96,13 +96,16 @@ def _reprojected(
     Args:
         matrix: of the camera.
         local: the points, which may be scaled.
-        nearness: [M] their 1/z, 1/m.
+        inverse_depth: [M] of the points, 1/m.
         positions: [M, 2] where they are shown.
     """
     (a, b), (fx, fy) = local[:2] / local[2], np.diag(matrix)[:2]
     residuals = matrix[:2, :2] @ np.stack([a, b]) + matrix[:2, 2:] - positions.T
     zero, ab = np.zeros_like(a), a * b
-    rows = ((-nearness, zero, a * nearness, ab, -(1 + a**2), b), (zero, -nearness, b * nearness, 1 + b**2, -ab, -a))
+    rows = (
+        (-inverse_depth, zero, a * inverse_depth, ab, -(1 + a**2), b),
+        (zero, -inverse_depth, b * inverse_depth, 1 + b**2, -ab, -a),
+    )
     return residuals, np.stack([focal * np.stack(row) for focal, row in zip((fx, fy), rows, strict=True)])
 
 
