@@ -24,9 +24,9 @@ from experiments.arguments import add_changes, add_sequence, make_parser
 from spslam.config import load_config
 from spslam.options import PRESETS
 from spslam.run.device import resolve_device
-from spslam.run.reader_launch import launch_standby
 from spslam.run.request import parse_frames
 from spslam.run.sequence import RunRequest, run_sequence
+from spslam.run.standby import launch_standby
 from spslam.run_folder import RunFolder
 
 # Columns of the table that are medians of metrics.json.

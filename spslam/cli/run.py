@@ -16,8 +16,8 @@ from spslam.cli.viewing import add_view, opened_viewer
 from spslam.config import Config, load_config
 from spslam.errors import DeviceError
 from spslam.loading import collector_paused
-from spslam.run.reader_launch import end_standby, launch_standby
 from spslam.run.request import RunRequest
+from spslam.run.standby import end_standby, launch_standby
 from spslam.run_folder import RunFolder
 
 if TYPE_CHECKING:

@@ -180,6 +180,11 @@ class RunOptions(Section):
         "their own, or as `threads` of the run's own; `auto` is `process` for a GPU if the command line starts the run "
         "and the process can read the dataset"
     )
+    graph_solver: Literal["auto", "process", "thread"] = option(
+        "where the keyframe graph is solved: in a separate `process` or on a `thread` of the run's own, with the same "
+        "result; `auto` is `process` for a GPU if the command line starts the run",
+        needs=(need(is_("graph.enabled", True)),),
+    )
     prefetch_ahead: int | None = option(
         "maximum number of frames read ahead; null is three per thread, at least 8", "frames", ge=1
     )

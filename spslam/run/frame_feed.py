@@ -12,7 +12,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.prefetch import Prefetcher, prefetch, usable_cores
 from spslam.errors import DatasetError
 from spslam.run.frozen_frames import FrozenFrames
-from spslam.run.reader_launch import AHEAD_PER_WORKER, has_standby
+from spslam.run.reader_launch import AHEAD_PER_WORKER, READERS
 from spslam.run.reader_process import ReaderProcess, ReaderUnavailableError
 from spslam.slam.device_events import event_recorder
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
@@ -134,7 +134,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
 def uses_process(reader: str, device: torch.device) -> bool:
     """Whether a separate process reads, by the value of `run.reader`: `auto` takes a standby reader for a GPU."""
-    return reader == "process" or (reader == "auto" and device.type == "cuda" and has_standby())
+    return reader == "process" or (reader == "auto" and device.type == "cuda" and READERS.waiting is not None)
 
 
 def automatic_workers(device: torch.device) -> int:

@@ -13,9 +13,6 @@ from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.upload import Upload
 
-# Raised by a connection whose other end is closed.
-DISCONNECTED = (EOFError, ConnectionError)
-
 
 class Message(NamedTuple):
     """From a process that reads: a frame without its pixels, one that can't be read, a failure, or the end of the

@@ -9,7 +9,6 @@ import contextlib
 import os
 import pickle
 import select
-import signal
 import subprocess
 from collections import deque
 from collections.abc import Iterator
@@ -18,8 +17,9 @@ from multiprocessing.connection import Connection
 from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import DatasetError, SpslamError, brief
-from spslam.run.reader_launch import AHEAD_PER_WORKER, launch, take_standby
-from spslam.run.reader_message import DISCONNECTED, Message
+from spslam.helper_process import DISCONNECTED, NOT_STARTED, describe_exit
+from spslam.run.reader_launch import AHEAD_PER_WORKER, READERS
+from spslam.run.reader_message import Message
 from spslam.run.reader_service import SharedFrames, Work, slot_message
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import PreparedFrame
@@ -101,8 +101,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise _unavailable(f"{dataset.name} can't be pickled ({brief(str(error))})") from error
         try:
-            reader = take_standby() or launch()
-        except (OSError, AttributeError, TypeError) as error:
+            reader = READERS.take()
+        except NOT_STARTED as error:
             raise _unavailable(f"the process can't be started ({brief(str(error))})") from error
         os.ftruncate(reader.shared, SharedFrames.size(slots, words))
         shared = SharedFrames.mapped(reader.shared, slots, words)
@@ -222,8 +222,7 @@ def _unavailable(reason: str) -> ReaderUnavailableError:
 
 
 def _describe_exit(code: int | None) -> str:
-    how = f"by {signal.Signals(-code).name}" if code is not None and code < 0 else f"with code {code}"
     return (
-        f"the process that reads frames ended {how}; if memory was short, lower run.prefetch_ahead; "
+        f"the process that reads frames ended {describe_exit(code)}; if memory was short, lower run.prefetch_ahead; "
         "run.reader=threads uses no separate process"
     )

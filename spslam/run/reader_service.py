@@ -19,8 +19,9 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.prefetch import Readable, prefetch
 from spslam.errors import DatasetError
+from spslam.helper_process import DISCONNECTED
 from spslam.run.frozen_frames import FrozenFrames
-from spslam.run.reader_message import DISCONNECTED, Message
+from spslam.run.reader_message import Message
 from spslam.run.reader_workers import ForkedPreparation, WorkerEndedError
 from spslam.slam.pixels import FramePixels, blank_pixels
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame

@@ -18,7 +18,8 @@ from typing import cast
 import torch
 
 from spslam.errors import DatasetError
-from spslam.run.reader_message import DISCONNECTED, Message
+from spslam.helper_process import DISCONNECTED
+from spslam.run.reader_message import Message
 from spslam.slam.pixels import WORD_BYTES, FramePixels
 from spslam.slam.prepared_frame import FramePreparation, PreparedFrame
 

@@ -3,15 +3,15 @@
 A solution begins at a frame and is taken up `graph.every` frames later, whether it took long or not; where it moves a
 keyframe by more than `graph.min_change_m`, the map is made again for it, and both are adopted between two frames, a
 number of frames later that grows with the keyframes. A live run waits for nothing: it takes up what is ready. The
-thread that works on it shares nothing with the loop but what neither changes.
+thread that works on it, and has another process solve the graph where there is one, shares nothing with the loop but
+what neither changes.
 """
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import importlib
 import math
-import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -27,12 +27,11 @@ from spslam.prior import Prior
 from spslam.scene import SparseVolume
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.graph.edges import Link, LoopDecision
-from spslam.slam.graph.host_threads import host_threads
+from spslam.slam.graph.host_threads import give_way, host_threads
 from spslam.slam.graph.joining import Component, find_frame
-from spslam.slam.graph.keyframe import NEAR_SHARE, ArrivingKeyframe, Keyframe, KeyframeCamera
-from spslam.slam.graph.keyframe_graph import GraphContent, GraphUpdate, KeyframeGraph
+from spslam.slam.graph.keyframe import NEAR_SHARE, ArrivingKeyframe, Keyframe
+from spslam.slam.graph.keyframe_graph import GraphUpdate
 from spslam.slam.graph.keyframe_store import KeyframeStore
-from spslam.slam.graph.overlap import Surfaces
 from spslam.slam.graph.registration import Registrar
 from spslam.slam.graph.remap import (
     corrected_poses,
@@ -42,11 +41,12 @@ from spslam.slam.graph.remap import (
     handed_over,
     own_stream,
 )
+from spslam.slam.graph.solver import GraphProblem, GraphSolution
+from spslam.slam.graph.solver_process import make_solver
 from spslam.slam.pixels import FramePixels
 from spslam.slam.state import SlamState
 
 AHEAD_M = 2.0  # a turn by an angle moves what is seen by so much times the angle
-NICENESS = 10  # of the thread in a live run, above the process's: tracking comes first where cores are scarce
 # Where it falls behind for so many turns, a live run waits for it for so long after each frame, and drops frames rather
 # than let the keyframes grow that wait for their edges.
 OVERDUE_TURNS, OVERDUE_WAIT_S = 2, 0.03
@@ -65,9 +65,9 @@ class GlobalMapping:
 
     def __init__(self, config: Config, prior: Prior, state: SlamState, store: KeyframeStore):
         self._config, self._prior, self._state, self._store = config, prior, state, store
-        self._surfaces = Surfaces()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="spslam-graph")
         self._pool = host_threads(state.scene.device)
+        self._solver = make_solver(config, state.scene.device, self._pool)
         # Now rather than at the first solution: an import keeps other threads from the interpreter.
         self._worker.submit(importlib.import_module, "scipy.sparse.linalg")
         self._running: Future[Any] | None = None  # None also after the state was loaded
@@ -83,6 +83,7 @@ class GlobalMapping:
         """Ends the thread, once it is done with what it does."""
         self._abandoned.set()
         self._worker.shutdown(wait=True, cancel_futures=True)
+        self._solver.close()
         if self._pool is not None:
             self._pool.shutdown(wait=True)
 
@@ -114,6 +115,7 @@ class GlobalMapping:
         if not self._gives_way:
             self._gives_way = True
             self._worker.submit(_give_way)
+            self._solver.give_way()
         if self._running is not None and not self._running.done():
             is_overdue = number - self._taken_up > OVERDUE_TURNS * self._config.graph.every
             if not is_overdue or wait([self._running], OVERDUE_WAIT_S).not_done:
@@ -185,7 +187,8 @@ class GlobalMapping:
             pixels: of the frame.
         """
         store, unknown = self._store, self._state.noise.model.cpu()
-        registrar = self._registrar({store.camera: unknown, **store.opened_noise})
+        noises = {store.camera: unknown, **store.opened_noise}
+        registrar = Registrar.of_config(self._config, noises, self._state.scene.device, self._pool)
         known = Component(store.keyframes, self._keyframe_poses())
         return find_frame(registrar, Keyframe.of(number, pixels, store.camera), known, number)
 
@@ -202,7 +205,7 @@ class GlobalMapping:
         store.noise = self._state.noise.model.cpu().clone()
         before = self._keyframe_poses()
         solved = self._solution(before)
-        update = self._taken(*self._worker.submit(solved).result())
+        update = self._taken(self._worker.submit(solved).result())
         again = _change(before, update.poses) > self._config.graph.min_change_m
         target = _kept(update)
         self._adopt(target, self._remade(target)() if again else None)
@@ -268,10 +271,10 @@ class GlobalMapping:
     def _solved(self) -> GraphUpdate:
         """Waits for the solution that is being made, and takes its content over."""
         running, self._running = self._running, None
-        return self._taken(*(running or self._worker.submit(self._solution(self._store.start))).result())
+        return self._taken((running or self._worker.submit(self._solution(self._store.start))).result())
 
-    def _taken(self, content: GraphContent, update: GraphUpdate) -> GraphUpdate:
-        self._store.content = content
+    def _taken(self, solution: GraphSolution) -> GraphUpdate:
+        self._store.content, update = solution
         self._store.leave_out(update.left_out, update.poses)
         return update
 
@@ -280,25 +283,11 @@ class GlobalMapping:
         running, self._running = self._running, None
         return self._remade(target)() if running is None else running.result()
 
-    def _registrar(self, noise: dict[KeyframeCamera, torch.Tensor]) -> Registrar:
-        return Registrar.of_config(self._config, noise, self._state.scene.device, self._pool)
-
-    def _solution(self, poses: np.ndarray) -> Callable[[], tuple[GraphContent, GraphUpdate]]:
+    def _solution(self, poses: np.ndarray) -> Callable[[], GraphSolution]:
         """What solves the graph of the first K keyframes from their poses float64 [K, 4, 4], on any thread."""
         store, count = self._store, len(poses)
-        keyframes, links, content = store.keyframes[:count], store.links[:count], store.content.copy()
-        options, registrar = self._config.graph, self._registrar(store.noises)
-        spacing = options.max_translation_m, math.radians(options.max_rotation_deg)
-
-        def solve() -> tuple[GraphContent, GraphUpdate]:
-            for keyframe in keyframes[len(self._surfaces) :]:
-                self._surfaces.add(keyframe)
-            graph = KeyframeGraph(registrar, self._surfaces, content)
-            update = graph.update(keyframes, links, poses, spacing, options.loops)
-            registrar.forget()  # else Python's garbage collector does, minutes later
-            return content, update
-
-        return solve
+        problem = GraphProblem(store.links[:count], poses, store.content, store.noises)
+        return functools.partial(self._solver.solve, store.keyframes[:count], problem)
 
     def _remade(
         self, poses: np.ndarray, volume: SparseVolume | None = None, first: int = 0
@@ -357,9 +346,7 @@ def _kept(update: GraphUpdate) -> np.ndarray:
 
 def _give_way() -> None:
     """Lets this thread's work wait for that of the process's others, where the system can."""
-    with contextlib.suppress(OSError, AttributeError):
-        thread = threading.get_native_id()  # under Linux each thread has a priority of its own
-        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + NICENESS)
+    give_way(threading.get_native_id())  # under Linux each thread has a priority of its own
 
 
 def _change(before: np.ndarray, after: np.ndarray) -> float:

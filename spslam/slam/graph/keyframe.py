@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -89,6 +89,7 @@ class Keyframe:
     depth: torch.Tensor
     intensity: torch.Tensor
     camera: KeyframeCamera
+    _found: list[ImageFeatures] = field(default_factory=list, init=False, repr=False)
 
     @classmethod
     def of(cls, frame: int, pixels: FramePixels, camera: KeyframeCamera) -> Keyframe:
@@ -98,19 +99,26 @@ class Keyframe:
     def changed(self, **changes: Any) -> Keyframe:
         """The same image under another number or in other memory; features that were found are kept."""
         other = replace(self, **changes)
-        if "_features" in self.__dict__:
-            other.__dict__["_features"] = self.features
+        other.know_features(self.found_features)
         return other
 
     @property
     def features(self) -> ImageFeatures:
         """Of the image, those of which the depth is known; found once."""
-        found: ImageFeatures | None = self.__dict__.get("_features")
-        if found is None:  # before Python 3.12 a cached_property finds those of one keyframe at a time
+        if self.found_features is None:  # before Python 3.12 a cached_property finds those of one keyframe at a time
             images = self.intensity.numpy(), self.depth.numpy()
-            found = features_of_images(*images, self.camera.camera, self.camera.max_depth_m).with_depth()
-            self.__dict__["_features"] = found
-        return found
+            found = features_of_images(*images, self.camera.camera, self.camera.max_depth_m)
+            self.know_features(found.with_depth())
+        return self._found[0]
+
+    @property
+    def found_features(self) -> ImageFeatures | None:
+        """Those features if they were found before, by whomever; None otherwise."""
+        return self._found[0] if self._found else None
+
+    def know_features(self, found: ImageFeatures | None) -> None:
+        """Takes those features from whoever found them in this image; forgets them for None."""
+        self._found[:] = [] if found is None else [found]
 
     @cached_property
     def median_m(self) -> float:

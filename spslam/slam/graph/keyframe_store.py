@@ -10,23 +10,19 @@ import torch
 
 from spslam.geometry import compose
 from spslam.slam.graph.archive import KeyframeArchive
+from spslam.slam.graph.content_tensors import content_of, content_tensors
 from spslam.slam.graph.edges import Link
 from spslam.slam.graph.image_pool import ImagePool
 from spslam.slam.graph.keyframe import ArrivingKeyframe, Keyframe, KeyframeCamera
 from spslam.slam.graph.keyframe_graph import GraphContent
 from spslam.slam.graph.keyframe_tensors import (
     cameras_of,
-    edge_tensors,
-    edges_of,
     keyframe_tensors,
     keyframes_of,
     link_tensors,
     links_of,
-    pair_tensor,
-    pairs_of,
     stacked,
 )
-from spslam.slam.graph.loops import Proposal
 from spslam.slam.graph.redundancy import Anchor, moved_anchors
 
 
@@ -132,10 +128,7 @@ class KeyframeStore:
                 -1, 2
             ),
             "anchor_poses": stacked([anchor.pose for anchor in self.anchors], 4),
-            **edge_tensors("edge_", content.edges),
-            **edge_tensors("waiting_", [proposal.edge for proposal in content.waiting]),
-            "waiting_correction": stacked([proposal.correction for proposal in content.waiting], 4),
-            "tried": pair_tensor(content.tried),
+            **content_tensors(content),
             "start": torch.from_numpy(self.start),
             "target": torch.from_numpy(np.zeros((0, 4, 4)) if self.target is None else self.target),
             "noise": torch.stack([self.noise, *(self.opened_noise[camera] for camera in cameras[1:])]),
@@ -155,9 +148,7 @@ class KeyframeStore:
         anchored = zip(state["anchors"].tolist(), state["anchor_poses"].cpu().numpy().copy(), strict=True)
         self.anchors = [Anchor(frame, to, pose) for (frame, to), pose in anchored]
         done, begun = state["numbers"].tolist()
-        corrections = state["waiting_correction"].cpu().numpy().copy()
-        waiting = [Proposal(*each) for each in zip(edges_of("waiting_", state), corrections, strict=True)]
-        self.content = GraphContent(edges_of("edge_", state), pairs_of(state["tried"]), done, waiting)
+        self.content = content_of(state, done)
         self.begun = None if begun < 0 else begun
         self.start = state["start"].cpu().numpy().copy()
         self.target = state["target"].cpu().numpy().copy() if len(state["target"]) else None
