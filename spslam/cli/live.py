@@ -25,6 +25,7 @@ from spslam.cli.progress import print_summary
 from spslam.cli.run import default_output, timed_output
 from spslam.cli.viewing import add_view, opened_viewer
 from spslam.config import Config, load_config
+from spslam.run.standby import end_standby, launch_standby
 
 REALSENSE_CONFIG = "folder"  # what `--record` writes can be run with the saved configuration
 MAX_WAIT_MS = 60.0
@@ -111,6 +112,7 @@ def _run_realsense(args: argparse.Namespace, config: Config, output: Path) -> di
 def _run(
     args: argparse.Namespace, config: Config, output: Path, source: Any, data: Path | None = None, pose: Any = None
 ) -> dict[str, Any]:
+    launch_standby(config, reads=False)
     from spslam.live.request import LiveRequest
     from spslam.live.session import run_live
 
@@ -128,6 +130,7 @@ def _run(
         with opened_viewer(args, f"spslam live {args.source}") as viewer:
             return run_live(request, source, progress, pose, viewer)
     finally:
+        end_standby()
         if progress is not None:
             progress.close()
 

@@ -78,7 +78,7 @@ def run_live(
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
         folder = OutputFolder(Path(request.output_dir))
-        with folder.locked(), _removed_if_empty(folder):
+        with contextlib.closing(system), folder.locked(), _removed_if_empty(folder):
             _refuse_interrupted(folder)
             folder.create(resume=False)
             atomic_write(folder.config, dump_config(system.config, provenance(system.config, device)))

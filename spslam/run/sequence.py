@@ -1,5 +1,6 @@
 """SLAM over a sequence: from a dataset to an output folder."""
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
@@ -76,22 +77,23 @@ def _run(
 ) -> dict[str, Any]:
     dataset = opened.dataset
     system = SlamSystem(request.config, dataset.camera, first_pose(request.config, dataset), device)
-    warnings = opened.doubts()
-    if request.map is not None:
-        system.open_map(request.map)
-    with OutputFolder(Path(request.output_dir)).locked():
-        finished = finished_metrics(request, dataset)
-        if finished is not None:
-            return finished
-        session = open_session(request, dataset, system, warnings)
-        earlier = session.folder.read_log() if session.start else []
-        observer.begin(ObservedRun.of(request, dataset, earlier), system.state)
-        with FrameFeed(dataset, request.config, device, session.start, system.state.frames.processed) as feed:
-            _process(feed, system, session, progress, observer, started)
-        frames = system.state.frames
-        indices = frames.indices[frames.opened :].tolist()
-        source = RunInput.of_dataset(dataset, indices, request.config.run.previews)
-        return write_results(system, source, request, session)
+    with contextlib.closing(system):
+        warnings = opened.doubts()
+        if request.map is not None:
+            system.open_map(request.map)
+        with OutputFolder(Path(request.output_dir)).locked():
+            finished = finished_metrics(request, dataset)
+            if finished is not None:
+                return finished
+            session = open_session(request, dataset, system, warnings)
+            earlier = session.folder.read_log() if session.start else []
+            observer.begin(ObservedRun.of(request, dataset, earlier), system.state)
+            with FrameFeed(dataset, request.config, device, session.start, system.state.frames.processed) as feed:
+                _process(feed, system, session, progress, observer, started)
+            frames = system.state.frames
+            indices = frames.indices[frames.opened :].tolist()
+            source = RunInput.of_dataset(dataset, indices, request.config.run.previews)
+            return write_results(system, source, request, session)
 
 
 def _process(

@@ -45,16 +45,19 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
         sent = uploader.send(pixels) if uploader else pixels
         reports.append(system.submit(PreparedFrame(frame.index, frame.timestamp, sent)).result())
     system.finish()
+    system.close()
     event_recorder(device)().wait()
     return reports[:FRAMES]
 
 
 def _shortened(config: Config) -> Config:
-    """The configuration with few iterations, mapping after each frame, and fewer frames per mapping call than exist."""
+    """The configuration with few iterations, mapping after each frame, fewer frames per mapping call than exist, and
+    without the process that is the run's."""
     mapping = config.mapping.model_copy(
         update={"every": 1, "iterations": 2, "first_iterations": 4, "frames": 2, "recent": 1, "covisible": 1}
     )
-    return config.model_copy(update={"mapping": mapping})
+    run = config.run.model_copy(update={"graph_solver": "thread"})
+    return config.model_copy(update={"mapping": mapping, "run": run})
 
 
 def _wall_frame(camera: Camera, config: Config, index: int) -> RgbdFrame:

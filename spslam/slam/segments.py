@@ -49,7 +49,8 @@ def segment_config(config: Config) -> Config:
     """Options of a segment's system: no segment in a segment, no solution of its graph, no long first optimization."""
     graph = config.graph.model_copy(update={"new_map_after_s": None, "every": NEVER})
     mapping = config.mapping.model_copy(update={"first_iterations": config.mapping.iterations})
-    return config.model_copy(update={"graph": graph, "mapping": mapping})
+    run = config.run.model_copy(update={"graph_solver": "thread"})
+    return config.model_copy(update={"graph": graph, "mapping": mapping, "run": run})
 
 
 class Segments:

@@ -10,7 +10,6 @@ what neither changes.
 from __future__ import annotations
 
 import functools
-import importlib
 import math
 import threading
 from collections.abc import Callable, Sequence
@@ -68,8 +67,7 @@ class GlobalMapping:
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="spslam-graph")
         self._pool = host_threads(state.scene.device)
         self._solver = make_solver(config, state.scene.device, self._pool)
-        # Now rather than at the first solution: an import keeps other threads from the interpreter.
-        self._worker.submit(importlib.import_module, "scipy.sparse.linalg")
+        self._worker.submit(self._solver.prepare)
         self._running: Future[Any] | None = None  # None also after the state was loaded
         self._abandoned = threading.Event()  # of the map that is being made again
         # The newest keyframe's number, the state's stamp when its pose was read, and that pose.

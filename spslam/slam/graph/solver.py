@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -58,6 +59,10 @@ class GraphSolver:
         self._config, self._pool = config, pool
         self._known: list[Keyframe] = []  # of which there are surfaces
         self._surfaces = Surfaces()
+
+    def prepare(self) -> None:
+        """Loads what solutions need, so that the first one need not: an import keeps other threads waiting."""
+        importlib.import_module("scipy.sparse.linalg")
 
     def solve(self, keyframes: Sequence[Keyframe], problem: GraphProblem) -> GraphSolution:
         """Solves the graph of K keyframes: those of the last solution that it did not leave out, then new ones."""

@@ -47,6 +47,9 @@ class SolverProcess:
         self._is_solving = False
         self._here: GraphSolver | None = None
 
+    def prepare(self) -> None:
+        """See `GraphSolver.prepare`; the other process does so by itself."""
+
     def solve(self, keyframes: Sequence[Keyframe], problem: GraphProblem) -> GraphSolution:
         """See `GraphSolver.solve`."""
         if self._helper is not None:

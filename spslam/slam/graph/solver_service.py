@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import pickle
 import traceback
 from concurrent.futures import ThreadPoolExecutor
@@ -35,6 +36,7 @@ def serve(socket: int) -> None:
         ThreadPoolExecutor(threads) as pool,
     ):
         service = SolverService(pool)
+        service.prepare()
         while True:
             request: Request = pickle.loads(connection.recv_bytes())
             try:
@@ -55,6 +57,10 @@ class SolverService:
         self._pool = pool
         self._keyframes: list[Keyframe] = []
         self._solver: GraphSolver | None = None
+
+    def prepare(self) -> None:
+        """Loads what solutions need, before the first is asked for."""
+        importlib.import_module("scipy.sparse.linalg")
 
     def answer(self, request: Request) -> Answer:
         """Solves what is asked for."""
