@@ -32,6 +32,7 @@ GROUND = {
     "config",
     "errors",
     "geometry",
+    "helper_process",
     "io",
     "loading",
     "notebook",

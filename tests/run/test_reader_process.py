@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from spslam import helper_process
 from spslam.errors import SpslamError
 from spslam.run import frame_feed, reader_launch
 from spslam.run.frame_feed import FrameFeed
-from spslam.run.reader_launch import end_standby, has_standby, launch_standby
+from spslam.run.reader_launch import READERS
 from spslam.run.reader_process import ReaderProcess
 from spslam.run.reader_service import serve
+from spslam.run.standby import end_standby, launch_standby
 from spslam.slam.device_events import HostEvent
 from spslam.slam.pixels import sample_frame
 from spslam.slam.upload import Upload
@@ -64,7 +66,7 @@ def test_the_function_that_the_process_runs_exists():
 
 
 def test_starting_the_process_does_not_import_torch():
-    code = "import sys, spslam.run.reader_launch, spslam.run.request; assert 'torch' not in sys.modules"
+    code = "import sys, spslam.run.standby, spslam.run.request; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=PATIENCE_S)
 
 
@@ -87,7 +89,7 @@ def not_started(monkeypatch):
     def fail_to_fork(*_, **__):
         raise OSError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(reader_launch.subprocess, "Popen", fail_to_fork)
+    monkeypatch.setattr(helper_process.subprocess, "Popen", fail_to_fork)
     return Recorded(FRAMES)
 
 
@@ -118,11 +120,11 @@ def test_a_process_that_was_asked_for_and_cannot_read_is_an_error(monkeypatch, m
 def test_standby_reader_is_used_once():
     launch_standby(settings("run.reader=process"))
     launch_standby(settings("run.reader=process"))
-    pid = reader_launch._standby[0].process.pid
+    pid = READERS.waiting.process.pid
     with feed_of(Recorded(FRAMES)) as feed:
         assert feed.prepare()._process.pid == pid
         assert [frame.index for frame in feed] == list(range(FRAMES))
-    assert not has_standby()
+    assert READERS.waiting is None
 
 
 class LateUploader:
@@ -202,15 +204,15 @@ def test_what_fails_ahead_is_raised_where_it_is_requested():
 
 def test_unused_standby_reader_is_ended():
     launch_standby(settings("run.reader=process"))
-    pid = reader_launch._standby[0].process.pid
+    pid = READERS.waiting.process.pid
     end_standby()
-    assert has_ended(pid) and not has_standby()
+    assert has_ended(pid) and READERS.waiting is None
 
 
 @pytest.mark.parametrize("options", [("device=cpu",), ("run.reader=threads", "device=cuda")])
 def test_no_standby_reader_where_the_run_uses_threads(options):
     launch_standby(settings(*options))
-    assert not has_standby()
+    assert READERS.waiting is None
 
 
 def test_exception_in_a_dataset_keeps_its_traceback():
