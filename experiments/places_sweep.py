@@ -144,8 +144,9 @@ def loop_figures(log: list[dict], estimated: np.ndarray, truth: np.ndarray) -> d
 
 
 MEASURES = (
-    "mean_robust_weight", "inlier_share", "min_eigenvalue", "prediction_error_cm", "prediction_error_deg",
-    "free_space_violation", "brightness_correlation", "map_coverage", "valid_depth_share", "recovered", "relocalized",
+    "residual_cm", "mean_robust_weight", "inlier_share", "min_eigenvalue", "prediction_error_cm",
+    "prediction_error_deg", "free_space_violation", "brightness_correlation", "feature_inliers", "feature_share",
+    "feature_rays", "map_coverage", "valid_depth_share", "recovered", "relocalized",
 )  # fmt: skip
 
 

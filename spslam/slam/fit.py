@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 FAR_CM, FAR_DEG = 2.0, 1.5  # from the prediction
+INDEPENDENT_PIXELS = 300  # as many a frame's pixels are worth: the map's errors are alike for neighbors
+LEAST_DEVIATION_M = 0.003  # of a pixel
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Fit:
             degrees of where the frame shows them.
         feature_share: of the features that agree on a pose, the share that agrees with this one; of the earlier frames
             that they were matched with, the least. Unknown where colors are not where depth is.
+        feature_rays: number of image features that were beyond the range of the last frame's depth and lie, from the
+            pose, within that angle of where they may be on their rays.
     """
 
     residual_cm: float = math.nan
@@ -43,11 +47,18 @@ class Fit:
     brightness_correlation: float = math.nan
     feature_inliers: float = math.nan
     feature_share: float = math.nan
+    feature_rays: float = math.nan
 
     @property
     def is_far_from_prediction(self) -> bool:
         """Whether the motion model was wrong by so much that tracking may have stopped half-way, or slid."""
         return self.prediction_error_cm > FAR_CM or self.prediction_error_deg > FAR_DEG
+
+    @property
+    def deviation_m(self) -> float:
+        """Standard deviation of the pose along the direction that surface determines least, m or rad."""
+        pixel_m = max(self.residual_cm / 100, LEAST_DEVIATION_M)
+        return pixel_m / math.sqrt(INDEPENDENT_PIXELS * self.min_eigenvalue) if self.min_eigenvalue > 0 else math.inf
 
 
 def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:

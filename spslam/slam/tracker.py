@@ -14,12 +14,18 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.constraints import Constraints
-from spslam.slam.fit import FAR_CM, FAR_DEG, Fit, min_eigenvalue, prediction_error
+from spslam.slam.fit import (
+    FAR_CM,
+    FAR_DEG,
+    INDEPENDENT_PIXELS,
+    LEAST_DEVIATION_M,
+    Fit,
+    min_eigenvalue,
+    prediction_error,
+)
 from spslam.slam.frame_table import FrameTable
 from spslam.slam.render_options import render_options
 
-INDEPENDENT_PIXELS = 300  # as many a frame's pixels are worth: the map's errors are alike for neighbors
-LEAST_DEVIATION_M = 0.003  # of a pixel
 # A plain wall's map moves the camera along it by its own noise, by centimeters a frame, before the brightness of depth
 # keyframes has a say: directions of less information than this, per pixel and m^2, wait for them.
 HELD_INFORMATION = 0.1

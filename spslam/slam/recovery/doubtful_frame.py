@@ -85,7 +85,12 @@ class DoubtfulFrame:
             telling = [one for one in self.matches if one.agreeing > FEW_FEATURES * most]
             within = [self.image.inliers(one, pose, self.late_px) for one in telling]
             shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, telling, strict=True)]
-        return replace(fit, feature_inliers=max(inliers, default=0), feature_share=min(shares, default=math.nan))
+        return replace(
+            fit,
+            feature_inliers=max(inliers, default=0),
+            feature_share=min(shares, default=math.nan),
+            feature_rays=max((self.image.ray_inliers(one, pose, self.late_px) for one in self.matches), default=0),
+        )
 
     @property
     def is_contradicted(self) -> bool:

@@ -33,6 +33,7 @@ UNSURE_EIGENVALUE = 0.01  # below it so may a pose that was not predicted well
 # Farther from the prediction, the brightness of earlier images, whose basin is a pixel or two, may not bring the pose
 # back in a direction that surface leaves free.
 UNSURE_CM, UNSURE_DEG = 0.5, 0.35
+UNSURE_DEVIATION_M = 0.0035  # along the weakest direction, by how well surface fits: a noisy sensor says less of it
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
@@ -147,9 +148,11 @@ class Recovery:
     def _may_have_slid(self, tracked: TrackedFrame) -> bool:
         """Whether surface leaves a direction so free that image features are asked."""
         tracking, fit = self._config.tracking, tracked.fit
-        is_unsure = fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG
-        least = UNSURE_EIGENVALUE if is_unsure else WEAK_EIGENVALUE
-        return tracking.features and tracking.recovery and fit.min_eigenvalue < least
+        if not (tracking.features and tracking.recovery):
+            return False
+        if fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG:
+            return fit.min_eigenvalue < UNSURE_EIGENVALUE or fit.deviation_m > UNSURE_DEVIATION_M
+        return fit.min_eigenvalue < WEAK_EIGENVALUE
 
     def _held(
         self,
@@ -363,7 +366,10 @@ class Recovery:
         candidates += self._track_from(frame, candidates[0], starts)[1:]
         found = self._likeliest(frame, candidates, anywhere=True)
         is_new = not any(found.pose is candidate.pose for candidate in candidates[:known])
-        found = self._accept_anywhere(found, frame.history.consistent_frames)
+        # Stored frames may confirm, where the last one shows too little, that the camera is where it was predicted.
+        is_followed = not frame.history.is_lost and not found.lost and _is_consistent(found.fit)
+        if not is_followed:
+            found = self._accept_anywhere(found, frame.history.consistent_frames)
         return replace(found, relocalized=is_new and not found.lost)
 
     def _accept_anywhere(self, tracked: TrackedFrame, consistent_before: int) -> TrackedFrame:
