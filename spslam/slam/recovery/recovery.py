@@ -146,10 +146,12 @@ class Recovery:
         )
 
     def _may_have_slid(self, tracked: TrackedFrame) -> bool:
-        """Whether surface leaves a direction so free that image features are asked."""
+        """Whether image features are asked: where surface leaves a direction free, and where the pose is a surprise."""
         tracking, fit = self._config.tracking, tracked.fit
         if not (tracking.features and tracking.recovery):
             return False
+        if fit.prediction_error_cm >= CONSISTENT_CM or fit.prediction_error_deg >= CONSISTENT_DEG:
+            return True
         if fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG:
             return fit.min_eigenvalue < UNSURE_EIGENVALUE or fit.deviation_m > UNSURE_DEVIATION_M
         return fit.min_eigenvalue < WEAK_EIGENVALUE
