@@ -90,6 +90,23 @@ def test_image_features_hold_what_surface_leaves_free():
     assert error_probability(GOOD, **{**wall, "feature_share": math.nan}, feature_inliers=200) > 0.5
 
 
+def test_what_lies_beyond_the_range_of_depth_holds_a_pose_with_what_does_not():
+    wall = dict(min_eigenvalue=0.0, feature_share=0.95)
+    assert error_probability(GOOD, **wall, feature_inliers=40, feature_rays=30) < 0.01
+    assert error_probability(GOOD, **wall, feature_inliers=40, feature_rays=10) > 0.5
+    # Rays alone don't: they do not tell how far the camera has gone.
+    assert error_probability(GOOD, **wall, feature_inliers=10, feature_rays=500) > 0.5
+
+
+def test_how_firmly_surface_holds_a_pose():
+    """3 mm of a pixel are sqrt(300) times less of a pose along a direction of eigenvalue 1."""
+    firm = Fit(residual_cm=0.1, min_eigenvalue=1.0)
+    assert firm.deviation_m == pytest.approx(0.003 / math.sqrt(300))
+    assert replace(firm, residual_cm=0.9, min_eigenvalue=0.01).deviation_m == pytest.approx(30 * firm.deviation_m)
+    assert replace(firm, min_eigenvalue=0.0).deviation_m == math.inf
+    assert Fit().deviation_m == math.inf
+
+
 def test_features_that_hold_a_pose_speak_for_it():
     """Where the motion model was wrong, and where images are blurred."""
     far = dict(prediction_error_cm=20.0, prediction_error_deg=8.0, brightness_correlation=0.45)
