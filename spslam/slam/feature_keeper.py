@@ -9,7 +9,7 @@ from spslam.slam.feature_store import keeps_features
 from spslam.slam.image_features import FrameFeatures, ImageFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import PreparedFrame
-from spslam.slam.recovery.recovery import UNSURE_EIGENVALUE
+from spslam.slam.recovery.sliding import UNSURE_EIGENVALUE
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.state import SlamState

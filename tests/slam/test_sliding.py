@@ -1,11 +1,15 @@
 """A camera before a bare wall or in a corridor, along which surface holds no pose: image features do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from spslam.config import load_config
 from spslam.datasets import open_dataset
+from spslam.slam.fit import Fit
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
+from spslam.slam.recovery.sliding import is_consistent, may_have_slid
 from spslam.slam.system import SlamSystem
 
 FRAMES = 8
@@ -43,3 +47,18 @@ def test_a_pose_that_most_features_contradict_is_recovered(device, monkeypatch, 
     errors = [np.linalg.norm(pose[:3, 3] - truth[number, :3, 3]) for number, pose in zip(CORRIDOR, found, strict=True)]
     assert (max(errors) > 0.03) == slides
     assert slides or max(errors) < 0.015
+
+
+def test_features_are_asked_of_what_may_have_slid():
+    firm = Fit(residual_cm=0.2, min_eigenvalue=0.02, prediction_error_cm=0.1, prediction_error_deg=0.1)
+    assert not may_have_slid(firm)
+    assert may_have_slid(replace(firm, min_eigenvalue=0.003))
+    unpredicted = replace(firm, prediction_error_cm=1.0)
+    assert not may_have_slid(unpredicted)
+    assert may_have_slid(replace(unpredicted, min_eigenvalue=0.009))
+    assert may_have_slid(replace(unpredicted, residual_cm=1.0))  # 4.1 mm along the weakest direction
+    assert not may_have_slid(replace(firm, residual_cm=1.0))
+    for surprise in ({"prediction_error_cm": 6.0}, {"prediction_error_deg": 4.5}):
+        assert may_have_slid(replace(firm, **surprise))
+    unknown = replace(firm, prediction_error_cm=float("nan"), prediction_error_deg=float("nan"))
+    assert not may_have_slid(unknown) and not is_consistent(unknown)

@@ -24,6 +24,7 @@ SITUATIONS = {
     "no prior": ("paper", (*SMALL, "prior.enabled=false", "prior.decoder=random")),
     "surface samples, no color": ("balanced", (*SMALL, "sampling.uniform=0", "loss.rgb=0", "mapping.covisible=0")),
 }
+OTHER_WORDS = {"run.graph_solver": "process"}
 # What only the reading of data takes is told by the dataset's type; weights are read wherever they are given.
 NOT_TESTED_HERE = {path for path, _ in option_fields() if path.startswith("dataset.")} | {"prior.weights"}
 
@@ -38,7 +39,10 @@ def with_other_values(config: Config, paths: list[str]) -> Config:
     for path in paths:
         section, _, key = path.partition(".")
         value = option_value(config, path)
-        other = not value if isinstance(value, bool) else value + 3 if isinstance(value, int) else 2 * value + 0.01
+        if isinstance(value, str):
+            other = OTHER_WORDS[path]
+        else:
+            other = not value if isinstance(value, bool) else value + 3 if isinstance(value, int) else 2 * value + 0.01
         changed = getattr(config, section).model_copy(update={key: other})
         config = config.model_copy(update={section: changed})
     return config

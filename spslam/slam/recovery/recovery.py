@@ -18,22 +18,16 @@ from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatc
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.sliding import WEAK_EIGENVALUE, is_consistent, may_have_slid
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.recovery.verifier import Verifier
 from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.tracker import PoseEstimate, Tracker, TrackingProblem
 
 CONSISTENT_FRAMES = 4  # lost frames in a row whose likely poses are consistent are found
-CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one such frame to the next
 LIKELY_ERROR_PROBABILITY = 0.1  # of each of them at most
 OCCLUSION_CHECK_WEIGHT = 0.7  # a frame to be mapped with a smaller mean robust weight may be occluded
 ANCHORS = 2  # stored frames that hold a pose beside the last one
-WEAK_EIGENVALUE = 0.004  # below it surface leaves a direction almost free: poses that slide fit, and are consistent
-UNSURE_EIGENVALUE = 0.01  # below it so may a pose that was not predicted well
-# Farther from the prediction, the brightness of earlier images, whose basin is a pixel or two, may not bring the pose
-# back in a direction that surface leaves free.
-UNSURE_CM, UNSURE_DEG = 0.5, 0.35
-UNSURE_DEVIATION_M = 0.0035  # along the weakest direction, by how well surface fits: a noisy sensor says less of it
 SHORT_LOSS = 5  # lost frames in a row after which the camera is still near its last trusted pose
 MIN_GAIN = 0.02  # of mean robust weight, or that share of agreement, for another result than the first
 MAX_LOSS = 0.2  # of mean robust weight, of a pose that may still be the right one; the better fit may be a place alike
@@ -124,7 +118,7 @@ class Recovery:
         tracking, probability = self._config.tracking, self._confidence.error_probability(fit)
         # A camera that turns to what was not seen yet leaves the map, while features of the last frames hold it; one
         # that has jumped has to be found on the map.
-        is_followed = self._confidence.is_held(fit) and _is_consistent(fit)
+        is_followed = self._confidence.is_held(fit) and is_consistent(fit)
         is_somewhere = fit.inlier_share >= tracking.min_inlier_share or is_followed
         is_trusted = is_somewhere and probability <= tracking.lost_threshold
         occluded = self._confidence.is_occluded(fit)
@@ -146,15 +140,9 @@ class Recovery:
         )
 
     def _may_have_slid(self, tracked: TrackedFrame) -> bool:
-        """Whether image features are asked: where surface leaves a direction free, and where the pose is a surprise."""
-        tracking, fit = self._config.tracking, tracked.fit
-        if not (tracking.features and tracking.recovery):
-            return False
-        if fit.prediction_error_cm >= CONSISTENT_CM or fit.prediction_error_deg >= CONSISTENT_DEG:
-            return True
-        if fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG:
-            return fit.min_eigenvalue < UNSURE_EIGENVALUE or fit.deviation_m > UNSURE_DEVIATION_M
-        return fit.min_eigenvalue < WEAK_EIGENVALUE
+        """Whether image features are used, and asked of this pose."""
+        tracking = self._config.tracking
+        return tracking.features and tracking.recovery and may_have_slid(tracked.fit)
 
     def _held(
         self,
@@ -369,7 +357,7 @@ class Recovery:
         found = self._likeliest(frame, candidates, anywhere=True)
         is_new = not any(found.pose is candidate.pose for candidate in candidates[:known])
         # Stored frames may confirm, where the last one shows too little, that the camera is where it was predicted.
-        is_followed = not frame.history.is_lost and not found.lost and _is_consistent(found.fit)
+        is_followed = not frame.history.is_lost and not found.lost and is_consistent(found.fit)
         if not is_followed:
             found = self._accept_anywhere(found, frame.history.consistent_frames)
         return replace(found, relocalized=is_new and not found.lost)
@@ -381,13 +369,13 @@ class Recovery:
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
         frames with consistent poses.
         """
-        is_consistent = _is_consistent(tracked.fit)
+        was_near = is_consistent(tracked.fit)
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
         tracked = self._judged(replace(tracked, fit=fit))
         if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
             return replace(tracked, consistent_frames=0)
         is_likely = tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
-        frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(is_consistent))
+        frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(was_near))
         if frames >= CONSISTENT_FRAMES:
             return replace(tracked, lost=False, consistent_frames=0)
         return replace(tracked, lost=True, consistent_frames=frames)
@@ -396,8 +384,3 @@ class Recovery:
 def _may_be_occluded(tracked: TrackedFrame) -> bool:
     """Whether that is to be checked before the frame is mapped: it fits badly, and nobody has looked yet."""
     return math.isnan(tracked.fit.occluded_share) and tracked.fit.mean_robust_weight < OCCLUSION_CHECK_WEIGHT
-
-
-def _is_consistent(fit: Fit) -> bool:
-    """Whether the pose is about where the frames before predict it; False where nothing does."""
-    return fit.prediction_error_cm < CONSISTENT_CM and fit.prediction_error_deg < CONSISTENT_DEG
