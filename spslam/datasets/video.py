@@ -148,7 +148,9 @@ def import_av(path: Path) -> Any:
         import av
     except ImportError:
         raise DatasetError(f"{path}: videos need PyAV: pip install 'spslam[video]'") from None
-    av.logging.set_level(av.logging.PANIC)  # what FFmpeg has to say about damaged files comes as errors
+    # What FFmpeg has to say about damaged files comes as errors. With a level, PyAV's callback takes Python's lock,
+    # which the thread that closes a file holds while it waits for decoding threads: these wait in vain to complain.
+    av.logging.set_level(None)
     return av
 
 

@@ -1,5 +1,7 @@
 """Videos by OpenCV's writer and by FFmpeg's encoders give their frames, in any order, from threads and copies."""
 
+import contextlib
+import multiprocessing
 import pickle
 from fractions import Fraction
 
@@ -13,6 +15,7 @@ from spslam.errors import DatasetError
 
 av = pytest.importorskip("av")
 WIDTH, HEIGHT, COUNT = 64, 48, 30
+PATIENCE_S = 60
 
 
 def picture(number):
@@ -104,6 +107,27 @@ def test_broken_videos_are_one_line(tmp_path):
     path.write_bytes(content)
     with pytest.raises(DatasetError, match="must have a video track 1, got 1 of them"):
         VideoStream(path, 1)
+
+
+def read_damaged(path):
+    """Reads a frame of videos with bytes of their frames changed, and closes them while others are being decoded."""
+    content, random = path.read_bytes(), np.random.default_rng(0)
+    for number in range(60):
+        spoiled = np.frombuffer(content, np.uint8).copy()
+        spoiled[random.integers(40, len(content) - 1500, 200)] = random.integers(0, 256, 200)
+        path.with_suffix(f".{number}.mp4").write_bytes(spoiled.tobytes())
+        with contextlib.suppress(DatasetError):
+            VideoStream(path.with_suffix(f".{number}.mp4")).read(number % 5)
+
+
+def test_damaged_videos_are_closed(tmp_path):
+    """FFmpeg's threads complain about them meanwhile: closing waited for them, and they for Python's lock."""
+    path = write_h264(tmp_path / "a.mp4", [number / 30 for number in range(COUNT)])
+    process = multiprocessing.get_context("spawn").Process(target=read_damaged, args=(path,))
+    process.start()
+    process.join(PATIENCE_S)
+    process.kill()
+    assert process.exitcode == 0
 
 
 def test_pyav_absent_is_one_line(tmp_path, monkeypatch):
