@@ -82,7 +82,11 @@ def execute(args: argparse.Namespace) -> None:
             "--recording has the sizes and rate it was recorded with; leave out --serial, --size and --rate"
         )
     output = args.output or (default_output(args.config) if args.source == "replay" else timed_output(args.source))
-    metrics = _run_replay(args, config, output) if args.source == "replay" else _run_realsense(args, config, output)
+    launch_standby(config, reads=False)
+    try:
+        metrics = _run_replay(args, config, output) if args.source == "replay" else _run_realsense(args, config, output)
+    finally:
+        end_standby()
     if not args.quiet:
         print_summary(metrics, output)
 
@@ -112,7 +116,6 @@ def _run_realsense(args: argparse.Namespace, config: Config, output: Path) -> di
 def _run(
     args: argparse.Namespace, config: Config, output: Path, source: Any, data: Path | None = None, pose: Any = None
 ) -> dict[str, Any]:
-    launch_standby(config, reads=False)
     from spslam.live.request import LiveRequest
     from spslam.live.session import run_live
 
@@ -130,7 +133,6 @@ def _run(
         with opened_viewer(args, f"spslam live {args.source}") as viewer:
             return run_live(request, source, progress, pose, viewer)
     finally:
-        end_standby()
         if progress is not None:
             progress.close()
 

@@ -56,9 +56,16 @@ class Fit:
 
     @property
     def deviation_m(self) -> float:
-        """Standard deviation of the pose along the direction that surface determines least, m or rad."""
-        pixel_m = max(self.residual_cm / 100, LEAST_DEVIATION_M)
-        return pixel_m / math.sqrt(INDEPENDENT_PIXELS * self.min_eigenvalue) if self.min_eigenvalue > 0 else math.inf
+        """Standard deviation of the pose along the direction that surface determines least, m or rad; infinite where
+        surface determines none."""
+        if not self.min_eigenvalue > 0:
+            return math.inf
+        return math.sqrt(pose_variance((self.residual_cm / 100) ** 2) / self.min_eigenvalue)
+
+
+def pose_variance(mean_square: float) -> float:
+    """Variance of a pose along a direction of eigenvalue 1 per pixel, by the pixels' mean square residual, both m^2."""
+    return max(mean_square, LEAST_DEVIATION_M**2) / INDEPENDENT_PIXELS
 
 
 def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:

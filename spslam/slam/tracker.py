@@ -14,15 +14,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.scene import Scene
 from spslam.slam.constraints import Constraints
-from spslam.slam.fit import (
-    FAR_CM,
-    FAR_DEG,
-    INDEPENDENT_PIXELS,
-    LEAST_DEVIATION_M,
-    Fit,
-    min_eigenvalue,
-    prediction_error,
-)
+from spslam.slam.fit import FAR_CM, FAR_DEG, Fit, min_eigenvalue, pose_variance, prediction_error
 from spslam.slam.frame_table import FrameTable
 from spslam.slam.render_options import render_options
 
@@ -326,6 +318,6 @@ class Tracker:
             prediction_error_deg=error_deg,
         )
         pixels = self.config.tracking.pixels
-        variance = max(mean_square, LEAST_DEVIATION_M**2) * pixels / INDEPENDENT_PIXELS
+        variance = pose_variance(mean_square) * pixels
         equations = SurfaceEquations(numbers[7 : ops.trusted.FOUND_NUMBERS], pixels, variance)
         return PoseEstimate(found[:7], iterations, fit, equations, tuple(pose), found[-2:])

@@ -10,6 +10,7 @@ import torch
 
 from spslam.camera import Camera
 from spslam.geometry import inverse, rotation_angle
+from spslam.pose_graph import rotation_matrices
 from spslam.slam import feature_store
 from spslam.slam.constraints import Constraints
 from spslam.slam.depth_keyframes import depth_image_intrinsics
@@ -22,7 +23,14 @@ from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery import place_recognition
 from spslam.slam.recovery.doubtful_frame import DoubtfulFrame
-from spslam.slam.recovery.feature_alignment import MIN_INLIERS, FeatureAlignment, joined_too, ratio_matches
+from spslam.slam.recovery.feature_alignment import (
+    MIN_INLIERS,
+    FeatureAlignment,
+    FeatureMatches,
+    joined_too,
+    ratio_matches,
+)
+from spslam.slam.recovery.feature_equations import SeenRays
 from spslam.slam.recovery.place_recognition import retrieve_by_features
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.rolling_shutter import ShutterRectifier
@@ -322,3 +330,22 @@ def test_holes_are_not_beyond_the_range(hole):
 
 def test_an_image_without_depth_has_no_range():
     assert not blocks(np.zeros((120, 160), np.uint16)).beyond_m.any()
+
+
+def test_rays_agree_with_where_the_camera_looks_not_with_how_far_it_went(dataset, features):
+    image, pose = FeatureAlignment(features[4], dataset.camera), pose_matrix(pose_of(dataset, 4))
+    k = depth_image_intrinsics(dataset.camera)
+    positions = features[4].positions.astype(np.float64)
+    rays = np.stack([(positions[:, 0] - k.cx) / k.fx, (positions[:, 1] - k.cy) / k.fy, np.ones(len(positions))], 1)
+    seen = SeenRays(pose[:3, 3], rays @ pose[:3, :3].T, positions, np.full(len(positions), MAX_DEPTH_M))
+    matches = FeatureMatches(np.zeros((0, 3)), np.zeros((0, 2)), rays=seen)
+
+    def agreeing(turn_deg=0.0, moved_m=0.0):
+        other = pose.copy()
+        other[:3, :3] = rotation_matrices(np.radians([0.0, turn_deg, 0.0])) @ pose[:3, :3]
+        other[:3, 3] += moved_m * pose[:3, 2]
+        return image.ray_inliers(matches, pose_tensor(other, CPU))
+
+    assert agreeing() == agreeing(moved_m=0.1) == len(positions) > MIN_INLIERS
+    assert agreeing(turn_deg=3 * np.degrees(np.arctan(image.max_error_px / k.fx))) == 0
+    assert image.ray_inliers(replace(matches, rays=None), pose_of(dataset, 4)) == 0

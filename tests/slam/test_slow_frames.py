@@ -16,7 +16,7 @@ CASES = {
     "it looks up": ("arcade", "phone_lidar", "fast_turns", 530, 11),
     # It slid by 5.6 cm: an eigenvalue of 0.011 is little where pixels are off by 0.7 cm.
     "it slides on steps": ("stairwell", "phone_lidar", "walking", 530, 18),
-    # Tracking stopped half-way of a turn that began; the pose was believed, and all later ones contradicted it.
+    # A pose 8 degrees from the prediction was 1.3 cm off and not verified; features of later frames contradicted it.
     "it begins to turn": ("desk", "time_of_flight", "fast_turns", 540, 35),
 }
 
@@ -29,7 +29,7 @@ def test_it_is_followed(case, device):
     dataset = open_dataset(config.dataset)
     truth = dataset.poses()
     system = SlamSystem(config, dataset.camera, truth[0], device)
-    for number in range(frames):
+    for number in range(frames):  # they are up to 1.4 cm and 0.25 degrees off
         pose = system.process(dataset[number]).pose
         assert pose is not None, number
         assert np.linalg.norm(pose[:3, 3] - truth[number, :3, 3]) < 0.025, number

@@ -60,7 +60,8 @@ class GraphSolver:
         self._known: list[Keyframe] = []  # of which there are surfaces
         self._surfaces = Surfaces()
 
-    def prepare(self) -> None:
+    @staticmethod
+    def prepare() -> None:
         """Loads what solutions need, so that the first one need not: an import keeps other threads waiting."""
         importlib.import_module("scipy.sparse.linalg")
 

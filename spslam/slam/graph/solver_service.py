@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import pickle
 import traceback
 from concurrent.futures import ThreadPoolExecutor
@@ -36,7 +35,7 @@ def serve(socket: int) -> None:
         ThreadPoolExecutor(threads) as pool,
     ):
         service = SolverService(pool)
-        service.prepare()
+        GraphSolver.prepare()
         while True:
             request: Request = pickle.loads(connection.recv_bytes())
             try:
@@ -58,22 +57,13 @@ class SolverService:
         self._keyframes: list[Keyframe] = []
         self._solver: GraphSolver | None = None
 
-    def prepare(self) -> None:
-        """Loads what solutions need, before the first is asked for."""
-        importlib.import_module("scipy.sparse.linalg")
-
     def answer(self, request: Request) -> Answer:
         """Solves what is asked for."""
         if self._solver is None or request.known == 0:
             self._solver, self._keyframes = GraphSolver(request.config, self._pool), []
-        before = [keyframe.found_features is not None for keyframe in self._keyframes]
         keyframes = [*self._keyframes, *request.new_keyframes()]
-        before += [False] * (len(keyframes) - len(before))
+        without = [number for number, keyframe in enumerate(keyframes) if keyframe.found_features is None]
         solution = self._solver.solve(keyframes, request.problem())
         self._keyframes = kept(keyframes, solution.update)
-        found = {
-            number: keyframe.found_features
-            for number, (keyframe, known) in enumerate(zip(keyframes, before, strict=True))
-            if keyframe.found_features is not None and not known
-        }
-        return Answer.of(solution, found)
+        found = {number: keyframes[number].found_features for number in without}
+        return Answer.of(solution, {number: features for number, features in found.items() if features is not None})

@@ -89,7 +89,7 @@ class DoubtfulFrame:
             fit,
             feature_inliers=max(inliers, default=0),
             feature_share=min(shares, default=math.nan),
-            feature_rays=max((self.image.ray_inliers(one, pose, self.late_px) for one in self.matches), default=0),
+            feature_rays=max((self.image.ray_inliers(one, pose) for one in self.matches), default=0),
         )
 
     @property

@@ -205,16 +205,12 @@ class FeatureAlignment:
         errors = projected + self._matrix[:2, 2:] - matches.positions.T
         return int((in_front & ((errors**2).sum(0) < most_px**2)).sum())
 
-    def ray_inliers(self, matches: FeatureMatches, pose: torch.Tensor, late_px: float = 0.0) -> int:
-        """How many rays agree with a pose: each shows what it may, somewhere on it beyond the range of depth.
-
-        Args:
-            matches, pose, late_px: as of `inliers`.
-        """
+    def ray_inliers(self, matches: FeatureMatches, pose: torch.Tensor) -> int:
+        """How many rays agree with a pose float32 [7]: reprojected, what lies on them beyond the range of depth may be
+        within `max_error_px` of where the frame shows it."""
         if matches.rays is None or not len(matches.rays):
             return 0
-        at, error_px = self._color_pose(pose_matrix(pose)), max(self.max_error_px, late_px)
-        return ray_equations(self._matrix, matches.rays, at, error_px)[0]
+        return ray_equations(self._matrix, matches.rays, self._color_pose(pose_matrix(pose)), self.max_error_px)[0]
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""

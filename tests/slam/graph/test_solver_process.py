@@ -169,7 +169,7 @@ def test_a_process_that_cannot_be_started_is_an_error_where_it_was_asked_for(mon
 
 def test_the_process_ends_with_the_one_that_started_it():
     code = (
-        "import time; from spslam.slam.graph.solver_launch import SOLVERS; SOLVERS.prepare(); "
+        "from spslam.slam.graph.solver_launch import SOLVERS; SOLVERS.prepare(); "
         "print(SOLVERS.waiting.process.pid, flush=True)"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
