@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
@@ -80,7 +82,11 @@ class RealSenseSource(LiveSource, AbstractContextManager):
                 # Before the first frame is played.
                 player = config.resolve(sdk.pipeline_wrapper(self._pipeline)).get_device().as_playback()
                 player.set_real_time(real_time)
+                # It would play from the start of its first stream on, and lose what the other had until its own start.
+                player.pause()
             profile = self._pipeline.start(config)
+            if recording is not None:
+                _resume(player)
         except RuntimeError as error:
             wanted = f"{width or WIDTH}x{height or HEIGHT} at {rate_hz or RATE_HZ} Hz"
             raise SourceError(_explained(str(error), recording, serial, wanted)) from None
@@ -197,6 +203,16 @@ def _import_sdk() -> Any:
         hint = "; install libusb, on Debian and Ubuntu `apt install libusb-1.0-0`" if "libusb" in str(error) else ""
         raise SourceError(f"pyrealsense2 can't be loaded: {error}{hint}") from None
     return pyrealsense2
+
+
+def _resume(player: Any) -> None:
+    """Plays a paused recording on, without waiting: the SDK returns once a frame was taken, or after 10 s."""
+
+    def resume() -> None:
+        with contextlib.suppress(RuntimeError):  # stopped before a frame was taken
+            player.resume()
+
+    threading.Thread(target=resume, name="spslam-realsense", daemon=True).start()
 
 
 def _explained(error: str, recording: Path | None, serial: str | None, wanted: str) -> str:
