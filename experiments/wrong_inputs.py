@@ -3,6 +3,7 @@
     python -m experiments.wrong_inputs --place apartment --sensor structured_light --frames 120
     python -m experiments.wrong_inputs --only "focal" --without-poses
     python -m experiments.wrong_inputs --sound --seeds 2        # false alarms: generated places as they are
+    python -m experiments.wrong_inputs --sound --late           # with colors 15 ms late and a rolling shutter
 
 Each row is one way in which a recording can be wrong (`experiments/wrong_recordings.py`). The verdict is what `spslam
 run` does: `refused`, with what it names, `warned` or `silent`. What is not refused runs: its trajectory is right if
@@ -16,6 +17,7 @@ import argparse
 import itertools
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +39,8 @@ from spslam.slam.system import SlamSystem
 
 WITHIN = 1.1
 CLEAN_SEEDS = 3
+PLAIN = Capture(color_noise=2)
+LATE = replace(PLAIN, exposure_ms=10, rolling_shutter_ms=20, color_delay_ms=15)  # as cameras in hands have it at worst
 DEPTH_RANGE_M = (0.1, 10.0)
 
 
@@ -58,14 +62,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--without-poses", action="store_true", help="the recording comes without ground truth")
     parser.add_argument("--check-only", action="store_true", help="run nothing")
     parser.add_argument("--sound", action="store_true", help="all places, motions and sensors as they are")
+    parser.add_argument("--late", action="store_true", help="of --sound: late colors, exposure and rolling shutter")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of --sound")
     parser.add_argument("--first-seed", type=int, default=0, help="the first of them")
     parser.add_argument("--json", type=Path, help="file to write the rows to")
     return parser
 
 
-def _places(place: str, motion: str, sensor: str, frames: int, seed: int = 0) -> PlacesDataset:
-    dataset = PlacesDataset(place, motion, sensor, frames, seed, capture=Capture(color_noise=2))
+def _places(
+    place: str, motion: str, sensor: str, frames: int, seed: int = 0, capture: Capture = PLAIN
+) -> PlacesDataset:
+    dataset = PlacesDataset(place, motion, sensor, frames, seed, capture=capture)
     dataset.depth_range = DEPTH_RANGE_M
     return dataset
 
@@ -160,7 +167,7 @@ def _false_alarms(args: argparse.Namespace) -> list[dict]:
     rows = []
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for place, motion, sensor, seed in itertools.product(PLACES, MOTIONS, SENSORS, seeds):
-        dataset: RgbdDataset = _places(place, motion, sensor, 600, seed)
+        dataset: RgbdDataset = _places(place, motion, sensor, 600, seed, LATE if args.late else PLAIN)
         began = time.process_time()
         row = {"name": dataset.name, **_verdict(check_first_frames(dataset)), "seconds": time.process_time() - began}
         rows.append(row)

@@ -14,6 +14,9 @@ WINDOW = 31  # stamps that an image's time is taken from, itself in the middle w
 LEAST_STAMPS = 8  # with fewer there is no telling how even they are
 # Of the period, by which a stamp of an even clock is off at most: beyond that images are taken as they come.
 MOST_OFF = 0.3
+# By so much the moments of a frame's depth and color may differ, or those of an image's rows: as in recordings whose
+# images are paired by time, and with a rolling shutter.
+LATE_S = 0.02
 _MOST_AT_ONCE = 1 << 15  # windows in memory
 
 

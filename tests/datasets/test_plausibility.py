@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from experiments.fault_injection import black_out, cover_garbage, cover_near, cover_wall
+from experiments.wrong_inputs import LATE
 from experiments.wrong_recordings import FAULTS, Fault, WrongRecording
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.places import Capture, PlacesDataset
 from spslam.datasets.plausibility import Finding, check_first_frames, folded, require_sound
 from spslam.datasets.plausibility.edges import TURNS, EdgeMatch
 from spslam.datasets.plausibility.flow_fit import Points, fit_flow
-from spslam.datasets.plausibility.lens import FOCAL, Lens
+from spslam.datasets.plausibility.intrinsics import CERTAIN_SIGMAS, estimate_lens
+from spslam.datasets.plausibility.lens import FOCAL, RADIAL, SHIFT_X, Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
 from spslam.datasets.plausibility.tracks import Followed, follow
 from spslam.datasets.plausibility.views import read_views
@@ -222,17 +224,50 @@ def test_a_dataset_that_is_not_registered_is_not_expected_to_be(apartment):
     assert not {"registration", "pairing"} & found(recording).keys()
 
 
-def test_a_focal_length_is_estimated_from_exact_points():
-    random = np.random.default_rng(0)
-    camera = PlacesDataset(frames=1).camera
-    true = Lens(camera, 2.0)
-    pixels = random.uniform((0, 0), (camera.width, camera.height), (200, 2))
+CAMERA = PlacesDataset(frames=1).camera
+
+
+def turned_points(angle, lens, seed=0, noise_px=0.1):
+    """Points of a camera that has turned by an angle (rad) and moved by 10 and 5 cm."""
+    random = np.random.default_rng(seed)
+    pixels = random.uniform((0, 0), (CAMERA.width, CAMERA.height), (200, 2))
     depth = random.uniform(1, 4, 200)
-    turn = np.array([[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]])
-    last = true.pixels(true.points(pixels, depth) @ turn.T + (0.1, 0, 0.05))
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    last = lens.pixels(lens.points(pixels, depth) @ turn.T + (0.1, 0, 0.05))
+    return Points(pixels, depth, last + random.normal(0, noise_px, last.shape))
+
+
+@pytest.mark.parametrize(
+    ("number", "angles", "seconds", "is_certain"),
+    [
+        (SHIFT_X, (0.2, 0.2), 4.0, True),
+        (SHIFT_X, (0.2, 0.2), 0.1, False),  # 2 rad/s: colors that are 20 ms late would look like that
+        (SHIFT_X, (0.2, -0.2), 0.1, True),  # to and fro, late colors would not
+        (RADIAL, (0.2, 0.2), 0.1, True),
+    ],
+)
+def test_a_camera_that_turns_one_way_says_less_of_its_center(number, angles, seconds, is_certain):
+    off = np.zeros(7)
+    off[number] = 0.08 if number == SHIFT_X else 0.2
+    true = Lens(CAMERA, 2.0, off)
+    segments = [turned_points(angle, true, i) for i, angle in enumerate(angles)]
+    estimate = estimate_lens(segments, Lens(CAMERA, 2.0), [seconds] * 2)
+    assert estimate.chosen[0] == number
+    assert (estimate.sigmas > CERTAIN_SIGMAS) == is_certain
+
+
+def test_late_colors_and_a_rolling_shutter_of_fast_turns_are_not_refused():
+    """The principal point looked shifted by a tenth of the image."""
+    recording = PlacesDataset("arcade", "fast_turns", "structured_light", 150, seed=41, capture=LATE)
+    recording.depth_range = (0.1, 10.0)
+    assert not [finding for finding in check_first_frames(recording) if finding.certain]
+
+
+def test_a_focal_length_is_estimated_from_exact_points():
     wrong = np.zeros(7)
     wrong[FOCAL] = 0.1
-    fit = fit_flow(Points(pixels, depth, last), Lens(camera, 2.0, wrong), [FOCAL])
+    points = turned_points(0.2, Lens(CAMERA, 2.0), noise_px=0.0)
+    fit = fit_flow(points, Lens(CAMERA, 2.0, wrong), [FOCAL])
     assert fit.numbers[FOCAL] == pytest.approx(0, abs=1e-3)
     assert fit.error_px < 0.01
     assert fit.translation == pytest.approx([0.1, 0, 0.05], abs=1e-3)

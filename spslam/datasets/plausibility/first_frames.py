@@ -22,7 +22,7 @@ from spslam.datasets.plausibility.pose_check import pose_findings
 from spslam.datasets.plausibility.streams import depth_findings, order_findings, repetition_findings, time_findings
 from spslam.datasets.plausibility.support import PREFERRED, depth_prefers, is_supported
 from spslam.datasets.plausibility.tracks import Followed, Segment, Tracks, follow
-from spslam.datasets.plausibility.views import Stretch, View, read_views, stretch_of, view_stride
+from spslam.datasets.plausibility.views import SECONDS_BETWEEN_VIEWS, Stretch, View, read_views, stretch_of, view_stride
 from spslam.errors import DatasetError
 
 # Views that are read at a time, and how many a run may be worth: reading and judging one takes about a third of the
@@ -105,7 +105,7 @@ def judge(dataset: RgbdDataset, views: Sequence[View], followed: Followed | None
     tracks = follow(views, followed)
     lens = Lens(stretch.camera, float(np.median(stretch.known_depth()[::7])))
     segments, points = _with_depth(views, tracks.segments)
-    estimate = estimate_lens(points, lens)
+    estimate = estimate_lens(points, lens, [_seconds(views, segment) for segment in segments])
     findings += _broken_findings(tracks)
     if estimate is not None:
         findings += _geometry_findings(stretch, segments, points, estimate, dataset.is_registered)
@@ -157,6 +157,12 @@ def _with_depth(views: Sequence[View], segments: Sequence[Segment]) -> tuple[lis
             kept.append(segment)
             points.append(Points(segment.pixels_first[known], depth[known], segment.pixels_last[known]))
     return kept, points
+
+
+def _seconds(views: Sequence[View], segment: Segment) -> float:
+    """From a segment's first view to its last; as views are meant to be apart where time stamps do not ascend."""
+    seconds = views[segment.last].timestamp - views[segment.first].timestamp
+    return seconds if seconds > 0 else (segment.last - segment.first) * SECONDS_BETWEEN_VIEWS
 
 
 def _broken_findings(tracks: Tracks) -> list[Finding]:

@@ -1,7 +1,9 @@
 """Are focal length, principal point, distortion and the meaning of depth as the recording says?
 
 The same seven numbers explain all segments of a stretch. Each segment's fit gives its estimate and its information, and
-their sum decides; how much segments differ beyond that widens the error. One number is named if it alone explains most.
+their sum decides; how much segments differ beyond that widens the error, and so does a camera that turns one way, of
+which late colors move all points alike and a rolling shutter stretches images. One number is named if it alone explains
+most.
 """
 
 from __future__ import annotations
@@ -9,9 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.datasets.clock import LATE_S
 from spslam.datasets.plausibility import lens as number
 from spslam.datasets.plausibility.findings import Finding
 from spslam.datasets.plausibility.flow_fit import PRIOR, FlowFit, Points, fit_flow
@@ -22,6 +26,8 @@ from spslam.datasets.plausibility.lens import Lens
 _MATTERS = np.array([0.025, 0.04, 0.025, 0.025, 0.05, 0.12, 0.04])
 # Standard deviation of what the model leaves out: rolling shutter, smoothing of tracks, biased depth.
 _MODEL_ERROR = np.array([0.005, 0.008, 0.005, 0.005, 0.012, 0.04, 0.015])
+# Which of them a camera that turns by an angle within `LATE_S` is off by as much.
+_IS_MOVED_BY_TURN = np.isin(np.arange(number.COUNT), [number.FOCAL, number.ASPECT, number.SHIFT_X, number.SHIFT_Y])
 CERTAIN_SIGMAS, DOUBTFUL_SIGMAS = 5.0, 4.0
 PREFERRED_SIGMAS = 3.0  # doubtful where depth images alone agree, which have no part in the estimate
 # Principal points farther from the given one, as a share of the image, are hardly a camera's: other things do not fit.
@@ -77,12 +83,13 @@ class LensEstimate:
         return small and (not self.matters or self.sigmas < 1.5 or self.sigmas > 2 * CERTAIN_SIGMAS)
 
 
-def estimate_lens(segments: Sequence[Points], lens: Lens) -> LensEstimate | None:
+def estimate_lens(segments: Sequence[Points], lens: Lens, seconds: Sequence[float]) -> LensEstimate | None:
     """What the segments say.
 
     Args:
         segments: points of each.
         lens: as the recording says.
+        seconds: from the first view of each segment to its last, positive.
 
     Returns:
         None where there is no segment.
@@ -95,12 +102,13 @@ def estimate_lens(segments: Sequence[Points], lens: Lens) -> LensEstimate | None
     weighted = np.sum([fit.information @ fit.numbers for fit in fits], axis=0)
     with np.errstate(divide="ignore"):
         sigma = 1 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    model_error = np.hypot(_MODEL_ERROR, LATE_S * _turning_speed(fits, seconds) * _IS_MOVED_BY_TURN)
     chosen = _choose(information, weighted)
-    values, sigmas = _judge(fits, chosen)
+    values, sigmas = _judge(fits, chosen, model_error)
     focal = float(weighted[number.FOCAL] / max(information[number.FOCAL, number.FOCAL], 1e-12))
     given = float(np.mean([fit_flow(points, lens).error_px for points in segments]))
     gain = given / max(float(np.mean([fit.error_px for fit in fits])), _LEAST_ERROR_PX)
-    return LensEstimate(lens, chosen, values, sigmas, focal, np.hypot(sigma, _MODEL_ERROR), gain)
+    return LensEstimate(lens, chosen, values, sigmas, focal, np.hypot(sigma, model_error), gain)
 
 
 def lens_finding(estimate: LensEstimate, supported: bool, preferred: bool) -> Finding | None:
@@ -139,6 +147,12 @@ def center_findings(camera: Camera) -> list[Finding]:
     return [Finding("intrinsics", text, remedy, certain=off > _CENTER_CERTAIN)]
 
 
+def _turning_speed(fits: Sequence[FlowFit], seconds: Sequence[float]) -> float:
+    """How fast the camera turns in one direction, rad/s; what it turns to and fro cancels out."""
+    turns = np.sum([cv2.Rodrigues(fit.rotation)[0][:, 0] for fit in fits], axis=0)
+    return float(np.linalg.norm(turns) / sum(seconds))
+
+
 def _start(segments: Sequence[Points], lens: Lens) -> Lens:
     """The lens with the focal length, of some, that fits best."""
     best, least = lens, np.inf
@@ -172,7 +186,7 @@ def _gain(information: np.ndarray, weighted: np.ndarray, group: list[int]) -> fl
     return float(weighted[group] @ np.linalg.solve(inside, weighted[group]))
 
 
-def _judge(fits: Sequence[FlowFit], chosen: tuple[int, ...]) -> tuple[np.ndarray, float]:
+def _judge(fits: Sequence[FlowFit], chosen: tuple[int, ...], model_error: np.ndarray) -> tuple[np.ndarray, float]:
     """Values of the chosen numbers with all others at 0, and how many standard deviations they are from 0."""
     group = list(chosen)
     parts = []
@@ -183,7 +197,7 @@ def _judge(fits: Sequence[FlowFit], chosen: tuple[int, ...]) -> tuple[np.ndarray
     mean = np.linalg.solve(total, np.sum([inside @ value for inside, value in parts], axis=0))
     spread = sum(float((value - mean) @ inside @ (value - mean)) for inside, value in parts)
     inflation = max(1.0, spread / max(len(group) * (len(parts) - 1), 1))
-    covariance = inflation * np.linalg.inv(total) + np.diag(_MODEL_ERROR[group] ** 2)
+    covariance = inflation * np.linalg.inv(total) + np.diag(model_error[group] ** 2)
     values = np.zeros(number.COUNT)
     values[group] = mean
     sigmas = float(np.sqrt(mean @ np.linalg.solve(covariance, mean) / len(group)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from spslam.datasets.clock import LATE_S
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
@@ -15,9 +16,6 @@ from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import TrackingProblem
 
 REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones features say where colors are, not depth
-# By so much the moments of a frame's depth and color may differ, or those of an image's rows: as in recordings whose
-# images are paired by time, and with a rolling shutter.
-LATE_S = 0.02
 # Of the features that agree with the earlier frame seen best: those of a frame that shares fewer contradict no pose, as
 # where the camera has turned away from it they lie at the edge of both images.
 FEW_FEATURES = 0.3
