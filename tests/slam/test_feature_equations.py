@@ -8,8 +8,10 @@ import pytest
 from spslam.geometry import pose_from, rotation_angle
 from spslam.pose_graph import rotation_matrices
 from spslam.slam.recovery.feature_equations import (
+    DEPTH_DEVIATIONS,
     INDEPENDENT_FEATURES,
     INVERSE_DEPTH_DEVIATION,
+    SeenPoints,
     SeenRays,
     point_equations,
     ray_equations,
@@ -34,6 +36,11 @@ def seen(pose, points):
     """Where a pose's image shows points, px."""
     x, y, z = MATRIX @ (pose[:3, :3].T @ (points - pose[:3, 3]).T)
     return np.stack([x / z, y / z], 1)
+
+
+def exact(points, positions):
+    """Points whose depth has no noise."""
+    return SeenPoints(points, positions, np.zeros_like(points))
 
 
 def rays_of(origin, directions, positions, beyond_m):
@@ -67,14 +74,44 @@ def test_equations_of_points_are_those_of_their_errors(random):
     positions = random.uniform([0, 0], [320, 240], (COUNT, 2))
     share = math.sqrt(min(1.0, INDEPENDENT_FEATURES / COUNT)) / WIDE_PX
     check_equations(
-        point_equations(MATRIX, points, positions, POSE, WIDE_PX),
+        point_equations(MATRIX, exact(points, positions), POSE, WIDE_PX),
         lambda step: (seen(stepped(POSE, step), points) - positions).ravel() * share,
+    )
+
+
+def check_along_epipolar_lines(found, positions_at, deviation, positions, error_px):
+    """Equations of errors that may be off by `deviation` of the parameter of `positions_at(pose, parameter)` too."""
+    along = (positions_at(POSE, 1e-5) - positions_at(POSE, -1e-5)) / 2e-5
+    assert np.linalg.norm(deviation * along, axis=1).min() > 0.5 * error_px  # it matters
+    variance = error_px**2 * np.eye(2) + deviation**2 * along[:, :, None] * along[:, None]
+    roots = np.linalg.cholesky(np.linalg.inv(variance))  # of the information, lower
+    share = math.sqrt(min(1.0, INDEPENDENT_FEATURES / COUNT))
+
+    def errors(step):
+        off = positions_at(stepped(POSE, step), 0.0) - positions
+        return share * np.einsum("nji,nj->ni", roots, off).ravel()
+
+    check_equations(found, errors)
+
+
+def test_equations_of_noisy_points_are_those_of_errors_across_their_epipolar_lines(random):
+    """As if the depth of each were solved for too."""
+    origin = POSE[:3, 3] + np.array([0.3, -0.2, 0.1])
+    points = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 2], (COUNT, 3)))
+    sight = (points - origin) / np.linalg.norm(points - origin, axis=1)[:, None]
+    positions = seen(POSE, points) + random.normal(0, 1e-3, (COUNT, 2))
+    check_along_epipolar_lines(
+        point_equations(MATRIX, SeenPoints(points, positions, 0.02 * sight), POSE, 3.0),
+        lambda pose, at: seen(pose, points + at * sight),
+        0.02 * DEPTH_DEVIATIONS,
+        positions,
+        3.0,
     )
 
 
 def test_points_behind_the_camera_tell_nothing(random):
     points = to_world(np.array([[0.1, 0.2, -1.0], [0.0, 0.0, 0.0]]))
-    agreeing, matrix, gradient = point_equations(MATRIX, points, np.zeros((2, 2)), POSE, 3.0)
+    agreeing, matrix, gradient = point_equations(MATRIX, exact(points, np.zeros((2, 2))), POSE, 3.0)
     assert agreeing == 0 and not matrix.any() and not gradient.any()
 
 
@@ -83,26 +120,14 @@ def test_equations_of_rays_are_those_of_errors_across_their_epipolar_lines(rando
     beyond_m, inverse_depth = 4.0, 0.125
     origin = POSE[:3, 3] + np.array([0.1, 0.05, -0.2])
     directions = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (COUNT, 3))) - POSE[:3, 3]
-    error_px = 3.0
 
-    def positions_at(pose, at):
-        x, y, z = MATRIX @ (pose[:3, :3].T @ (directions + at * (origin - pose[:3, 3])).T)
+    def positions_at(pose, more):
+        x, y, z = MATRIX @ (pose[:3, :3].T @ (directions + (inverse_depth + more) * (origin - pose[:3, 3])).T)
         return np.stack([x / z, y / z], 1)
 
-    positions = positions_at(POSE, inverse_depth) + random.normal(0, 1e-3, (COUNT, 2))
-    along = (positions_at(POSE, inverse_depth + 1e-5) - positions_at(POSE, inverse_depth - 1e-5)) / 2e-5
-    assert np.linalg.norm(along, axis=1).min() > 5  # the camera has moved so far that it matters
-    deviation = (
-        error_px**2 * np.eye(2) + (INVERSE_DEPTH_DEVIATION * inverse_depth) ** 2 * along[:, :, None] * along[:, None]
-    )
-    roots = np.linalg.cholesky(np.linalg.inv(deviation))  # of the information, lower
-    share = math.sqrt(min(1.0, INDEPENDENT_FEATURES / COUNT))
-
-    def errors(step):
-        off = positions_at(stepped(POSE, step), inverse_depth) - positions
-        return share * np.einsum("nji,nj->ni", roots, off).ravel()
-
-    check_equations(ray_equations(MATRIX, rays_of(origin, directions, positions, beyond_m), POSE, error_px), errors)
+    positions = positions_at(POSE, 0.0) + random.normal(0, 1e-3, (COUNT, 2))
+    found = ray_equations(MATRIX, rays_of(origin, directions, positions, beyond_m), POSE, 3.0)
+    check_along_epipolar_lines(found, positions_at, INVERSE_DEPTH_DEVIATION * inverse_depth, positions, 3.0)
 
 
 @pytest.mark.parametrize("depth_m", [2.0, 5.0, 1e4])
@@ -118,7 +143,7 @@ def test_rays_tell_how_the_camera_has_turned(random, depth_m):
     def off(with_rays):
         at = POSE
         for _ in range(10):
-            _, matrix, gradient = point_equations(MATRIX, near, shown_near, at, 3.0)
+            _, matrix, gradient = point_equations(MATRIX, exact(near, shown_near), at, 3.0)
             if with_rays:
                 _, more, toward = ray_equations(MATRIX, rays, at, 3.0)
                 matrix, gradient = matrix + more, gradient + toward

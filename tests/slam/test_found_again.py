@@ -59,6 +59,19 @@ def test_a_plane_agrees_with_itself_anywhere(recovery):
     assert (result.lost, result.consistent_frames) == (True, 0)
 
 
+@pytest.mark.parametrize(
+    ("inliers", "share", "rays", "is_lost"),
+    [(26, 0.8, 0, True), (70, 0.9, 0, False), (26, 0.9, 100, False), (70, 0.7, 0, True), (70, math.nan, 0, True)],
+)
+def test_where_surface_leaves_a_direction_free_many_features_must_agree(recovery, inliers, share, rays, is_lost):
+    """However certain it seems: 26 features had agreed with a pose that was 9 cm off along a wall."""
+    fit = replace(CERTAIN, mean_robust_weight=0.9, min_eigenvalue=0.0025)
+    fit = replace(fit, feature_inliers=inliers, feature_share=share, feature_rays=rays)
+    result = found_again(recovery, fit, CONSISTENT_FRAMES + 1)
+    assert result.error_probability < 0.02
+    assert (result.lost, result.consistent_frames) == (is_lost, 0)
+
+
 def test_an_unlikely_pose_ends_the_row(recovery):
     result = found_again(recovery, UNLIKELY, CONSISTENT_FRAMES + 1)
     assert result.error_probability > 0.1

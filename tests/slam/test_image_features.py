@@ -58,6 +58,15 @@ def pose_of(dataset, frame):
     return pose_tensor(dataset.poses()[frame], CPU)
 
 
+def some_of(matches, rows):
+    return FeatureMatches(matches.points[rows], matches.positions[rows], matches.deviations[rows])
+
+
+def exact(points, positions):
+    """Matches of points whose depth has no noise."""
+    return FeatureMatches(points, positions, np.zeros_like(points))
+
+
 def random_features(count, seed):
     random = np.random.default_rng(seed)
     descriptors = random.integers(0, 256, (count, 32), dtype=np.uint8)
@@ -126,13 +135,30 @@ def test_the_pose_needs_no_start(dataset, features, apart):
     assert alignment.inliers(matches, turned_away) == 0
 
 
+def test_noise_of_depth_is_no_contradiction_along_epipolar_lines(dataset, features):
+    """Points measured a third too far off agree with a pose 19 cm away where depth is that noisy, and with no other."""
+    pose, seen = pose_of(dataset, 12), features[0].with_depth()
+    off, z = replace(seen, points=1.33 * seen.points), float(np.median(seen.points[:, 2]))
+    rolled = pose_matrix(pose)
+    rolled[:3, :3] = rolled[:3, :3] @ rotation_matrices(np.array([0.0, 0.0, 0.2]))
+
+    def agreeing(noise, earlier, at=pose):
+        alignment = FeatureAlignment(features[12], dataset.camera, depth_noise=noise)
+        return alignment.inliers(alignment.matches(earlier, pose_of(dataset, 0)), at)
+
+    count, sure = agreeing((0.0, 0.0), seen), agreeing((0.0, 0.0), off)
+    assert sure < 0.5 * count
+    for noise in (((0.2 * z) ** 2, 0.0), (0.0, (0.2 / z) ** 2)):
+        assert agreeing(noise, off) > 0.9 * count
+        assert agreeing(noise, off, pose_tensor(rolled, CPU)) < 0.3 * count
+
+
 def test_few_or_contradictory_matches_give_no_pose(dataset, features):
     alignment = FeatureAlignment(features[0], dataset.camera)
     matches = alignment.matches(features[3].with_depth(), pose_of(dataset, 3))
-    few = type(matches)(matches.points[: MIN_INLIERS - 1], matches.positions[: MIN_INLIERS - 1])
-    assert alignment.pose(few, CPU) is None
+    assert alignment.pose(some_of(matches, np.arange(MIN_INLIERS - 1)), CPU) is None
     random = np.random.default_rng(0)
-    nonsense = type(matches)(random.uniform(-1, 1, (60, 3)) + (0, 0, 3), random.uniform(0, 120, (60, 2)))
+    nonsense = exact(random.uniform(-1, 1, (60, 3)) + (0, 0, 3), random.uniform(0, 120, (60, 2)))
     assert alignment.pose(nonsense, CPU) is None
 
 
@@ -146,7 +172,7 @@ def test_matches_with_several_frames_give_a_pose_together(dataset, features):
     for matches, wanted in zip(found, (True, False), strict=True):
         good = np.array([(tuple(at) in first) == wanted for at in matches.positions])
         near = np.flatnonzero(good)[:: good.sum() // MIN_INLIERS][: MIN_INLIERS - 1]  # all over the image
-        halves.append(type(matches)(matches.points[near], matches.positions[near]))
+        halves.append(some_of(matches, near))
     assert [alignment.pose(matches, CPU) for matches in halves] == [None, None]
     *each, together = joined_too(halves)
     assert each == halves
@@ -276,7 +302,8 @@ def test_few_features_of_a_frame_that_is_hardly_seen_contradict_nothing(dataset,
     many = image.counted(image.matches(features[2].with_depth(), pose_of(dataset, 2)), pose)
     assert many.agreeing > 40
     count = int(share * many.agreeing)
-    other = replace(many, points=many.points[:count] + 1.0, positions=many.positions[:count], agreeing=count)
+    few = some_of(many, np.arange(count))
+    other = replace(few, points=few.points + 1.0, agreeing=count)
     frame = DoubtfulFrame(SimpleNamespace(constraints=Constraints()), None, None, None, image, (many, other))
     fit = frame.with_features(Fit(), pose)
     assert (fit.feature_share < 0.2) == contradicts
@@ -338,7 +365,7 @@ def test_rays_agree_with_where_the_camera_looks_not_with_how_far_it_went(dataset
     positions = features[4].positions.astype(np.float64)
     rays = np.stack([(positions[:, 0] - k.cx) / k.fx, (positions[:, 1] - k.cy) / k.fy, np.ones(len(positions))], 1)
     seen = SeenRays(pose[:3, 3], rays @ pose[:3, :3].T, positions, np.full(len(positions), MAX_DEPTH_M))
-    matches = FeatureMatches(np.zeros((0, 3)), np.zeros((0, 2)), rays=seen)
+    matches = replace(exact(np.zeros((0, 3)), np.zeros((0, 2))), rays=seen)
 
     def agreeing(turn_deg=0.0, moved_m=0.0):
         other = pose.copy()

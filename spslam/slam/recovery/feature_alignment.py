@@ -21,7 +21,13 @@ from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.poses import pose_matrix, pose_tensor
-from spslam.slam.recovery.feature_equations import SeenRays, point_equations, ray_equations
+from spslam.slam.recovery.feature_equations import (
+    SeenPoints,
+    SeenRays,
+    agreeing_points,
+    point_equations,
+    ray_equations,
+)
 
 MAX_RATIO = 0.8  # of the distances to the best and to the second-best match
 MAX_ERROR_DEG = 0.33  # of a reprojected point, as seen from the camera: 3 px of a Kinect's 640
@@ -36,25 +42,19 @@ MIN_ALIKE = 12  # matches of these
 
 
 @dataclass(frozen=True)
-class FeatureMatches:
+class FeatureMatches(SeenPoints):
     """Surface points of an earlier frame, and where the frame shows them.
 
     Attributes:
-        points: float64 [M, 3] in the world, m.
-        positions: float64 [M, 2] in px of the intensity image.
+        points, positions, deviations: see `SeenPoints`.
         agreeing: how many of them agree with the pose that they give.
         motion_px: by how much they moved in the image since the earlier frame, their median; 0 without any.
         rays: what was matched beyond the range of depth; None where that is not kept of the earlier frame.
     """
 
-    points: np.ndarray
-    positions: np.ndarray
     agreeing: int = 0
     motion_px: float = 0.0
     rays: SeenRays | None = None
-
-    def __len__(self) -> int:
-        return len(self.points)
 
 
 class FeatureAlignment:
@@ -67,6 +67,7 @@ class FeatureAlignment:
             returned are those of depth.
         read: the features as they were read, where `features` are rectified.
         device: that compares descriptors.
+        depth_noise: a^2 (m^2) and c^2 (1/m^2) of the variance of a depth z, a^2 + c^2 z^4; none where it is not known.
 
     Attributes:
         features: see the argument.
@@ -82,8 +83,9 @@ class FeatureAlignment:
         motion: ColorMotion | None = None,
         read: ImageFeatures | None = None,
         device: torch.device | str = "cpu",
+        depth_noise: tuple[float, float] = (0.0, 0.0),
     ):
-        self._device = torch.device(device)
+        self._device, self._depth_noise = torch.device(device), depth_noise
         self.features, self.read = features, features if read is None else read
         self._motion = motion
         k = depth_image_intrinsics(camera)
@@ -103,8 +105,10 @@ class FeatureAlignment:
         before = (local @ self._matrix.T)[:, :2] / local[:, 2:]
         moved = np.linalg.norm(positions - before, axis=1)
         motion_px = float(np.median(moved)) if len(moved) else 0.0
-        points = local @ to_world[:3, :3].T + to_world[:3, 3]
-        return FeatureMatches(points, positions, motion_px=motion_px, rays=self._rays(earlier, to_world))
+        z, (floor, growth) = local[:, 2:], self._depth_noise
+        points, deviations = local @ to_world[:3, :3].T, local / z * np.sqrt(floor + growth * z**4) @ to_world[:3, :3].T
+        rays = self._rays(earlier, to_world)
+        return FeatureMatches(points + to_world[:3, 3], positions, deviations, motion_px=motion_px, rays=rays)
 
     def _rays(self, earlier: ImageFeatures, to_world: np.ndarray) -> SeenRays | None:
         """Matches beyond the range of an earlier frame's depth, whose color image is of a pose float64 [4, 4]."""
@@ -165,15 +169,14 @@ class FeatureAlignment:
             matches: with earlier frames.
             late_px: by how much the features may be off, where that is more than `max_error_px`.
         """
-        points = np.concatenate([np.zeros((0, 3)), *(one.points for one in matches)])
-        positions = np.concatenate([np.zeros((0, 2)), *(one.positions for one in matches)])
+        points = _joined(matches)
         rays = [one.rays for one in matches if one.rays is not None and len(one.rays)]
         at = before = pose_matrix(pose)
         error_px = max(self.max_error_px, late_px)
         for _ in range(HELD_ITERATIONS):
             lever = 1.0 if self._motion is None else self._motion.lever(at)
             color_pose = self._color_pose(at)
-            agreeing, features, toward = point_equations(self._matrix, points, positions, color_pose, error_px)
+            agreeing, features, toward = point_equations(self._matrix, points, color_pose, error_px)
             if agreeing < MIN_INLIERS:
                 return None
             for seen in rays:
@@ -191,19 +194,16 @@ class FeatureAlignment:
         return pose if self._motion is None else self._motion.color_pose(pose)
 
     def inliers(self, matches: FeatureMatches, pose: torch.Tensor, late_px: float = 0.0) -> int:
-        """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`.
+        """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`, and what the
+        noise of their depth may add along their epipolar lines.
 
         Args:
             matches: with an earlier frame.
             pose: of this frame.
             late_px: or to within so much, which the image may have moved since depth was measured.
         """
-        at, most_px = self._color_pose(pose_matrix(pose)), max(self.max_error_px, late_px)
-        local = at[:3, :3].T @ (matches.points - at[:3, 3]).T
-        in_front = local[2] > 0
-        projected = self._matrix[:2, :2] @ (local[:2] / np.where(in_front, local[2], 1))
-        errors = projected + self._matrix[:2, 2:] - matches.positions.T
-        return int((in_front & ((errors**2).sum(0) < most_px**2)).sum())
+        most_px = max(self.max_error_px, late_px)
+        return agreeing_points(self._matrix, matches, self._color_pose(pose_matrix(pose)), most_px)
 
     def ray_inliers(self, matches: FeatureMatches, pose: torch.Tensor) -> int:
         """How many rays agree with a pose float32 [7]: reprojected, what lies on them beyond the range of depth may be
@@ -227,8 +227,16 @@ def joined_too(matches: Sequence[FeatureMatches]) -> list[FeatureMatches]:
     some = [one for one in matches if len(one)]
     if len(some) < 2:
         return list(matches)
-    points, positions = (np.concatenate([getattr(one, name) for one in some]) for name in ("points", "positions"))
-    return [*matches, FeatureMatches(points, positions)]
+    return [*matches, _joined(some)]
+
+
+def _joined(matches: Sequence[FeatureMatches]) -> FeatureMatches:
+    """All points of several matches."""
+    points, positions, deviations = (
+        np.concatenate([np.zeros((0, columns)), *(getattr(one, name) for one in matches)])
+        for name, columns in (("points", 3), ("positions", 2), ("deviations", 3))
+    )
+    return FeatureMatches(points, positions, deviations)
 
 
 def ratio_matches(descriptors: torch.Tensor, earlier: np.ndarray) -> np.ndarray:

@@ -103,15 +103,18 @@ class PoseConfidenceModel:
         return fit.feature_inliers >= self.min_feature_inliers and fit.feature_share >= self.min_feature_share
 
     def is_held(self, fit: Fit) -> bool:
-        """Whether image features hold the pose; where the camera may be anywhere, places alike have them alike.
+        """Whether image features hold the pose; where the camera may be anywhere, places alike have them alike."""
+        return self.has_many_features(fit) and not math.isnan(fit.prediction_error_cm)
+
+    def has_many_features(self, fit: Fit) -> bool:
+        """Whether as many image features agree with the pose as hold one.
 
         Those beyond the range of depth count as well: they tell how the camera has turned, if not how far it has gone.
         """
-        is_anywhere = math.isnan(fit.prediction_error_cm)
         rays = 0.0 if math.isnan(fit.feature_rays) else fit.feature_rays
         are_enough = fit.feature_inliers >= self.min_feature_inliers
         are_enough = are_enough and fit.feature_inliers + rays >= self.min_holding_inliers
-        return are_enough and fit.feature_share >= self.min_holding_share and not is_anywhere
+        return are_enough and fit.feature_share >= self.min_holding_share
 
     def _weight_where_mapped(self, fit: Fit) -> float:
         """The mean robust weight, as it would be on a map with as few holes as those of the calibration.

@@ -249,7 +249,9 @@ class Recovery:
         keyframes = problem.constraints.depth_keyframes
         timing = None if keyframes is None else keyframes.timing
         motion = None if timing is None else history.color_motion(timing.frame)
-        return FeatureAlignment(rectified, self._camera, motion, read, problem.predicted.device)
+        noise = problem.constraints.noise
+        floor, growth = (0.0, 0.0) if noise is None else noise[:2].tolist()
+        return FeatureAlignment(rectified, self._camera, motion, read, problem.predicted.device, (floor, growth))
 
     def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
         """Poses against the last trusted frame: by image features, by ICP from the predicted pose and from its own."""
@@ -367,14 +369,17 @@ class Recovery:
 
         The error probability is computed without the prediction error. It must be at most
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
-        frames with consistent poses.
+        frames with consistent poses; and surface must leave no direction free, or many image features agree: with the
+        few of one small thing a pose may slide, and be consistent.
         """
         was_near = is_consistent(tracked.fit)
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
         tracked = self._judged(replace(tracked, fit=fit))
-        if tracked.error_probability <= self._config.tracking.relocalization_threshold and not tracked.lost:
+        is_firm = fit.min_eigenvalue >= WEAK_EIGENVALUE
+        is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
+        if is_certain and not tracked.lost and (is_firm or self._confidence.has_many_features(fit)):
             return replace(tracked, consistent_frames=0)
-        is_likely = tracked.error_probability <= LIKELY_ERROR_PROBABILITY and fit.min_eigenvalue >= WEAK_EIGENVALUE
+        is_likely = tracked.error_probability <= LIKELY_ERROR_PROBABILITY and is_firm
         frames = int(is_likely and not tracked.lost) * (1 + consistent_before * int(was_near))
         if frames >= CONSISTENT_FRAMES:
             return replace(tracked, lost=False, consistent_frames=0)
