@@ -54,7 +54,7 @@ class LensEstimate:
         values: float64 [7], theirs; 0 for others.
         sigmas: how many standard deviations they are from 0 together.
         focal: log of the factor on the focal length if that alone were off.
-        sigma: float64 [7], standard deviation of each number if it alone were off.
+        sigma: float64 [7], standard deviation of each number if it alone were off and the camera did not turn.
         gain: how many times smaller errors in pixels are with other numbers.
     """
 
@@ -108,7 +108,7 @@ def estimate_lens(segments: Sequence[Points], lens: Lens, seconds: Sequence[floa
     focal = float(weighted[number.FOCAL] / max(information[number.FOCAL, number.FOCAL], 1e-12))
     given = float(np.mean([fit_flow(points, lens).error_px for points in segments]))
     gain = given / max(float(np.mean([fit.error_px for fit in fits])), _LEAST_ERROR_PX)
-    return LensEstimate(lens, chosen, values, sigmas, focal, np.hypot(sigma, model_error), gain)
+    return LensEstimate(lens, chosen, values, sigmas, focal, np.hypot(sigma, _MODEL_ERROR), gain)
 
 
 def lens_finding(estimate: LensEstimate, supported: bool, preferred: bool) -> Finding | None:
