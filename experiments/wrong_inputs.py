@@ -40,13 +40,16 @@ from spslam.slam.system import SlamSystem
 WITHIN = 1.1
 CLEAN_SEEDS = 3
 PLAIN = Capture(color_noise=2)
-LATE = replace(PLAIN, exposure_ms=10, rolling_shutter_ms=20, color_delay_ms=15)  # as cameras in hands have it at worst
+LATE = replace(PLAIN, exposure_ms=10, rolling_shutter_ms=20, color_delay_ms=15)
 DEPTH_RANGE_M = (0.1, 10.0)
 
 
 def main() -> None:
     """Prints the table, or the false alarms."""
-    args = _parser().parse_args()
+    parser = _parser()
+    args = parser.parse_args()
+    if args.late and not args.sound:
+        parser.error("--late is of --sound")
     rows = _false_alarms(args) if args.sound else _table(args)
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1) + "\n")

@@ -13,6 +13,7 @@ from spslam.slam.recovery.feature_equations import (
     INVERSE_DEPTH_DEVIATION,
     SeenPoints,
     SeenRays,
+    agreeing_points,
     point_equations,
     ray_equations,
 )
@@ -107,6 +108,16 @@ def test_equations_of_noisy_points_are_those_of_errors_across_their_epipolar_lin
         positions,
         3.0,
     )
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.02])
+def test_points_that_agree_are_those_that_the_equations_count(random, deviation):
+    points = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 2], (COUNT, 3)))
+    deviations = deviation * (points - POSE[:3, 3] - np.array([0.3, -0.2, 0.1]))
+    shown = SeenPoints(points, seen(POSE, points) + random.normal(0, 3.0, (COUNT, 2)), deviations)
+    agreeing = agreeing_points(MATRIX, shown, POSE, 3.0)
+    assert 0 < agreeing < COUNT
+    assert agreeing == point_equations(MATRIX, shown, POSE, 3.0)[0]
 
 
 def test_points_behind_the_camera_tell_nothing(random):

@@ -1,8 +1,8 @@
 """Are focal length, principal point, distortion and the meaning of depth as the recording says?
 
 The same seven numbers explain all segments of a stretch. Each segment's fit gives its estimate and its information, and
-their sum decides; how much segments differ beyond that widens the error, and so does a camera that turns one way, of
-which late colors move all points alike and a rolling shutter stretches images. One number is named if it alone explains
+their sum decides; how much segments differ beyond that widens the error. So does a camera that turns one way: late
+colors then shift all points alike, and a rolling shutter stretches images. One number is named if it alone explains
 most.
 """
 
@@ -26,8 +26,8 @@ from spslam.datasets.plausibility.lens import Lens
 _MATTERS = np.array([0.025, 0.04, 0.025, 0.025, 0.05, 0.12, 0.04])
 # Standard deviation of what the model leaves out: rolling shutter, smoothing of tracks, biased depth.
 _MODEL_ERROR = np.array([0.005, 0.008, 0.005, 0.005, 0.012, 0.04, 0.015])
-# Which of them a camera that turns by an angle within `LATE_S` is off by as much.
-_IS_MOVED_BY_TURN = np.isin(np.arange(number.COUNT), [number.FOCAL, number.ASPECT, number.SHIFT_X, number.SHIFT_Y])
+# Those that may also be off by the angle (rad) that the camera turns in `LATE_S`.
+_SHOWS_TURN = np.isin(np.arange(number.COUNT), [number.FOCAL, number.ASPECT, number.SHIFT_X, number.SHIFT_Y])
 CERTAIN_SIGMAS, DOUBTFUL_SIGMAS = 5.0, 4.0
 PREFERRED_SIGMAS = 3.0  # doubtful where depth images alone agree, which have no part in the estimate
 # Principal points farther from the given one, as a share of the image, are hardly a camera's: other things do not fit.
@@ -102,7 +102,7 @@ def estimate_lens(segments: Sequence[Points], lens: Lens, seconds: Sequence[floa
     weighted = np.sum([fit.information @ fit.numbers for fit in fits], axis=0)
     with np.errstate(divide="ignore"):
         sigma = 1 / np.sqrt(np.maximum(np.diag(information), 1e-12))
-    model_error = np.hypot(_MODEL_ERROR, LATE_S * _turning_speed(fits, seconds) * _IS_MOVED_BY_TURN)
+    model_error = np.hypot(_MODEL_ERROR, LATE_S * _turning_speed(fits, seconds) * _SHOWS_TURN)
     chosen = _choose(information, weighted)
     values, sigmas = _judge(fits, chosen, model_error)
     focal = float(weighted[number.FOCAL] / max(information[number.FOCAL, number.FOCAL], 1e-12))

@@ -105,10 +105,11 @@ class FeatureAlignment:
         before = (local @ self._matrix.T)[:, :2] / local[:, 2:]
         moved = np.linalg.norm(positions - before, axis=1)
         motion_px = float(np.median(moved)) if len(moved) else 0.0
+        points = local @ to_world[:3, :3].T + to_world[:3, 3]
         z, (floor, growth) = local[:, 2:], self._depth_noise
-        points, deviations = local @ to_world[:3, :3].T, local / z * np.sqrt(floor + growth * z**4) @ to_world[:3, :3].T
+        deviations = np.sqrt(floor + growth * z**4) * (local / z) @ to_world[:3, :3].T
         rays = self._rays(earlier, to_world)
-        return FeatureMatches(points + to_world[:3, 3], positions, deviations, motion_px=motion_px, rays=rays)
+        return FeatureMatches(points, positions, deviations, motion_px=motion_px, rays=rays)
 
     def _rays(self, earlier: ImageFeatures, to_world: np.ndarray) -> SeenRays | None:
         """Matches beyond the range of an earlier frame's depth, whose color image is of a pose float64 [4, 4]."""

@@ -369,8 +369,8 @@ class Recovery:
 
         The error probability is computed without the prediction error. It must be at most
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
-        frames with consistent poses; and surface must leave no direction free, or many image features agree: with the
-        few of one small thing a pose may slide, and be consistent.
+        frames with consistent poses. Where surface leaves a direction free, poses that slide are consistent too: there
+        only the former counts, and many image features must agree.
         """
         was_near = is_consistent(tracked.fit)
         fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
