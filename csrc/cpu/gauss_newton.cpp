@@ -1,6 +1,9 @@
 #include "spslam/gauss_newton.h"
 
+#include <algorithm>
+
 #include "core/for_each.h"
+#include "cpu/keyframe_prefetch.h"
 #include "cpu/scene_tile.h"
 #include "cpu/term_sums.h"
 #include "kernels/gauss_newton.h"
@@ -12,6 +15,57 @@ namespace {
 // Pixels summed by one worker before its sums are added to the others', in order.
 constexpr std::int64_t kPixelGrain = 2 * kTileRows;
 
+// Pixels on their way: an iteration draws others than the one before, and the tables and images that they are looked up
+// in are far larger than the caches. So every look-up is a pass of its own, which prefetches what the next one reads.
+class DrawnPixels {
+ public:
+  // Reads count records, record(i) for i from 0 on, and looks up the cells around the points that they show.
+  template <class Record>
+  void look_up(const SceneView& scene, const Measurement& measure, const Pose<float>& pose, std::int64_t count,
+               const Record& record) {
+    const std::int32_t* records[kPointsAhead];
+    for (std::int64_t i = 0; i < count; ++i) __builtin_prefetch(records[i] = record(i));
+    size = 0;
+    for (std::int64_t i = 0; i < count; ++i) {
+      pixels[size] = unpack_pixel(records[i]);
+      if (!(pixels[size].depth > 0.0f)) continue;
+      points[size] = surface_point(pixels[size], pose, measure.options->intrinsics);
+      const Vec3<float> point_vox = (1.0f / scene.voxel_size) * points[size].world;
+      const Vec3<float> base = rounded_down(point_vox);
+      keys_[size] = cell_key(base);
+      cells[size].local = point_vox - base;
+      const std::int64_t slot = voxel_slot(keys_[size], scene.table.mask);
+      __builtin_prefetch(scene.table.keys + slot);
+      __builtin_prefetch(scene.table.values + slot);
+      for (int k = 0; k < measure.num_keyframes; ++k) {
+        prefetch_keyframe(measure.options->depth_keyframes, measure.frames->keyframes[k], points[size].world);
+      }
+      ++size;
+    }
+    for (std::int64_t i = 0; i < size; ++i) {
+      ids_[i] = keys_[i] == kEmptyVoxelKey ? kNoVoxel : find_voxel_key(scene.table, keys_[i]);
+      if (ids_[i] != kNoVoxel) __builtin_prefetch(scene.corner_ids + std::int64_t{kCellCorners} * ids_[i]);
+    }
+    for (std::int64_t i = 0; i < size; ++i) {
+      cells[i] = cell_of_voxel(scene.corner_ids, ids_[i], cells[i].local);
+      if (!cells[i].corner_ids) continue;
+      for (int k = 0; k < kCellCorners; ++k) {
+        __builtin_prefetch(scene.embeddings + kEmbeddingChannels * std::int64_t{cells[i].corner_ids[k]});
+      }
+    }
+  }
+
+  // Of those with a depth.
+  std::int64_t size = 0;
+  Pixel pixels[kPointsAhead];
+  SurfacePoint points[kPointsAhead];
+  Cell<float> cells[kPointsAhead];
+
+ private:
+  std::int64_t keys_[kPointsAhead];
+  std::int32_t ids_[kPointsAhead];
+};
+
 // Sums over pixels [begin, end), whose records `record(i)` gives: terms of the map and, from kTrackingTerms on, of the
 // depth keyframes and of the gain.
 template <class Record>
@@ -19,12 +73,12 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
                 const Pose<float>& pose, std::int64_t begin, std::int64_t end, const Record& record, double* terms) {
   const GaussNewtonOptions& options = *measure.options;
   GeometryTile tile(net);
+  DrawnPixels drawn;
   SurfacePoint points[kTileRows];
   Pixel pixels[kTileRows];
   Vec3<float> gradients[kTileRows];
   PixelNoise noise[kTileRows];
   float sdf[kTileRows];
-  const float inverse_voxel = 1.0f / scene.voxel_size;
   double* const keyframe_terms = terms + kTrackingTerms;
   double* const gain_terms = keyframe_terms + kKeyframeTerms;
   const auto add_keyframes = [&](const Pixel& pixel, const SurfacePoint& point, const PixelNoise& own,
@@ -41,22 +95,24 @@ void add_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
     }
     tile.clear();
   };
-  for (std::int64_t i = begin; i < end; ++i) {
-    const Pixel pixel = unpack_pixel(record(i));
-    if (!(pixel.depth > 0.0f)) continue;
-    const SurfacePoint point = surface_point(pixel, pose, options.intrinsics);
-    add_reference_residual(measure, pixel, point, terms, gain_terms);
-    const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point.world);
-    const PixelNoise own = noise_of(measure, pixel);
-    if (!cell.corner_ids) {
-      add_keyframes(pixel, point, own, {0.0f, false});
-      continue;
+  for (std::int64_t first = begin; first < end; first += kPointsAhead) {
+    drawn.look_up(scene, measure, pose, std::min(end - first, kPointsAhead),
+                  [&](std::int64_t i) { return record(first + i); });
+    for (std::int64_t i = 0; i < drawn.size; ++i) {
+      const Pixel& pixel = drawn.pixels[i];
+      const SurfacePoint& point = drawn.points[i];
+      add_reference_residual(measure, pixel, point, terms, gain_terms);
+      const PixelNoise own = noise_of(measure, pixel);
+      if (!drawn.cells[i].corner_ids) {
+        add_keyframes(pixel, point, own, {0.0f, false});
+        continue;
+      }
+      points[tile.size()] = point;
+      pixels[tile.size()] = pixel;
+      noise[tile.size()] = own;
+      tile.add(scene, point.world, drawn.cells[i]);
+      if (tile.full()) flush();
     }
-    points[tile.size()] = point;
-    pixels[tile.size()] = pixel;
-    noise[tile.size()] = own;
-    tile.add(scene, point.world, cell);
-    if (tile.full()) flush();
   }
   if (tile.size()) flush();
 }

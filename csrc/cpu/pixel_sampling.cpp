@@ -73,11 +73,17 @@ void write_images(const RgbdImage& image, const PixelSampling& sampling, PaddedD
 // Draws pixels [first, first + n) of the frame.
 void draw_batch(const RgbdImage& image, PaddedDepth& depth, const std::int32_t* valid, std::int64_t num_valid,
                 PhiloxKey key, const PixelSampling& sampling, std::int64_t first, int n, const SampledPixels& out) {
+  const std::int32_t* drawn[kPixelBatch];
   std::int32_t u[kPixelBatch], v[kPixelBatch];
   for (int i = 0; i < n; ++i) {
-    const std::int32_t place = valid[philox_index(key, static_cast<std::uint32_t>(first + i), num_valid)];
+    drawn[i] = valid + philox_index(key, static_cast<std::uint32_t>(first + i), num_valid);
+    __builtin_prefetch(drawn[i]);
+  }
+  for (int i = 0; i < n; ++i) {
+    const std::int32_t place = *drawn[i];
     v[i] = place / image.width;
     u[i] = place - v[i] * image.width;
+    __builtin_prefetch(image.color + 3 * static_cast<std::int64_t>(place));
   }
   const DepthImage whole{image.depth,
                          image.width,

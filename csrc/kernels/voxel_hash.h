@@ -95,23 +95,38 @@ struct Cell {
   Vec3<T> local;
 };
 
+// Packed coordinate of the cell whose lowest corner is `base`, of whole numbers; kEmptyVoxelKey for NaN and out of range.
+template <class T>
+SPS_INLINE std::int64_t cell_key(const Vec3<T>& base) {
+  constexpr T kLow = static_cast<T>(kVoxelCoordMin), kHigh = static_cast<T>(kVoxelCoordMax);
+  const bool in_range =
+      base.x >= kLow && base.x <= kHigh && base.y >= kLow && base.y <= kHigh && base.z >= kLow && base.z <= kHigh;
+  if (!in_range) return kEmptyVoxelKey;
+  return pack_voxel(
+      {static_cast<std::int32_t>(base.x), static_cast<std::int32_t>(base.y), static_cast<std::int32_t>(base.z)});
+}
+
+// The cell whose lowest corner has that id, which may be kNoVoxel, around a point that is at `local` in it.
+template <class T>
+SPS_INLINE Cell<T> cell_of_voxel(const std::int32_t* corner_ids, std::int32_t id, const Vec3<T>& local) {
+  const std::int32_t* row = id == kNoVoxel ? nullptr : corner_ids + static_cast<std::int64_t>(kCellCorners) * id;
+  if (!row || row[0] == kNoVoxel) return {nullptr, {T(0), T(0), T(0)}};
+  return {row, local};
+}
+
+template <class T>
+SPS_INLINE Vec3<T> rounded_down(const Vec3<T>& v) {
+  return {std::floor(v.x), std::floor(v.y), std::floor(v.z)};
+}
+
 // The cell around a point given in voxel units (world point / voxel size). One probe: the row beside the lowest corner
 // names the other seven. NaN and far away points are outside.
 template <class T>
 SPS_INLINE Cell<T> find_cell(const VoxelTable& table, const std::int32_t* corner_ids, const Vec3<T>& point_vox) {
-  const Vec3<T> base{std::floor(point_vox.x), std::floor(point_vox.y), std::floor(point_vox.z)};
-  Cell<T> cell{nullptr, {T(0), T(0), T(0)}};
-  constexpr T kLow = static_cast<T>(kVoxelCoordMin), kHigh = static_cast<T>(kVoxelCoordMax);
-  const bool in_range =
-      base.x >= kLow && base.x <= kHigh && base.y >= kLow && base.y <= kHigh && base.z >= kLow && base.z <= kHigh;
-  if (!in_range) return cell;
-  const VoxelCoord coord{static_cast<std::int32_t>(base.x), static_cast<std::int32_t>(base.y),
-                         static_cast<std::int32_t>(base.z)};
-  const std::int32_t id = find_voxel_key(table, pack_voxel(coord));
-  if (id == kNoVoxel) return cell;
-  const std::int32_t* row = corner_ids + static_cast<std::int64_t>(kCellCorners) * id;
-  if (row[0] == kNoVoxel) return cell;
-  return {row, point_vox - base};
+  const Vec3<T> base = rounded_down(point_vox);
+  const std::int64_t key = cell_key(base);
+  const std::int32_t id = key == kEmptyVoxelKey ? kNoVoxel : find_voxel_key(table, key);
+  return cell_of_voxel(corner_ids, id, point_vox - base);
 }
 
 }  // namespace spslam
