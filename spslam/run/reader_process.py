@@ -1,8 +1,9 @@
 """Frames prepared by the threads of another process, so that they don't compete with the frame loop for Python's GIL.
 
 Both processes map the same memory, divided into slots that hold one frame's pixels each. Over a socket the loop sends
-the work and then the numbers of slots that are free again; the reader sends one message per frame. Either side detects
-by the closed socket that the other has ended, for whatever reason; the system frees the memory with the last of them.
+the work and then the numbers of slots that are free again; the reader says that it is ready and sends one message per
+frame. Either side detects by the closed socket that the other has ended, for whatever reason; the system frees the
+memory with the last of them.
 """
 
 import contextlib
@@ -63,7 +64,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._memory, self._wanted = shared
         self._blank, self._uploader, self._kind = blank, uploader, kind
         self._in_use: deque[tuple[int, Upload]] = deque()
-        self._has_started = self._has_ended = self._is_locked = False
+        self._has_ended = self._is_locked = False
         # Each frame asks; `Connection.poll` would make another one each time.
         self._poll = select.poll()
         self._poll.register(connection.fileno(), select.POLLIN)
@@ -78,7 +79,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         ahead: int,
         uploader: Uploader | None,
     ) -> "ReaderProcess":
-        """Starts the process, or takes the standby reader. It reads nothing before the first frame is requested.
+        """Starts the process, or takes the standby reader. It reads the first frames at once, with image features, while
+        the loop's process loads kernels.
 
         Args:
             dataset: the frames.
@@ -107,6 +109,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         os.ftruncate(reader.shared, SharedFrames.size(slots, words))
         shared = SharedFrames.mapped(reader.shared, slots, words)
         os.close(reader.shared)
+        shared.wanted[0] = True
         with contextlib.suppress(*DISCONNECTED):
             reader.connection.send_bytes(content)
         return cls(reader.process, reader.connection, shared, blank, uploader, type(dataset))
@@ -137,9 +140,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._wanted[0] = wanted
 
     def is_ready(self) -> bool:
-        """Whether the next frame, or what there is instead, is there; the first has to be requested."""
-        is_reading = self._has_started and not self._has_ended and not self._connection.closed
-        return is_reading and bool(self._poll.poll(0))
+        """Whether the next frame, or what there is instead, is there, once the process is."""
+        return not self._has_ended and not self._connection.closed and bool(self._poll.poll(0))
 
     def __next__(self) -> PreparedFrame | DatasetError:
         try:
@@ -171,9 +173,6 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
     def _receive(self) -> PreparedFrame | DatasetError:
         if self._has_ended or self._connection.closed:
             raise StopIteration
-        if not self._has_started:
-            self._connection.send(None)
-            self._has_started = True
         self._return_slots()
         message = Message(*self._connection.recv())
         _check_failure(message)

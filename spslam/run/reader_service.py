@@ -127,13 +127,12 @@ def serve(socket: int, shared: int) -> None:
 
 
 def _serve(work: Work, shared: SharedFrames, connection: Connection) -> None:
-    """Says that it is ready, waits until the first frame is requested, and sends all."""
+    """Says that it is ready, and sends all frames."""
     extracts = (lambda: bool(shared.wanted[0])) if _is_shared_out(work, MIN_EXTRACTING) else None
     preparation = FramePreparation(work.dataset, work.config, work.start, extracts=extracts)
     # That takes tenths of a second; meanwhile the loop's process loads kernels.
     with _shared_out(work, preparation, connection) as source:
         connection.send(True)
-        connection.recv()
         _send_frames(work, preparation, source, shared.slots, connection)
 
 

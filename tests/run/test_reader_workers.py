@@ -60,13 +60,14 @@ def test_frames_are_those_of_threads(change, start):
 
 @pytest.mark.parametrize(("wanted", "workers", "are_extracted"), [(True, 4, True), (False, 4, False), (True, 3, False)])
 def test_features_are_extracted_ahead_while_they_are_wanted(wanted, workers, are_extracted):
-    """By as many processes as do that without holding up the loop."""
-    config = settings("run.reader=process", f"run.prefetch_workers={workers}")
-    with FrameFeed(Recorded(9, is_random_access=True), config, torch.device("cpu")) as feed:
+    """By as many processes as do that without holding up the loop; the first frames are read before it says so."""
+    ahead = 8
+    config = settings("run.reader=process", f"run.prefetch_workers={workers}", f"run.prefetch_ahead={ahead}")
+    with FrameFeed(Recorded(3 * ahead, is_random_access=True), config, torch.device("cpu")) as feed:
         feed.prepare()
         feed.want_features(wanted)
         extracted = [frame.pixels.features is not None for frame in feed]
-    assert all(extracted[2:]) == any(extracted[2:]) == are_extracted
+    assert all(extracted[ahead:]) == any(extracted[ahead:]) == are_extracted
     assert extracted[:2] == [True, True]  # those of the first two are needed in any case
 
 
