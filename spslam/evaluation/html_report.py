@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import os
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from spslam.errors import ConfigError
 from spslam.evaluation.html_parts import section, security_policy, table, web_file
 from spslam.evaluation.report_charts import error_section, time_section, tracking_section, trajectory_section
 from spslam.evaluation.report_map import outward_mesh, overview_figure, views_section
-from spslam.evaluation.report_view import LIBRARY, view_3d
-from spslam.evaluation.run_output import RunOutput
+from spslam.evaluation.report_view import LIBRARY, packed_mesh, view_3d
+from spslam.evaluation.run_output import Mesh, RunOutput
 from spslam.evaluation.verdict import judge_run, number
 from spslam.io import atomic_write
 
@@ -63,14 +64,21 @@ def write_report(output_dir: str | os.PathLike) -> Path:
     above = [_header(run), _verdict(run, config), _tiles(run.metrics), _warnings(run.metrics)]
     below = [views_section(run, mesh), error_section(run), time_section(run), tracking_section(run)]
     below += [_paper_table(run.metrics), _command(run, config), _figures(run.metrics), _settings(run)]
-    still = "" if mesh is None else overview_figure(run, mesh)
+    still, packed = ("", None) if mesh is None else _pictured(run, mesh)
     used = _size([*above, *below, trajectory_section(run, "")]) + _RESERVED_BYTES
-    view = view_3d(run, mesh, still, MAX_BYTES - used) if len(run.trajectory) else ""
+    view = view_3d(run, mesh, packed, still, MAX_BYTES - used) if len(run.trajectory) else ""
     of_map = "" if mesh is None else section("Map", view)
     trajectory = trajectory_section(run, view if mesh is None else "")
     path = run.folder.report
     atomic_write(path, _encoded(_page(run, [*above, of_map, below[0], trajectory, *below[1:]])))
     return path
+
+
+def _pictured(run: RunOutput, mesh: Mesh) -> tuple[str, dict[str, Any] | None]:
+    """The mesh from above, and as the 3-D view shows it."""
+    with ThreadPoolExecutor(1) as beside:  # NumPy and zlib work without Python's lock
+        packed = beside.submit(packed_mesh, mesh)
+        return overview_figure(run, mesh), packed.result()
 
 
 def _size(parts: list[str]) -> int:

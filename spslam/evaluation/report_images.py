@@ -11,6 +11,7 @@ from spslam.camera import Camera
 from spslam.evaluation.run_output import Mesh
 from spslam.geometry import pose_from
 from spslam.meshing.render import rasterize, render_mesh
+from spslam.meshing.shading import cross
 
 _ELEVATION = np.radians(48)
 _OVERVIEW = Camera(1200, 750, 1350.0, 1350.0, 599.5, 374.5)
@@ -52,10 +53,11 @@ def depth_limits(*depths: np.ndarray) -> tuple[float, float]:
 def outward_faces(mesh: Mesh, camera: Camera, pose: np.ndarray) -> np.ndarray:
     """The faces of a mesh, all flipped if most faces that the camera sees show it their back."""
     small = camera.resized(camera.width // 2, camera.height // 2)
-    front = rasterize(mesh.vertices, mesh.faces, small, pose, cull_back=True).face_ids >= 0
-    any_side = rasterize(mesh.vertices, mesh.faces, small, pose).face_ids >= 0
-    flipped = rasterize(mesh.vertices, mesh.faces[:, ::-1], small, pose, cull_back=True).face_ids >= 0
-    return mesh.faces if (front & any_side).sum() >= (flipped & any_side).sum() else mesh.faces[:, ::-1]
+    seen = rasterize(mesh.vertices, mesh.faces, small, pose).face_ids
+    corners = mesh.vertices[mesh.faces[seen[seen >= 0]]]
+    normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    towards = np.einsum("nk,nk->n", normals, pose[:3, 3] - corners[:, 0])
+    return mesh.faces if (towards >= 0).sum() >= (towards < 0).sum() else mesh.faces[:, ::-1]
 
 
 def render_overview(mesh: Mesh, faces: np.ndarray, poses: np.ndarray) -> np.ndarray:

@@ -38,12 +38,18 @@ _LAYERS = (
 _OFF_AT_FIRST = "backs"
 
 
-def view_3d(run: RunOutput, mesh: Mesh | None, still: str, max_bytes: int) -> str:
+def packed_mesh(mesh: Mesh) -> dict[str, Any] | None:
+    """A mesh as the page's script reads it, of so many faces as a phone draws; None where none is left."""
+    return _packed(simplify_mesh(mesh, MAX_FACES))
+
+
+def view_3d(run: RunOutput, mesh: Mesh | None, packed: dict[str, Any] | None, still: str, max_bytes: int) -> str:
     """The 3-D view of a run.
 
     Args:
         run: the run, of at least one frame.
         mesh: its mesh with the front faces towards the observed space; None shows the path alone.
+        packed: that mesh by `packed_mesh`.
         still: HTML that stands for the view in print and where there is no WebGL.
         max_bytes: largest size of the result. The mesh is simplified until it fits; the rest always does that fits
             into 1 MB.
@@ -58,7 +64,7 @@ def view_3d(run: RunOutput, mesh: Mesh | None, still: str, max_bytes: int) -> st
     parts = [_controls(shown, scene["frames"]), f'<div class="still">{still}</div>', library]
     if mesh is not None:
         used = sum(len(part.encode()) for part in parts) + len(encode_json(scene))
-        scene["mesh"] = _fitting_mesh(mesh, max_bytes - used)
+        scene["mesh"] = _fitting_mesh(mesh, packed, max_bytes - used)
     data = f'<script type="application/json" id="view-data">{encode_json(scene)}</script>'
     return f'<div class="view3d" id="view3d">{"".join(parts)}{data}</div>'
 
@@ -66,18 +72,20 @@ def view_3d(run: RunOutput, mesh: Mesh | None, still: str, max_bytes: int) -> st
 _OF_MESH = ("mesh", "backs")
 
 
-def _fitting_mesh(mesh: Mesh, max_bytes: int) -> dict[str, Any] | None:
-    """The mesh, simplified until its text has at most so many bytes; None if not even a coarse one has."""
-    count = MAX_FACES
-    while count >= _FEWEST_FACES:
-        simple = simplify_mesh(mesh, count)
-        # A mesh of nothing but slivers may leave nothing.
-        packed = pack_mesh(simple) if len(simple.faces) else None
+def _fitting_mesh(mesh: Mesh, packed: dict[str, Any] | None, max_bytes: int) -> dict[str, Any] | None:
+    """The packed mesh, or one of fewer faces that fits into so many bytes of text; None if not even a coarse one does."""
+    while packed is not None:
         size = len(encode_json(packed))
         if size <= max_bytes:
             return packed
-        count = int(0.95 * len(simple.faces) * max(max_bytes, 0) / size)
+        count = int(0.95 * packed["faces"] * max(max_bytes, 0) / size)
+        packed = _packed(simplify_mesh(mesh, count)) if count >= _FEWEST_FACES else None
     return None
+
+
+def _packed(mesh: Mesh) -> dict[str, Any] | None:
+    """None without faces: a mesh of nothing but slivers may have none left."""
+    return pack_mesh(mesh) if len(mesh.faces) else None
 
 
 def _path(run: RunOutput) -> tuple[dict[str, Any], set[str]]:

@@ -132,19 +132,20 @@ class _Setup:
         inverse_z = 1 / corners[..., 2]
         u = corners[..., 0] * inverse_z * camera.fx + camera.cx
         v = corners[..., 1] * inverse_z * camera.fy + camera.cy
-        left, right = _pixel_range(u, camera.width)
-        top, bottom = _pixel_range(v, camera.height)
-        u0, v0 = u[:, 0], v[:, 0]
-        du1, dv1, du2, dv2 = u[:, 1] - u0, v[:, 1] - v0, u[:, 2] - u0, v[:, 2] - v0
+        du1, dv1, du2, dv2 = u[:, 1] - u[:, 0], v[:, 1] - v[:, 0], u[:, 2] - u[:, 0], v[:, 2] - v[:, 0]
         area = du1 * dv2 - du2 * dv1
         # Counter-clockwise in a world with y up is clockwise in an image with v down.
-        visible = (area < 0) if cull_back else (area != 0)
-        keep = np.flatnonzero(visible & (right >= left) & (bottom >= top))
+        visible = np.flatnonzero((area < 0) if cull_back else (area != 0))
+        left, right = _pixel_range(u[visible], camera.width)
+        top, bottom = _pixel_range(v[visible], camera.height)
+        shown = np.flatnonzero((right >= left) & (bottom >= top))
+        left, right, top, bottom = left[shown], right[shown], top[shown], bottom[shown]
         # Small triangles first, so that the triangles of a chunk are of similar size.
-        pixels = (right[keep] - left[keep] + 1) * (bottom[keep] - top[keep] + 1)
-        keep = keep[np.argsort(pixels, kind="stable")]
+        order = np.argsort((right - left + 1) * (bottom - top + 1), kind="stable")
+        left, right, top, bottom = left[order], right[order], top[order], bottom[order]
+        keep = visible[shown[order]]
         scale = 1 / area[keep]
-        x0, y0 = left[keep] - u0[keep], top[keep] - v0[keep]
+        x0, y0 = left - u[keep, 0], top - v[keep, 0]
         b1, c1 = dv2[keep] * scale, -du2[keep] * scale
         b2, c2 = -dv1[keep] * scale, du1[keep] * scale
         first = np.stack([b1 * x0 + c1 * y0, b1, c1], axis=-1)
@@ -153,8 +154,7 @@ class _Setup:
         depth = first * (z1 - z0) + second * (z2 - z0)
         depth[:, 0] += z0[:, 0]
         planes = np.stack([first, second, depth], axis=1).astype(np.float32)
-        width, height = right[keep] - left[keep] + 1, bottom[keep] - top[keep] + 1
-        return cls(ids[keep], left[keep], top[keep], width, height, planes)
+        return cls(ids[keep], left, top, right - left + 1, bottom - top + 1, planes)
 
     def chunks(self) -> list[slice]:
         """Slices of triangles whose boxes have about `_FRAGMENTS` pixels in total."""
@@ -246,6 +246,7 @@ def _clip_edge(behind: np.ndarray, before: np.ndarray) -> np.ndarray:
 
 def _pixel_range(coordinates: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """First and last pixel center in the extent of a triangle, inside the image; first > last if there is none."""
-    first = np.clip(np.ceil(coordinates.min(axis=1)), 0, size)
-    last = np.clip(np.floor(coordinates.max(axis=1)), -1, size - 1)
+    a, b, c = coordinates.T  # column by column: NumPy's reductions over three numbers take five times as long
+    first = np.clip(np.ceil(np.minimum(np.minimum(a, b), c)), 0, size)
+    last = np.clip(np.floor(np.maximum(np.maximum(a, b), c)), -1, size - 1)
     return first.astype(np.int64), last.astype(np.int64)

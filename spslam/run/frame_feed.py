@@ -31,8 +31,8 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
     another process do not compete with the frame loop for Python's GIL. If `run.reader` is `auto`, a dataset that no
     other process can read is read by threads of this one; if it is `process`, that is an error. At most
-    `run.prefetch_ahead` frames exist at the same time. Another process reads the first ones while this one loads kernels;
-    threads begin when the first one is requested.
+    `run.prefetch_ahead` frames exist at the same time. Another process reads the first ones while this one loads
+    kernels; threads begin when the first one is requested.
 
     Args:
         dataset: the frames.

@@ -79,8 +79,8 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         ahead: int,
         uploader: Uploader | None,
     ) -> "ReaderProcess":
-        """Starts the process, or takes the standby reader. It reads the first frames at once, with image features, while
-        the loop's process loads kernels.
+        """Starts the process, or takes the standby reader. It reads the first frames at once, with image features,
+        while the loop's process loads kernels.
 
         Args:
             dataset: the frames.
