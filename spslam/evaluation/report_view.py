@@ -73,7 +73,7 @@ _OF_MESH = ("mesh", "backs")
 
 
 def _fitting_mesh(mesh: Mesh, packed: dict[str, Any] | None, max_bytes: int) -> dict[str, Any] | None:
-    """The packed mesh, or one of fewer faces that fits into so many bytes of text; None if not even a coarse one does."""
+    """The packed mesh, or one of fewer faces that fits into so many bytes; None if not even a coarse one does."""
     while packed is not None:
         size = len(encode_json(packed))
         if size <= max_bytes:

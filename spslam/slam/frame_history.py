@@ -15,6 +15,10 @@ from spslam.slam.state import SlamState
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
 RECENT_COMPARED = 16
 MAX_MOTION_S = 0.12  # between two frames; over a longer time the camera hardly moves evenly
+# At least between the two that say where a color image was taken. What a pose is off by moves the color image that the
+# next one is found by: with color half of that time before depth it would be off as much to the other side, and with
+# more than half farther and farther (docs/experiments/2026-11-color-before-depth.md).
+COLOR_MOTION_S = 0.025
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,7 @@ class FrameHistory:
         if selected is None:
             return None
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
-        motion = self.motion(len(frames), depth_time, color_offset)
+        motion = self.motion(len(frames), depth_time, color_offset, COLOR_MOTION_S)
         timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
         exposure = ops.Exposure(frames.log_gain_rows, frames.gains[-1])
         return selected._replace(timing=timing, exposure=exposure)
@@ -132,23 +136,29 @@ class FrameHistory:
         return self._state.frames.log_gain_rows[row]
 
     def own_motion(self, row: int) -> ops.FrameMotion:
-        """How the camera came to the frame of a row."""
+        """How the camera came to the frame of a row, as its color image is moved by."""
         frames = self._state.frames
-        return self.motion(row, frames.depth_time(row), frames.color_offset(row))
+        return self.motion(row, frames.depth_time(row), frames.color_offset(row), COLOR_MOTION_S)
 
-    def motion(self, row: int, depth_time: float | None, color_offset: float = 0.0) -> ops.FrameMotion:
+    def motion(
+        self, row: int, depth_time: float | None, color_offset: float = 0.0, least_s: float = 0.0
+    ) -> ops.FrameMotion:
         """How the camera came to the frame of a row, or to the next one, from the frame before.
 
         Args:
             row: of the frame.
             depth_time: when its depth image was taken, s; None where that is not known.
             color_offset: from there to its color image, s, as stamps say.
+            least_s: from a frame that is older by so much, if those between are trusted.
         """
         frames = self._state.frames
         if depth_time is None or row <= frames.opened or frames.is_lost(row - 1):
             return ops.NO_MOTION
-        seconds = depth_time - frames.depth_time(row - 1)
-        return ops.FrameMotion(row - 1, seconds, color_offset) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
+        before, seconds = row - 1, depth_time - frames.depth_time(row - 1)
+        while 0 < seconds < least_s and before > frames.opened and not frames.is_lost(before - 1):
+            before -= 1
+            seconds = depth_time - frames.depth_time(before)
+        return ops.FrameMotion(before, seconds, color_offset) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
 
     def color_motion(self, motion: ops.FrameMotion) -> ColorMotion | None:
         """How a frame's color image moved on from its depth image; None where the two are of one moment, or nothing

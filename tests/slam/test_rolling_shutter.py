@@ -19,6 +19,7 @@ from spslam.pose_graph import rotation_matrices
 from spslam.slam import fit, rolling_shutter, tracker
 from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
+from spslam.slam.frame_history import COLOR_MOTION_S
 from spslam.slam.image_features import extract_features
 from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_tensor
@@ -107,6 +108,21 @@ def test_unknown_motion_is_not_made_up():
     assert history.motion(4, float(frames.timestamps[3]) + 1.0) == ops.NO_MOTION
     frames.lost[-1] = True
     assert history.motion(4, 4 * INTERVAL) == ops.NO_MOTION
+
+
+@pytest.mark.parametrize(("rate_hz", "before"), [(30, 3), (60, 2), (90, 1), (200, 0)])
+def test_colors_are_moved_by_the_way_of_as_long_as_a_thirtieth_of_a_second(rate_hz, before):
+    """Over less, a pose that is off would throw the next one off by more, where color comes before depth. But not past
+    a frame that is lost."""
+    system = SlamSystem(settings("device=cpu", preset="fast"), Recorded(5).camera)
+    for i in range(4):
+        system.process(replace(Recorded(5)[i], timestamp=i / rate_hz))
+    history, frames = system.history, system.state.frames
+    assert history.motion(4, 4 / rate_hz).row == 3
+    assert history.motion(4, 4 / rate_hz, least_s=COLOR_MOTION_S).row == before
+    assert history.own_motion(3).row == max(before - 1, 0)
+    frames.lost[2] = True
+    assert history.motion(4, 4 / rate_hz, least_s=COLOR_MOTION_S).row == 3
 
 
 def test_times_of_images_come_from_their_offsets(tmp_path):
