@@ -19,7 +19,8 @@ class FrameMotion(NamedTuple):
     """How the camera came to a frame.
 
     Attributes:
-        row: of the pose before, in `DepthKeyframes.poses`; negative where it is unknown.
+        row: of an earlier pose, in `DepthKeyframes.poses`; negative where it is unknown. Where color comes before
+            depth, one more than twice as long before: else its error comes back with the other sign, and larger.
         seconds: since that pose, s.
         color_offset: from the frame's depth image to its color image, s, as their stamps say.
     """
@@ -76,7 +77,7 @@ class ReferenceImage(NamedTuple):
 
 
 class ColorTiming(NamedTuple):
-    """When color images are taken; the camera is taken to move on as it came from the frame before.
+    """When color images are taken; the camera is taken to move on as it came.
 
     Attributes:
         delay: float32 [1] from a frame's depth image to its color image beside its motion's `color_offset`, s, negative

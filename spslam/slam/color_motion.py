@@ -17,7 +17,7 @@ class ColorMotion:
     """From the pose at which a frame's depth was measured to that of its color image, on one path.
 
     Attributes:
-        before: float64 [4, 4] T_world_camera of the frame before.
+        before: float64 [4, 4] T_world_camera of an earlier frame, see `FrameHistory.own_motion`.
         share: of the motion since, which comes on top until the color image; negative where color comes first.
     """
 
