@@ -95,7 +95,8 @@ struct Cell {
   Vec3<T> local;
 };
 
-// Packed coordinate of the cell whose lowest corner is `base`, of whole numbers; kEmptyVoxelKey for NaN and out of range.
+// Packed coordinate of the cell whose lowest corner is `base`, of whole numbers; kEmptyVoxelKey for NaN and out of
+// range.
 template <class T>
 SPS_INLINE std::int64_t cell_key(const Vec3<T>& base) {
   constexpr T kLow = static_cast<T>(kVoxelCoordMin), kHigh = static_cast<T>(kVoxelCoordMax);
