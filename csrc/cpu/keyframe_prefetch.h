@@ -11,8 +11,8 @@ namespace spslam {
 // Points whose look-ups are under way together.
 constexpr std::int64_t kPointsAhead = 32;
 
-// Reads what will be needed soon. Nobody waits for it, and unlike a prefetch it is not dropped where the address of the
-// page has to be looked up first.
+// Reads what will be needed soon; nothing waits for the value. For images that saves more time than a prefetch
+// (docs/experiments/2026-11-waiting-for-memory.md).
 template <class T>
 inline void touch(const T* at) {
   (void)*static_cast<const volatile T*>(at);

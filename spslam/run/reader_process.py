@@ -140,7 +140,7 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         self._wanted[0] = wanted
 
     def is_ready(self) -> bool:
-        """Whether the next frame, or what there is instead, is there, once the process is."""
+        """Whether the next frame, or what there is instead, is there; to be asked after `wait_until_ready`."""
         return not self._has_ended and not self._connection.closed and bool(self._poll.poll(0))
 
     def __next__(self) -> PreparedFrame | DatasetError:

@@ -136,7 +136,7 @@ class FrameHistory:
         return self._state.frames.log_gain_rows[row]
 
     def own_motion(self, row: int) -> ops.FrameMotion:
-        """How the camera came to the frame of a row, as its color image is moved by."""
+        """How the camera came to the frame of a row, from one `COLOR_MOTION_S` before: this places its color image."""
         frames = self._state.frames
         return self.motion(row, frames.depth_time(row), frames.color_offset(row), COLOR_MOTION_S)
 

@@ -111,9 +111,9 @@ def test_unknown_motion_is_not_made_up():
 
 
 @pytest.mark.parametrize(("rate_hz", "before"), [(30, 3), (60, 2), (90, 1), (200, 0)])
-def test_colors_are_moved_by_the_way_of_as_long_as_a_thirtieth_of_a_second(rate_hz, before):
-    """Over less, a pose that is off would throw the next one off by more, where color comes before depth. But not past
-    a frame that is lost."""
+def test_colors_are_moved_by_the_way_since_a_frame_that_is_old_enough(rate_hz, before):
+    """25 ms: over less, a pose that is off would throw the next one off by more, where color comes before depth. But
+    not past a frame that is lost, nor before the first."""
     system = SlamSystem(settings("device=cpu", preset="fast"), Recorded(5).camera)
     for i in range(4):
         system.process(replace(Recorded(5)[i], timestamp=i / rate_hz))
