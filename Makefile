@@ -33,10 +33,10 @@ demo: dev ## track and map a generated room with exact ground truth, into runs/d
 test: dev ## build, then run the tests on the CPU, without the slow sweeps
 	$(PYTEST)
 
-test-all: dev ## the same with the slow tests, as CI does
+test-all: dev ## the same with the slow tests, before a change lands
 	$(PYTEST) -m "not sweep"
 
-test-sweeps: dev ## the long sweeps that CI leaves out
+test-sweeps: dev ## the longest sweeps, which test-all leaves out too
 	$(PYTEST) -m sweep
 
 test-gpu: ## run the tests that need a CUDA device, with the kernels that are there: built in place, or a wheel's

@@ -24,7 +24,6 @@ def outcomes():
     return list(run_trials(settings(preset="fast"), dataset, plan(dataset, 1, 0), torch.device("cpu")))
 
 
-@pytest.mark.slow
 def test_every_fault_is_noticed_and_the_camera_found_again(outcomes):
     assert sorted(outcome.trial.fault for outcome in outcomes) == ["black-out", "cover", "jump", "return"]
     for outcome in outcomes:
@@ -33,7 +32,6 @@ def test_every_fault_is_noticed_and_the_camera_found_again(outcomes):
         assert outcome.error_cm < 3, outcome
 
 
-@pytest.mark.slow
 def test_the_map_is_not_touched_while_lost(outcomes):
     assert [outcome.voxels_added for outcome in outcomes] == [0] * 4
 
