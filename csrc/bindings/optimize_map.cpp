@@ -21,19 +21,33 @@ void check_size(const Tensor& tensor, std::int64_t size, const char* name) {
 
 // Places in the op's lists of numbers; spslam/ops/optimize_map.py fills them. A rate below 0 freezes its parameters.
 enum class Rate { kEmbeddings, kTexels, kGeometryParams, kColorParams, kPoses, kCount };
-enum class Integer { kPixelStream, kNumPixels, kIterations, kFixedFrame, kFirstStep, kFirstStamp, kGraph, kCount };
+enum class Integer {
+  kPixelStream,
+  kNumPixels,
+  kIterations,
+  kFixedFrame,
+  kFirstStep,
+  kFirstColorStep,
+  kFirstStamp,
+  kGraph,
+  kCount
+};
 
 // Hands out the moments of the parameters that are not frozen, which come in the order of Rate: exp_avg and exp_avg_sq,
 // and gradients and stamps of a table.
 class Moments {
  public:
-  Moments(const std::vector<Tensor>& tensors, const Scalars<Rate>& rates) : tensors_(tensors), rates_(rates) {}
+  Moments(const std::vector<Tensor>& tensors, const Scalars<Rate>& rates, std::int64_t first_step,
+          std::int64_t first_color_step)
+      : tensors_(tensors), rates_(rates), first_step_(first_step), first_color_step_(first_color_step) {}
 
   AdamState state(Rate rate, const Tensor& param, std::int64_t size, const char* name) {
     if (!(rates_[rate] >= 0.0)) return {};
     float* const values = checked<float>(param, size, name);
     float* const exp_avg = checked<float>(next(name), size, name);
-    return {values, exp_avg, checked<float>(next(name), size, name), rates_[rate]};
+    const bool is_color = rate == Rate::kTexels || rate == Rate::kColorParams;
+    return {values, exp_avg, checked<float>(next(name), size, name), rates_[rate],
+            is_color ? first_color_step_ : first_step_};
   }
 
   AdamTable table(Rate rate, const Tensor& param, std::int64_t rows, std::int64_t channels, const char* name) {
@@ -59,6 +73,7 @@ class Moments {
 
   const std::vector<Tensor>& tensors_;
   const Scalars<Rate>& rates_;
+  const std::int64_t first_step_, first_color_step_;
   std::size_t next_ = 0;
 };
 
@@ -98,6 +113,7 @@ void optimize_map_(std::vector<Tensor> scene_tensors, std::vector<double> scene_
   check_count(kName, "num_pixels", integers[Integer::kNumPixels]);
   check_count(kName, "iterations", integers[Integer::kIterations]);
   check_count(kName, "first_step", integers[Integer::kFirstStep]);
+  check_count(kName, "first_color_step", integers[Integer::kFirstColorStep]);
   to_int32(kName, "first_stamp", integers[Integer::kFirstStamp]);
   to_int32(kName, "last stamp", integers[Integer::kFirstStamp] + integers[Integer::kIterations] - 1);
   check_size(losses, kLossTerms * integers[Integer::kIterations], "losses");
@@ -118,7 +134,7 @@ void optimize_map_(std::vector<Tensor> scene_tensors, std::vector<double> scene_
   call.rays.poses = mutable_data<float>(poses);
   call.intrinsics = render.intrinsics;
   call.options = render.options;
-  Moments moments(moment_list, rates);
+  Moments moments(moment_list, rates, integers[Integer::kFirstStep], integers[Integer::kFirstColorStep]);
   call.embeddings =
       moments.table(Rate::kEmbeddings, scene_tensors[3], scene.view.num_voxels, kEmbeddingChannels, "embeddings");
   call.texels = moments.table(Rate::kTexels, scene_tensors[5], num_texels, kPlaneChannels, "texels");
@@ -129,7 +145,6 @@ void optimize_map_(std::vector<Tensor> scene_tensors, std::vector<double> scene_
   moments.check_end();
   call.fixed_row = integers[Integer::kFixedFrame];
   call.iterations = integers[Integer::kIterations];
-  call.first_step = integers[Integer::kFirstStep];
   call.first_stamp = integers.as<std::int32_t>(Integer::kFirstStamp);
   call.losses = mutable_data<float>(losses);
   Tensor workspace = empty(losses, {optimize_map_workspace_size(scope.context, call)}, ScalarType::Byte);

@@ -34,13 +34,13 @@ bool fused_covers(const MapOptimization& call) {
   return fused::covers(call.scene, call.options) && aligned(call.embeddings) && aligned(call.texels);
 }
 
-fused::AdamTarget target(const AdamState& s, std::int64_t step) {
-  const AdamStep adam{s.learning_rate, kAdamBeta1, kAdamBeta2, kAdamEpsilon, step};
+fused::AdamTarget target(const AdamState& s, std::int64_t iteration) {
+  const AdamStep adam{s.learning_rate, kAdamBeta1, kAdamBeta2, kAdamEpsilon, s.first_step + iteration};
   return {s.param, s.exp_avg, s.exp_avg_sq, adam_coefficients<float>(adam)};
 }
 
-fused::TableTarget table_target(const AdamTable& t, std::int64_t rows, std::int64_t step) {
-  return {target(t.state, step), static_cast<std::int64_t*>(t.gradients), t.stamps, rows};
+fused::TableTarget table_target(const AdamTable& t, std::int64_t rows, std::int64_t iteration) {
+  return {target(t.state, iteration), static_cast<std::int64_t*>(t.gradients), t.stamps, rows};
 }
 
 fused::TableSums table_sums(const AdamTable& t) {
@@ -81,18 +81,17 @@ class MapLaunches {
 
   fused::MapUpdateArguments update_arguments(std::int64_t iteration, const fused::RayStepArguments& rays,
                                              int blocks) const {
-    const std::int64_t step = call_.first_step + iteration;
     fused::MapUpdateArguments a{};
     a.partials = buffers_.partials;
     a.pose_gradients = buffers_.pose_gradients;
     a.blocks = blocks;
     a.rays = rays.rays;
     a.fixed_row = call_.fixed_row;
-    a.geometry = target(call_.geometry_params, step);
-    a.color = target(call_.color_params, step);
-    a.poses = target(call_.poses, step);
-    a.embeddings = table_target(call_.embeddings, call_.scene.num_voxels, step);
-    a.texels = table_target(call_.texels, plane_rows(call_.scene.planes), step);
+    a.geometry = target(call_.geometry_params, iteration);
+    a.color = target(call_.color_params, iteration);
+    a.poses = target(call_.poses, iteration);
+    a.embeddings = table_target(call_.embeddings, call_.scene.num_voxels, iteration);
+    a.texels = table_target(call_.texels, plane_rows(call_.scene.planes), iteration);
     a.inverse_scale = 1.0f / rays.fixed_point_scale;
     a.stamp = rays.stamp;
     a.weights = call_.options.weights;

@@ -57,7 +57,7 @@ struct OptimizeMapLaunch {
   }
 
   AdamStep adam(const AdamState& state, std::int64_t iteration) const {
-    return {state.learning_rate, kAdamBeta1, kAdamBeta2, kAdamEpsilon, call_.first_step + iteration};
+    return {state.learning_rate, kAdamBeta1, kAdamBeta2, kAdamEpsilon, state.first_step + iteration};
   }
 
   void step_scene(std::int64_t iteration) {

@@ -137,6 +137,7 @@ def optimize_map_(
     fixed_frame: int,
     first_step: int,
     first_stamp: int,
+    first_color_step: int | None = None,
     pixel_stream: int = RandomStream.MAPPING_PIXELS,
     graph: LaunchGraph | None = None,
 ) -> torch.Tensor:
@@ -161,6 +162,7 @@ def optimize_map_(
         fixed_frame: row of `poses` that is not changed, as the gauge of the reconstruction; -1 for none.
         first_step: 1-based number of the first Adam step since the moments were zero.
         first_stamp: stamp of the first iteration; the I from it on must be new to the tables.
+        first_color_step: as `first_step`, of the moments of `texels` and `color_params`; None is that one.
         pixel_stream: random stream of the draw.
         graph: where the call's CUDA graph is kept; without one the kernels are launched one after the other.
 
@@ -201,9 +203,11 @@ def optimize_map_(
     check_count(name, "num_pixels", num_pixels)
     check_count(name, "iterations", iterations)
     check_count(name, "first_step", first_step)
+    color_step = first_step if first_color_step is None else first_color_step
+    check_count(name, "first_color_step", color_step)
     last_stamp = first_stamp + iterations - 1
     check(first_stamp >= -(2**31) and last_stamp < 2**31, name, "first_stamp", "fit 32 bits", first_stamp)
-    integers = [int(pixel_stream), num_pixels, iterations, fixed_frame, first_step, first_stamp]
+    integers = [int(pixel_stream), num_pixels, iterations, fixed_frame, first_step, color_step, first_stamp]
     return trusted.optimize_map_(scene, records, poses, frames, intrinsics, options, moments, integers, graph)
 
 

@@ -284,7 +284,8 @@ def optimize_map_(
 
     Args:
         scene, records, poses, frames, intrinsics, options, moments, graph: as there.
-        integers: `pixel_stream`, `num_pixels`, `iterations`, `fixed_frame`, `first_step` and `first_stamp`.
+        integers: `pixel_stream`, `num_pixels`, `iterations`, `fixed_frame`, `first_step`, `first_color_step` and
+            `first_stamp`.
     """
     losses = poses.new_empty(integers[2], 5)
     with torch.no_grad():

@@ -97,6 +97,11 @@ class MappingOptions(Section):
         "optimize voxel embeddings and geometry decoder; false leaves geometry to the prior's fusion", needs=(_MAPPING,)
     )
     reset_moments: bool = option("reset Adam's moments each time mapping runs", needs=(_MAPPING,))
+    keep_color_moments: bool = option(
+        "but not those of the tri-planes and the color decoder: colors converge in fewer iterations, where geometry "
+        "would follow the noise of depth",
+        needs=(_MAPPING, _COLOR, need(is_("mapping.reset_moments", True))),
+    )
 
     def check(self) -> None:
         if self.recent + self.covisible > self.frames:

@@ -17,7 +17,7 @@ from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
 from spslam.slam.depth_keyframes import depth_image_shape
 from spslam.slam.recovery.pose_confidence import MODEL_FILE
-from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames
+from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames, keeps_moments
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
 from spslam.tensor_schema import CHECKPOINT
 
@@ -83,8 +83,8 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
     if state.graph is not None:
         tensors.update(_prefixed("graph.", state.graph.tensors()))
     # Moments that the next mapping call resets anyway need no place.
-    if not config.mapping.reset_moments:
-        for name, moments in state.moments.items():
+    for name, moments in state.moments.items():
+        if keeps_moments(config, name):
             tensors[f"moments.{name}.first"] = moments.first
             tensors[f"moments.{name}.second"] = moments.second
     if copy:

@@ -13,7 +13,7 @@ from spslam.slam.covisibility import select_frames
 from spslam.slam.encode_frame import encode_frame
 from spslam.slam.pixels import FramePixels
 from spslam.slam.render_options import render_options
-from spslam.slam.state import Moments, SlamState
+from spslam.slam.state import Moments, SlamState, keeps_moments
 
 
 @dataclass
@@ -93,8 +93,7 @@ class Mapper:
 
     def begin_on(self, state: SlamState, frames: torch.Tensor, iterations: int) -> MappingTask:
         """As `begin`, of an optimization over given frames, int64 [n] rows; some frame must have pixels and a pose."""
-        if self.config.mapping.reset_moments:
-            _reset(state)
+        self._reset(state)
         # The first usable frame is kept fixed: it defines the world frame.
         first_usable = int(state.usable.numpy().argmax())
         return MappingTask(frames, len(state.frames) - 1, first_usable, iterations)
@@ -112,6 +111,8 @@ class Mapper:
         """
         config = self.config
         options = render_options(config, ops.RandomStream.MAPPING_RAYS, task.newest, task.done)
+        # Kept from the first iteration on, moments have as many steps as there were iterations.
+        color_steps = state.stamp if keeps_moments(config, "texels") else state.steps
         losses = ops.trusted.optimize_map_(
             state.scene.view(),
             state.pixels.records,
@@ -126,6 +127,7 @@ class Mapper:
                 iterations,
                 task.fixed_frame,
                 state.steps + 1,
+                color_steps + 1,
                 state.stamp + 1,
             ),
             self._graph,
@@ -150,6 +152,14 @@ class Mapper:
             else None,
         )
 
+    def _reset(self, state: SlamState) -> None:
+        forgotten = [each for name, each in state.moments.items() if not keeps_moments(self.config, name)]
+        past = [each for moments in forgotten for each in (moments.first, moments.second)]
+        if past:
+            torch._foreach_zero_(past)
+        if self.config.mapping.reset_moments:
+            state.steps = 0
+
     def _select(self, state: SlamState, usable: torch.Tensor) -> torch.Tensor:
         frames = state.frames
         return select_frames(
@@ -169,10 +179,3 @@ def _decoder(
 ) -> ops.AdamMoments | None:
     """Adam's state of a decoder; None where it stays as it is."""
     return _moments(state, name, parameter).of_tensor(rate) if optimized and rate > 0 else None
-
-
-def _reset(state: SlamState) -> None:
-    past = [each for moments in state.moments.values() for each in (moments.first, moments.second)]
-    if past:
-        torch._foreach_zero_(past)
-    state.steps = 0

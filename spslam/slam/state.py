@@ -22,6 +22,8 @@ from spslam.slam.newest_frame import NewestFrame
 from spslam.slam.pixel_database import PixelDatabase
 from spslam.slam.sensor_noise import SensorNoiseEstimate
 
+_COLOR = ("texels", "color_decoder")  # names of moments
+
 
 @dataclass
 class Moments:
@@ -76,6 +78,12 @@ class Moments:
     def reset(self) -> None:
         """Forgets the past steps."""
         torch._foreach_zero_([self.first, self.second])
+
+
+def keeps_moments(config: Config, name: str) -> bool:
+    """Whether the moments of a parameter outlast the mapping call that made them."""
+    mapping = config.mapping
+    return not mapping.reset_moments or (mapping.keep_color_moments and name in _COLOR)
 
 
 @dataclass

@@ -158,6 +158,6 @@ def test_same_bits_for_any_number_of_threads():
 def test_opcheck(device, options):
     m = Map(device)
     args = (*m.scene.arguments(), m.records, m.poses, m.frames, *options.arguments(INTRINSICS))
-    args += (*m.map_moments().arguments(), [3, 20, 1, 0, 1, 1, 0], m.poses.new_empty(1, 5))
+    args += (*m.map_moments().arguments(), [3, 20, 1, 0, 1, 1, 1, 0], m.poses.new_empty(1, 5))
     utilities = ("test_schema", "test_faketensor")
     torch.library.opcheck(torch.ops.spslam.optimize_map_, args, test_utils=utilities)

@@ -15,6 +15,7 @@ struct AdamState {
   float* param;
   float *exp_avg, *exp_avg_sq;  // null: frozen
   double learning_rate;
+  std::int64_t first_step;  // 1-based, of the moments
 };
 
 // The same for a table of which each iteration changes a few rows.
@@ -36,7 +37,6 @@ struct MapOptimization {
   AdamState poses;         // [rows, 7]
   std::int64_t fixed_row;  // of the poses: kept, as the gauge of the reconstruction
   std::int64_t iterations;
-  std::int64_t first_step;   // 1-based, of the moments
   std::int32_t first_stamp;  // rows get first_stamp + iteration
   float* losses;             // [iterations, 5]
 };
