@@ -88,26 +88,33 @@ def test_a_frame_near_the_map_is_found(dataset, preset):
     assert np.linalg.norm(result.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
 
 
-@pytest.mark.parametrize(("shift_m", "goes_on"), [(0.0, False), (0.2, True)])
+@pytest.mark.parametrize(("shift_m", "goes_on"), [(0.0, False), (0.15, True)])
 def test_tracking_goes_on_where_the_prediction_was_far_off(dataset, monkeypatch, shift_m, goes_on):
     system = processed(dataset, 1)
     tracker, truth = system.tracker, dataset.poses()[1]
     pixels = sample_frame(dataset[1], dataset.camera, system.config)
-    start = pose_tensor(truth, CPU)
-    start[4:] += shift_m / 3**0.5
-    problem = TrackingProblem(system.state.scene, pixels.records, start, system.config.tracking.first_frames + 1)
 
     def tracked():
-        found = tracker.track(problem)
-        return found, np.linalg.norm(found.pose[4:].numpy() - truth[:3, 3])
+        """What is found from starts off to all sides, and how far off that is, m."""
+        found = []
+        for side in np.concatenate([np.eye(3), -np.eye(3)]):
+            start = pose_tensor(truth, CPU)
+            start[4:] += torch.from_numpy(shift_m * side)
+            frame = system.config.tracking.first_frames + 1
+            found.append(tracker.track(TrackingProblem(system.state.scene, pixels.records, start, frame)))
+        return found, [np.linalg.norm(each.pose[4:].numpy() - truth[:3, 3]) for each in found]
 
-    (found, error_m), once = tracked(), system.config.tracking.iterations
-    assert found.iterations == (2 * once if goes_on else once)
+    (found, errors_m), once = tracked(), system.config.tracking.iterations
+    assert {each.iterations for each in found} == {2 * once if goes_on else once}
     monkeypatch.setattr("spslam.slam.fit.FAR_CM", np.inf)
     monkeypatch.setattr("spslam.slam.fit.FAR_DEG", np.inf)
-    at_once, error_at_once_m = tracked()
-    assert at_once.iterations == once
-    assert error_m < 0.5 * error_at_once_m if goes_on else torch.equal(found.pose, at_once.pose)
+    at_once, errors_at_once_m = tracked()
+    assert {each.iterations for each in at_once} == {once}
+    if goes_on:
+        assert max(errors_m) < 0.005
+        assert np.mean(errors_m) < 0.5 * np.mean(errors_at_once_m)
+    else:
+        assert all(torch.equal(one.pose, other.pose) for one, other in zip(found, at_once, strict=True))
 
 
 def test_a_pose_stays_as_it_was_found_where_tracking_on_leads_off_the_map(dataset, monkeypatch):

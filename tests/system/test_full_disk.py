@@ -68,7 +68,7 @@ def test_every_output_is_named_when_the_disk_is_full(monkeypatch, tmp_path, disk
 
 def test_a_run_goes_on_when_there_is_room_again(monkeypatch, tmp_path, disk):
     run_on(monkeypatch, Recorded(FRAMES), tmp_path / "whole", *SETTINGS)
-    out = disk(2**24) / "out"
+    out = disk(2**25) / "out"
     filler = out.parent / "filler"
 
     def fill(done, total, report):
