@@ -75,6 +75,18 @@ def test_calls_go_on_where_the_last_one_ended(device, options):
     assert_equal(once, twice)
 
 
+def test_colors_count_their_own_steps(device, options):
+    """Moments of colors may be older: their bias is corrected by their own number of steps."""
+    own, all_old, all_new = Map(device), Map(device), Map(device)
+    own.optimize(options, 1, first_color_step=50)
+    all_old.optimize(options, 1, first_step=50)
+    all_new.optimize(options, 1)
+    for name, param in own.params.items():
+        same, other = (all_old, all_new) if name in ("texels", "color_params") else (all_new, all_old)
+        assert torch.equal(param, same.params[name]), name
+        assert not torch.equal(param, other.params[name]), name
+
+
 @pytest.mark.parametrize(
     "frozen", [("embeddings", "geometry_params"), ("texels", "color_params"), ("poses",), ("geometry_params",)], ids=str
 )

@@ -20,6 +20,7 @@ from tests.ops.mapping_scene import RENDER_OPTIONS, Map
         (dict(num_pixels=0), ValueError, "num_pixels must be at least 1, got 0"),
         (dict(iterations=0), ValueError, "iterations must be at least 1, got 0"),
         (dict(first_step=0), ValueError, "first_step must be at least 1, got 0"),
+        (dict(first_color_step=0), ValueError, "first_color_step must be at least 1, got 0"),
         (dict(first_stamp=2**31 - 1), ValueError, "first_stamp must fit 32 bits, got 2147483647"),
         (dict(truncation=0.0), ValueError, "truncation must be positive, got 0.0"),
         (dict(precision="fp8"), ValueError, "precision must be tf32 or fp32, got fp8"),

@@ -233,6 +233,17 @@ def test_moments_start_anew_where_told_so(dataset, reset, expected):
     assert system.state.stamp == 6
 
 
+@pytest.mark.parametrize("kept", ["true", "false"])
+def test_moments_of_colors_outlast_a_call_where_told_so(dataset, kept):
+    system = processed(dataset, 1, f"mapping.keep_color_moments={kept}", "mapping.first_iterations=4")
+    state = system.state
+    before = {name: moments.first.clone() for name, moments in state.moments.items()}
+    system.mapper.begin(state, 2)
+    for name, moments in state.moments.items():
+        is_kept = kept == "true" and name in ("texels", "color_decoder")
+        assert torch.equal(moments.first, before[name] if is_kept else torch.zeros_like(before[name])), name
+
+
 def test_gradients_are_spent_after_an_iteration(dataset):
     system = processed(dataset, 1)
     assert not any(moments.gradient.any() for moments in system.state.moments.values())
