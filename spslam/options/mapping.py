@@ -98,8 +98,8 @@ class MappingOptions(Section):
     )
     reset_moments: bool = option("reset Adam's moments each time mapping runs", needs=(_MAPPING,))
     keep_color_moments: bool = option(
-        "but not those of the tri-planes and the color decoder: colors converge in fewer iterations, where geometry "
-        "would follow the noise of depth",
+        "keep those of the tri-planes and the color decoder: colors then need fewer iterations, while kept moments of "
+        "geometry would follow the noise of depth",
         needs=(_MAPPING, _COLOR, need(is_("mapping.reset_moments", True))),
     )
 

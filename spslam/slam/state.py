@@ -75,10 +75,6 @@ class Moments:
         """For parameters that every iteration steps."""
         return ops.AdamMoments(self.first, self.second, rate)
 
-    def reset(self) -> None:
-        """Forgets the past steps."""
-        torch._foreach_zero_([self.first, self.second])
-
 
 def keeps_moments(config: Config, name: str) -> bool:
     """Whether the moments of a parameter outlast the mapping call that made them."""
