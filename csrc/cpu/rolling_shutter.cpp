@@ -13,26 +13,32 @@ constexpr std::int64_t kLanes = 128;  // pixels that are made together, in vecto
 
 // `count` pixels of row y from column `begin` on. By value: nothing that is written can be part of them.
 void rectify_lanes(FrameImages images, ReadoutMotion readout, ShutterCamera camera, std::int64_t y, std::int64_t begin,
-                   std::int64_t count, std::uint16_t* depth, std::uint8_t* intensity) {
-  float scale[kLanes], by_column[kLanes], by_row[kLanes], read[kLanes], corners[4][kLanes];
+                   std::int64_t length, std::uint16_t* depth, std::uint8_t* intensity) {
+  float own[kLanes], scale[kLanes], by_column[kLanes], by_row[kLanes];
+  std::uint16_t read[kLanes];
+  std::uint8_t corners[4][kLanes];
   std::int32_t row[kLanes], column[kLanes], top[kLanes], left[kLanes];
+  const std::uint16_t* pixels = images.depth + y * camera.width + begin;
+  const float v = static_cast<float>(y);
+  // Whole numbers of 32 bits, which AVX2 converts in lanes, unlike those of 64.
+  const std::int32_t first = static_cast<std::int32_t>(begin), count = static_cast<std::int32_t>(length);
+  for (std::int32_t lane = 0; lane < count; ++lane) own[lane] = images.unit * static_cast<float>(pixels[lane]);
   // Not SPS_SIMD: GCC would keep the structs of each lane in memory and vectorize nothing; so it does by itself.
-  for (std::int64_t lane = 0; lane < count; ++lane) {
-    const ReadPixel from = look_up(images, readout, camera, y, begin + lane);
+  for (std::int32_t lane = 0; lane < count; ++lane) {
+    const ReadPixel from = look_up(own[lane], readout, camera, static_cast<float>(first + lane), v);
     const ReadPlace at = read_place(camera, from);
     scale[lane] = from.scale, by_column[lane] = at.by_column, by_row[lane] = at.by_row;
     row[lane] = at.row, column[lane] = at.column, top[lane] = at.top, left[lane] = at.left;
   }
-  for (std::int64_t lane = 0; lane < count; ++lane) {
-    read[lane] = static_cast<float>(images.depth[row[lane] * camera.width + column[lane]]);
+  for (std::int32_t lane = 0; lane < count; ++lane) {
+    read[lane] = images.depth[row[lane] * camera.width + column[lane]];
     const std::uint8_t* corner = images.intensity + top[lane] * camera.width + left[lane];
-    corners[0][lane] = static_cast<float>(corner[0]), corners[1][lane] = static_cast<float>(corner[1]);
-    corners[2][lane] = static_cast<float>(corner[camera.width]);
-    corners[3][lane] = static_cast<float>(corner[camera.width + 1]);
+    corners[0][lane] = corner[0], corners[1][lane] = corner[1];
+    corners[2][lane] = corner[camera.width], corners[3][lane] = corner[camera.width + 1];
   }
   SPS_SIMD
-  for (std::int64_t lane = 0; lane < count; ++lane) {
-    depth[lane] = rectified_depth(scale[lane], read[lane]);
+  for (std::int32_t lane = 0; lane < count; ++lane) {
+    depth[lane] = rectified_depth(scale[lane], static_cast<float>(read[lane]));
     intensity[lane] = rectified_intensity(corners[0][lane], corners[1][lane], corners[2][lane], corners[3][lane],
                                           by_column[lane], by_row[lane]);
   }

@@ -13,7 +13,9 @@ __device__ __forceinline__ void rectify_image_pixel(const FrameImages& images, c
     depth[i] = images.depth[i], intensity[i] = images.intensity[i];
     return;
   }
-  const ReadPixel from = look_up(images, readout, camera, i / camera.width, i % camera.width);
+  const float own = images.unit * static_cast<float>(images.depth[i]);
+  const float u = static_cast<float>(i % camera.width), v = static_cast<float>(i / camera.width);
+  const ReadPixel from = look_up(own, readout, camera, u, v);
   rectify_pixel(images, camera, from, depth + i, intensity + i);
 }
 

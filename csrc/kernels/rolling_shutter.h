@@ -68,13 +68,10 @@ struct ReadPixel {
   float column, row, scale;
 };
 
-// Of pixel (y, x), by its own depth: the motion is alike for its neighbors. Without depth only the turn is heeded, as
-// for points far away.
-SPS_INLINE ReadPixel look_up(const FrameImages& images, const ReadoutMotion& motion, const ShutterCamera& camera,
-                             std::int64_t y, std::int64_t x) {
+// Of a pixel (u, v), by its own depth (m): the motion is alike for its neighbors. Without depth only the turn is heeded,
+// as for points far away.
+SPS_INLINE ReadPixel look_up(float depth, const ReadoutMotion& motion, const ShutterCamera& camera, float u, float v) {
   const Intrinsics& k = camera.intrinsics;
-  const float u = static_cast<float>(x), v = static_cast<float>(y);
-  const float depth = images.unit * static_cast<float>(images.depth[y * camera.width + x]);
   const float inverse_z = depth > 0.0f ? 1.0f / depth : 0.0f;
   const Vec3<float> ray{(u - k.cx) * (1.0f / k.fx), (v - k.cy) * (1.0f / k.fy), 1.0f};
   const ReadoutMotion per_depth{motion.angular, inverse_z * motion.linear, motion.readout};
