@@ -136,11 +136,16 @@ class ColorSampler {
   void sample_batch(const float* u, const float* v, std::int32_t count, std::uint8_t* out) const {
     // Weights are read a vector at a time, of which kPairs are used.
     constexpr int kRead = kPixelLanes + kLanes<std::uint16_t>;
-    alignas(64) std::int32_t places[kPixelLanes] = {};
-    alignas(64) std::uint16_t by_u[kRead] = {}, by_v[kRead] = {};
-    SPS_SIMD for (std::int32_t i = 0; i < count; ++i) {
+    alignas(64) std::int32_t places[kPixelLanes];
+    alignas(64) std::uint16_t by_u[kRead], by_v[kRead];
+    std::fill(places + count, places + kPixelLanes, 0);
+    std::fill(by_u + count, by_u + kRead, std::uint16_t{0});
+    std::fill(by_v + count, by_v + kRead, std::uint16_t{0});
+    std::int32_t room = 0;  // negative where a pixel lies behind the last pair
+    SPS_SIMD_MIN(room) for (std::int32_t i = 0; i < count; ++i) {
       const ColorPlace column = color_place(u[i], width_), row = color_place(v[i], height_);
       places[i] = row.pixel * row_bytes_ + kChannels * column.pixel;
+      room = std::min(room, last_pair_ - places[i]);
       by_u[i] = static_cast<std::uint16_t>(column.weight);
       by_v[i] = static_cast<std::uint16_t>(row.weight);
     }
@@ -151,7 +156,7 @@ class ColorSampler {
         put_pairs(places + i, by_u + i, by_v + i, sampled + kChannels * i);
       }
     }
-    for (std::int32_t i = 0; i < count; ++i) {
+    for (std::int32_t i = 0; room < 0 && i < count; ++i) {
       if (places[i] > last_pair_) put_near_end(places[i], by_u[i], by_v[i], sampled + kChannels * i);
     }
     std::memcpy(out, sampled, kChannels * count);
