@@ -22,7 +22,7 @@ PYTEST = OMP_WAIT_POLICY=passive $(PYTHON) -m pytest -n $(JOBS) --dist loadfile
 NATIVE_ISA = $$($(PYTHON) -c "import torch; c = torch.backends.cpu.get_cpu_capability(); \
   print({'AVX512': 'avx512', 'AVX2': 'avx2'}.get(c, 'baseline'))")
 
-.PHONY: help demo test test-all test-sweeps test-gpu dev lint example-cpp test-numpy test-asan
+.PHONY: help demo test test-all test-sweeps test-ray test-gpu dev lint example-cpp test-numpy test-asan
 
 help:
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -38,6 +38,10 @@ test-all: dev ## the same with the slow tests, before a change lands
 
 test-sweeps: dev ## the longest sweeps, which test-all leaves out too
 	$(PYTEST) -m sweep
+
+test-ray: dev ## install Ray and run the tests on a cluster of two nodes, both on this machine
+	$(PYTHON) -m pip install $(PIP) $$($(PYTHON) cmake/requirements.py cluster)
+	$(PYTHON) -m pytest -m "" tests/tasks/test_ray.py
 
 test-gpu: ## run the tests that need a CUDA device, with the kernels that are there: built in place, or a wheel's
 	$(PYTHON) tests/run_on_gpu.py
