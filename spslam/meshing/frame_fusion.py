@@ -19,6 +19,7 @@ from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
+from spslam.meshing.ray_noise import noise_along_rays
 from spslam.meshing.reading import reading_threads
 from spslam.meshing.sdf_sampling import near_surface
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
@@ -122,7 +123,8 @@ def fuse_frames(
 
     Where a sensor mixes near and far surface at edges, or smooths depth over them, the pixels between two surfaces have
     little weight. Frames of smoothed depth are read twice: what frames saw before may be free of what a later one takes
-    for surface there.
+    for surface there. How far before and behind a surface voxels learn of it follows from the noise along rays, which
+    some pairs of frames show; see `ray_noise.noise_along_rays`.
 
     Args:
         frames: to be fused, in order; of one dataset or of several in one world.
@@ -139,7 +141,9 @@ def fuse_frames(
         SpslamError: voxels of over a hundred times the size would not fit either.
     """
     parts = [frames] if isinstance(frames, PosedFrames) else frames
-    edges = [_EdgeKind.of(part, part.noise or options.noise) for part in parts]
+    noises = [part.noise or options.noise for part in parts]
+    images = [_EdgeImages(part, noise, _EdgeKind.of(part, noise)) for part, noise in zip(parts, noises, strict=True)]
+    along_rays = [noise_along_rays(part, noise) for part, noise in zip(parts, noises, strict=True)]
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
         truncations = options.truncation_m(voxel_size_m), options.near_truncation_m(voxel_size_m)
@@ -147,8 +151,8 @@ def fuse_frames(
         try:
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
-            for part, kind in zip(parts, edges, strict=True):
-                _fuse_part(volume, _EdgeImages(part, part.noise or options.noise, kind))
+            for part, noise in zip(images, along_rays, strict=True):
+                _fuse_part(volume, part, noise)
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -217,14 +221,14 @@ class _EdgeImages:
                     yield position, *image
 
 
-def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages) -> None:
-    """Fuses the frames of one dataset."""
+def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages, along_rays: tuple[float, float]) -> None:
+    """Fuses the frames of one dataset, whose depth has this noise along rays."""
     device, intrinsics, noise = volume.sdf.device, frame_intrinsics(images.part), images.noise
     poses = images.part.poses
     if images.edges is _EdgeKind.BLURRED:
         for position, frame, kept in images.read():
             ramps = _ramps(on_device(frame.depth, device), on_device(kept, device), intrinsics, noise)
-            volume.make_room(ramps, pose7_on(poses[position], device), intrinsics, noise)
+            volume.make_room(ramps, pose7_on(poses[position], device), intrinsics, along_rays)
     for position, frame, found in images.read():
         depth = on_device(frame.depth, device)
         if images.edges is _EdgeKind.BLURRED:
@@ -237,7 +241,7 @@ def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages) -> None:
             if images.edges is _EdgeKind.FLYING:
                 planes[..., 4][on_device(found, device)] *= FLYING_WEIGHT
         color = on_device(frame.color, device)
-        volume.integrate_planes(planes, pose7_on(poses[position], device), intrinsics, color, noise)
+        volume.integrate_planes(planes, pose7_on(poses[position], device), intrinsics, color, along_rays)
 
 
 def _ramps(
