@@ -33,14 +33,18 @@ _BINS_PER_OCTAVE, _LEAST_RESIDUALS, _HALF_WEIGHT = 4, 500, 2000
 # Growth is known where bins span this factor of depth.
 _LEAST_SPAN = 1.5
 _DEVIATIONS_PER_MEDIAN = 1.4826
+# Distances along normals have this share of it where neighbors' noise is alike (structured light: 0.76), and the
+# constants of `ops.tsdf_integrate_` were chosen in their terms.
+_SHARE_ALONG_NORMALS = 0.75
 
 
 def noise_along_rays(frames: PosedFrames, noise: tuple[float, float]) -> tuple[float, float]:
     """Measures the noise of depth along rays.
 
     Of some pairs of frames, the first one's pixels are projected into the second. 1.48 times the median size of the
-    differences in depth, divided by the root of 2, is the deviation at a depth; floor and growth are its least-squares
-    fit, relative and not negative. Errors of the poses between the two frames add to it.
+    differences in depth, divided by the root of 2, is the deviation at a depth. Floor and growth are the least-squares
+    fit, relative and not negative, to 0.75 times it, which is what distances along normals have of noise that is alike
+    for neighbors. Errors of the poses between the two frames add to it.
 
     Args:
         frames: of one recording; those that can't be read don't count.
@@ -140,7 +144,7 @@ def _fit(depth: np.ndarray, difference: np.ndarray, noise: tuple[float, float]) 
         members = bins == each
         size = np.median(np.abs(difference[members])) * _DEVIATIONS_PER_MEDIAN
         if members.sum() >= _LEAST_RESIDUALS and size > 0:
-            rows.append((np.median(depth[members]), size**2 / 2, members.sum()))
+            rows.append((np.median(depth[members]), (_SHARE_ALONG_NORMALS * size) ** 2 / 2, members.sum()))
     if not rows:
         return noise
     at, variance, residuals = np.array(rows).T
