@@ -68,8 +68,8 @@ struct ReadPixel {
   float column, row, scale;
 };
 
-// Of a pixel (u, v), by its own depth (m): the motion is alike for its neighbors. Without depth only the turn is heeded,
-// as for points far away.
+// Of a pixel (u, v), by its own depth (m): the motion is alike for its neighbors. Without depth only the turn is
+// heeded, as for points far away.
 SPS_INLINE ReadPixel look_up(float depth, const ReadoutMotion& motion, const ShutterCamera& camera, float u, float v) {
   const Intrinsics& k = camera.intrinsics;
   const float inverse_z = depth > 0.0f ? 1.0f / depth : 0.0f;
