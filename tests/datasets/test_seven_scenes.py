@@ -244,25 +244,26 @@ def test_the_kitchen():
     assert frame.depth.max() < 20
 
 
+def least_seconds(function, *arguments, times=5):
+    """Time of this thread alone and the best of some calls, because other processes share the machine."""
+    seconds = []
+    for _ in range(times):
+        started = time.thread_time()
+        function(*arguments)
+        seconds.append(time.thread_time() - started)
+    return min(seconds)
+
+
+def decode(files):
+    cv2.imread(str(files.color))
+    cv2.imread(str(files.depth), cv2.IMREAD_UNCHANGED)
+
+
 def test_reading_costs_little_more_than_decoding():
     dataset = open_seven_scenes(shared_data("7scenes-redkitchen"), registered=True)
-
-    def decode(index):
-        cv2.imread(str(dataset.frames[index].color))
-        cv2.imread(str(dataset.frames[index].depth), cv2.IMREAD_UNCHANGED)
-
-    def least_seconds(function, index):
-        # Time of this thread alone and the best of five, because other processes share the machine.
-        seconds = []
-        for _ in range(5):
-            started = time.thread_time()
-            function(index)
-            seconds.append(time.thread_time() - started)
-        return min(seconds)
-
     ours, decoding = (
         statistics.median(least_seconds(function, i) for i in range(0, 50, 5))
-        for function in (dataset.__getitem__, decode)
+        for function in (dataset.__getitem__, lambda index: decode(dataset.frames[index]))
     )
     # Some 0.6 ms more than 4.6 ms, most of it for fresh memory; as a ratio, because both grow on a busy machine.
     assert ours < 1.5 * decoding
@@ -271,10 +272,13 @@ def test_reading_costs_little_more_than_decoding():
 def test_registering_a_frame_costs_little():
     dataset = open_seven_scenes(shared_data("7scenes-redkitchen"), registered=True)
     registration = open_seven_scenes(shared_data("7scenes-redkitchen")).registration
-    frame, seconds = dataset[100], []
-    for _ in range(20):
-        started = time.thread_time()
-        registration(frame.color, frame.depth)
-        seconds.append(time.thread_time() - started)
-    # 1.05 ms with AVX-512 and 1.4 with AVX2 where nothing else runs, 4.5 in NumPy.
-    assert min(seconds) < 3e-3
+    frame = dataset[100]
+
+    def decode_and_copy():
+        decode(dataset.frames[100])
+        return frame.color.copy(), frame.depth.copy()  # fresh memory, as what is registered takes
+
+    registering = least_seconds(registration, frame.color, frame.depth, times=20)
+    # 0.2 to 0.3 of it with AVX-512, 0.6 on slow cores with AVX2, 0.93 in NumPy; as a ratio, because both grow on a slow
+    # or busy machine.
+    assert registering < 0.85 * least_seconds(decode_and_copy, times=20)
