@@ -279,6 +279,6 @@ def test_registering_a_frame_costs_little():
         return frame.color.copy(), frame.depth.copy()  # fresh memory, as what is registered takes
 
     registering = least_seconds(registration, frame.color, frame.depth, times=20)
-    # Some 0.25 of it with AVX-512 and 0.4 to 0.65 on slow cores with AVX2; 0.9 in NumPy (4.5 of 4.9 ms). A ratio, because
-    # both grow on a slow or busy machine.
+    # Some 0.25 of it with AVX-512 and 0.4 to 0.65 on slow cores with AVX2; 0.9 in NumPy (4.5 of 4.9 ms). A ratio,
+    # because both grow on a slow or busy machine.
     assert registering < 0.85 * least_seconds(decode_and_copy, times=20)
