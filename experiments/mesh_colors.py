@@ -92,7 +92,8 @@ def measure(run: RunOutput, args: argparse.Namespace) -> tuple[int, dict[str, di
             textured = texture_mesh(mesh, frames, TextureOptions(noise, args.texel))
             print(f"{textured} of {len(frames)} frames in {time.perf_counter() - started:.0f} s", flush=True)
             meshes[f"texture {size}"] = textured
-    views = list(posed_frames(dataset, held).read())
+    unseen = posed_frames(dataset, held)
+    views = [(frame, unseen.poses[position]) for position, frame in unseen.read()]
     views = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
     if args.save:
         for name, each in meshes.items():

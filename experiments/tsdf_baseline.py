@@ -41,10 +41,11 @@ def fuse(dataset: RgbdDataset, run: RunOutput, voxel_m: float, blocks: int = 60_
         ("tsdf", "weight", "color"), (core.float32,) * 3, ((1), (1), (3)), voxel_m, 8, blocks, core.Device("CPU:0")
     )
     intrinsics = core.Tensor(dataset.camera.matrix())
-    for frame, pose in posed_frames(dataset, run.trajectory).read():
+    frames = posed_frames(dataset, run.trajectory)
+    for position, frame in frames.read():
         depth = image(core.Tensor(np.ascontiguousarray(frame.depth)))
         color = image(core.Tensor(np.ascontiguousarray(frame.color.astype(np.float32) / 255)))
-        view = intrinsics, core.Tensor(np.linalg.inv(pose)), 1.0, 10.0, TRUNCATION_VOXELS
+        view = intrinsics, core.Tensor(np.linalg.inv(frames.poses[position])), 1.0, 10.0, TRUNCATION_VOXELS
         grid.integrate(grid.compute_unique_block_coordinates(depth, *view), depth, color, *view)
     return [_mesh(grid.extract_triangle_mesh(weight_threshold=threshold)) for threshold in WEIGHT_THRESHOLDS]
 

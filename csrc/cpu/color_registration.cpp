@@ -237,7 +237,7 @@ void register_color(Cpu, const ColorRegistration& registration, const Registered
     const SeenRow seen{u, u + width, z + v * width};
     const float* measured = images.depth + v * width;
     see_row(registration, measured, v, seen);
-    sampler.sample(seen.u, seen.v, registration.width, colors + kChannels * v * width);
+    if (images.colors) sampler.sample(seen.u, seen.v, registration.width, colors + kChannels * v * width);
     cells_of_row(registration, measured, seen, grid.stride(), cells + v * width);
     if (hides) put_nearest(cells + v * width, seen.z, registration.width, grid.nearest());
     if (images.unseen) forget_unseen(registration, images.unseen, seen, cells + v * width);

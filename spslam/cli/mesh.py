@@ -6,12 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spslam.cli.arguments import add_run_folder, positive_meters, require_run_file
+from spslam.cli.arguments import add_device, add_run_folder, positive_meters, require_run_file
 from spslam.config import Config, load_config
 from spslam.errors import DatasetError, OutputError
 from spslam.run_folder import MESH_FORMATS, TEXTURED_FORMATS, RunFolder, is_merged
 
 if TYPE_CHECKING:
+    import torch
+
     from spslam.datasets.base import RgbdDataset
     from spslam.evaluation.run_output import RunOutput
     from spslam.meshing import TriangleMesh
@@ -55,17 +57,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_meters,
         help="edge length of a texel of --texture in meters; as finely as the frames saw the surface if not given",
     )
+    add_device(parser)
 
 
 def execute(args: argparse.Namespace) -> None:
     file_format = _file_format(args)
     folder = RunFolder(args.output)
-    map_file = require_run_file(folder.map)
+    require_run_file(folder.map)
     config = load_config(require_run_file(folder.config))
-    if is_merged(folder):
-        _execute_merged(args, folder, config, file_format)
-        return
 
+    from spslam.run.device import explained_failures, resolve_device
+
+    device = resolve_device(args.device or config.device)
+    with explained_failures(device):
+        if is_merged(folder):
+            _execute_merged(args, folder, config, file_format, device)
+        else:
+            _execute_run(args, folder, config, file_format, device)
+
+
+def _execute_run(
+    args: argparse.Namespace, folder: RunFolder, config: Config, file_format: str, device: torch.device
+) -> None:
     from spslam.evaluation.finished_run import add_metrics
     from spslam.evaluation.run_output import RunOutput
     from spslam.run.mesh import MeshJob, measured_noise, write_mesh
@@ -75,7 +88,7 @@ def execute(args: argparse.Namespace) -> None:
     options = _mesh_options(args, config.mesh, "neural" if _is_live(run) else config.mesh.source)
     dataset = _open_again(run, config, args.texture) if options.source == "tsdf" or args.texture else None
     earlier = _earlier(folder) if "map" in run.metrics else []
-    scene, noise = Scene.load(map_file), measured_noise(run.metrics)
+    scene, noise = Scene.load(folder.map, device), measured_noise(run.metrics)
     job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args))
     path = folder.mesh_as(file_format)
     mesh, figures = write_mesh(path, job, dataset)
@@ -123,14 +136,16 @@ def _texture(args: argparse.Namespace) -> TextureWish | None:
     return TextureWish(args.texel) if args.texture else None
 
 
-def _execute_merged(args: argparse.Namespace, folder: RunFolder, config: Config, file_format: str) -> None:
+def _execute_merged(
+    args: argparse.Namespace, folder: RunFolder, config: Config, file_format: str, device: torch.device
+) -> None:
     from spslam.run.recordings import write_map_mesh
     from spslam.scene import Scene
     from spslam.slam.graph.archive import KeyframeArchive
 
     archive = KeyframeArchive.load(require_run_file(folder.keyframes))
     path, options = folder.mesh_as(file_format), _mesh_options(args, config.mesh, config.mesh.source)
-    mesh, figures, missing = write_map_mesh(path, Scene.load(folder.map), archive, options, _texture(args))
+    mesh, figures, missing = write_map_mesh(path, Scene.load(folder.map, device), archive, options, _texture(args))
     for line in missing:
         print(f"! {line}")
     _print_mesh(path, mesh, figures)

@@ -84,10 +84,7 @@ class FileDataset(RgbdDataset):
         return None if self.gt_poses is None else self.gt_poses.copy()
 
     def read(self, index: int) -> RgbdFrame:
-        paths = self.frames[index]
-        if paths.fault is not None:
-            raise DatasetError(paths.fault)
-        size = self.camera.width, self.camera.height
+        paths, size = self._usable(index), (self.camera.width, self.camera.height)
         color = read_color(paths.color, None if self.resize_color else size)
         depth = read_depth(paths.depth, self.units_per_meter, self.invalid_depth, size)
         if self.undistortion is not None:
@@ -98,8 +95,21 @@ class FileDataset(RgbdDataset):
             color, depth = self.registration(color, depth, in_place=True)
         return RgbdFrame(index, paths.timestamp, color, depth, self._pose(index), paths.offsets)
 
+    def read_depth(self, index: int) -> np.ndarray:
+        size = self.camera.width, self.camera.height
+        depth = read_depth(self._usable(index).depth, self.units_per_meter, self.invalid_depth, size)
+        if self.undistortion is not None:
+            depth = self.undistortion.depth(depth)
+        return depth if self.registration is None else self.registration.depth(depth, in_place=True)
+
     def describe(self, index: int) -> str:
         return f"{self.frames[index].depth} (color: {self.frames[index].color.name})"
+
+    def _usable(self, index: int) -> FramePaths:
+        paths = self.frames[index]
+        if paths.fault is not None:
+            raise DatasetError(paths.fault)
+        return paths
 
     def _pose(self, index: int) -> np.ndarray | None:
         if self.gt_poses is None or not np.isfinite(self.gt_poses[index]).all():

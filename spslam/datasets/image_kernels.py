@@ -74,17 +74,37 @@ def register_color(
     color = _checked("color", color, np.uint8, (*view.color_size[::-1], _CHANNELS))
     if color.nbytes > _MOST_BYTES:
         raise ValueError(f"register_color: color must have at most {_MOST_BYTES} bytes, got {color.nbytes}")
+    colors = np.empty((*view.depth_size[::-1], _CHANNELS), np.uint8)
+    return colors, _register(view, (color, colors), depth, unseen, (typical_depth, hidden_share), in_place)
+
+
+def seen_depth(
+    view: ColorView, depth: np.ndarray, unseen: np.ndarray | None, hidden_share: float, in_place: bool = False
+) -> np.ndarray:
+    """The depth that `register_color` returns, without a color image; arguments and errors as there."""
+    return _register(view, (None, None), depth, unseen, (1.0, hidden_share), in_place)
+
+
+def _register(
+    view: ColorView,
+    colors: tuple[np.ndarray | None, np.ndarray | None],
+    depth: np.ndarray,
+    unseen: np.ndarray | None,
+    numbers: tuple[float, float],
+    in_place: bool,
+) -> np.ndarray:
+    """Depth that the color camera sees; writes the second of `colors` from the first where there are any."""
     depth = _checked("depth", depth, np.float32, view.depth_size[::-1])
     if unseen is not None:
         unseen = _checked("unseen", unseen, np.uint8, view.color_size[::-1])
-    colors = np.empty((*depth.shape, _CHANNELS), np.uint8)
     kept = depth if in_place else np.empty_like(depth)
     sizes = np.array([*view.color_size, *view.depth_size, *view.cells], np.int32)
-    numbers = np.array([*view.pixel_map.T.ravel(), typical_depth, hidden_share], np.float32)
-    pointers = (None if array is None else array.ctypes.data for array in (color, unseen, depth, sizes, numbers))
-    if _library().spslam_register_color(*pointers, colors.ctypes.data, kept.ctypes.data):
+    constants = np.array([*view.pixel_map.T.ravel(), *numbers], np.float32)
+    color, registered = colors
+    arrays = color, unseen, depth, sizes, constants, registered, kept
+    if _library().spslam_register_color(*(None if array is None else array.ctypes.data for array in arrays)):
         raise MemoryError("register_color: not enough memory for images of this size")
-    return colors, kept
+    return kept
 
 
 def unfilter_png(filtered: bytes, shape: tuple[int, int], channels: int, bits: int) -> np.ndarray | None:

@@ -122,23 +122,35 @@ class FrameGeometry:
         Raises:
             DatasetError: an image of another size than its camera.
         """
-        for kind, image, size in (("color", color, self._color_size), ("depth", depth, self._depth_size)):
-            if image.shape[1::-1] != size:
-                raise DatasetError(
-                    f"{name}: the {kind} image must be as large as its camera, {size[0]}x{size[1]}, "
-                    f"got {image.shape[1]}x{image.shape[0]}"
-                )
+        _check_size("color", color, self._color_size, name)
         if self._color_lens is not None:
             color = self._color_lens.color(color)
-        if self._depth_lens is not None:
-            depth = self._depth_lens.depth(depth)
+        depth = self._without_distortion(depth, name)
         if self._register is not None:
             color, depth = self._register(color, depth)
         elif self._resizes:
             color = resized_color(color, self.camera.width, self.camera.height)
-        if self._unseen is not None:
-            depth = np.where(self._unseen, np.float32(0), depth)
-        return color, depth
+        return color, self._without_unseen(depth)
+
+    def depth(self, depth: np.ndarray, name: str) -> np.ndarray:
+        """The depth image, float32 [H, W], as a call returns it, without the color image; arguments as there."""
+        depth = self._without_distortion(depth, name)
+        return self._without_unseen(depth if self._register is None else self._register.depth(depth))
+
+    def _without_distortion(self, depth: np.ndarray, name: str) -> np.ndarray:
+        _check_size("depth", depth, self._depth_size, name)
+        return depth if self._depth_lens is None else self._depth_lens.depth(depth)
+
+    def _without_unseen(self, depth: np.ndarray) -> np.ndarray:
+        return depth if self._unseen is None else np.where(self._unseen, np.float32(0), depth)
+
+
+def _check_size(kind: str, image: np.ndarray, size: tuple[int, int], name: str) -> None:
+    if image.shape[1::-1] != size:
+        raise DatasetError(
+            f"{name}: the {kind} image must be as large as its camera, {size[0]}x{size[1]}, "
+            f"got {image.shape[1]}x{image.shape[0]}"
+        )
 
 
 _IDENTITY = np.eye(4).tolist()
@@ -216,14 +228,23 @@ class Recording(RgbdDataset):
         return None if self._poses is None else self._poses.copy()
 
     def read(self, index: int) -> RgbdFrame:
-        if index in self._faults:
-            raise DatasetError(self._faults[index])
-        color, depth = (int(number) for number in self._pairs[index])
+        color, depth = self._usable(index)
         images = self._geometry(self._color.read(color), self._depth.read(depth), self.describe(index))
         pose = None
         if self._poses is not None and np.isfinite(self._poses[index]).all():
             pose = self._poses[index].copy()
         return RgbdFrame(index, float(self._times[index]), *images, pose, self._offsets[index])
+
+    def read_depth(self, index: int) -> np.ndarray:
+        _, depth = self._usable(index)
+        return self._geometry.depth(self._depth.read(depth), self.describe(index))
+
+    def _usable(self, index: int) -> tuple[int, int]:
+        """Numbers of a frame's color and depth image."""
+        if index in self._faults:
+            raise DatasetError(self._faults[index])
+        color, depth = (int(number) for number in self._pairs[index])
+        return color, depth
 
     def describe(self, index: int) -> str:
         color, depth = (int(number) for number in self._pairs[index])

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.image_kernels import ColorView, register_color
+from spslam.datasets.image_kernels import ColorView, register_color, seen_depth
 from spslam.datasets.images import resized_color
 from spslam.datasets.lens import sample_depth
 from spslam.geometry import inverse
@@ -153,6 +153,10 @@ class ColorToDepth:
         typical_m = typical_depth(depth)
         return register_color(self._view, image, depth, self._unseen, typical_m, _HIDDEN_SHARE, in_place)
 
+    def depth(self, depth: np.ndarray, *, in_place: bool = False) -> np.ndarray:
+        """The depth image, float32 [H, W], as a call returns it, without the color image."""
+        return seen_depth(self._view, depth, self._unseen, _HIDDEN_SHARE, in_place)
+
 
 def typical_depth(depth: np.ndarray) -> float:
     """Median, m, of a depth image [H, W], or of a sample of a large one; 1 where nothing was measured."""
@@ -203,13 +207,17 @@ class DepthToColor:
         Returns:
             uint8 [H, W, 3], and float32 [H, W].
         """
+        return color, self.depth(depth)
+
+    def depth(self, depth: np.ndarray) -> np.ndarray:
+        """The depth image, float32 [H, W], as a call returns it."""
         z = self._first_guess(depth)
         for sample in (_nearest_depth, sample_depth):
             found, seen = self._measured_there(z, depth, sample)
             agrees = (found > 0) & (np.abs(seen - z) <= np.float32(_HIDDEN_SHARE) * z)
             z = np.where(found > 0, seen, z)
         shape = self.camera.height, self.camera.width
-        return color, np.where(agrees, z, np.float32(0)).reshape(shape)
+        return np.where(agrees, z, np.float32(0)).reshape(shape)
 
     def _first_guess(self, depth: np.ndarray) -> np.ndarray:
         """Depth of the color camera's pixels to the nearest cell of the buffer, float32 [N], 0 unknown."""

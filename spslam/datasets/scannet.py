@@ -95,15 +95,21 @@ class SensDataset(RgbdDataset):
         return self._poses.copy() if np.isfinite(self._poses).any() else None
 
     def read(self, index: int) -> RgbdFrame:
-        if index in self._faults:
-            raise DatasetError(self._faults[index])
-        frame = int(self._order[index])
-        color = resized_color(self._file.color(frame), self.camera.width, self.camera.height)
-        depth = depth_in_meters(self._file.depth(frame), self._file.header.units_per_meter)
+        color = resized_color(self._file.color(self._usable(index)), self.camera.width, self.camera.height)
+        depth = self.read_depth(index)
         pose = self._poses[index]
         return RgbdFrame(
             index, float(self._times[index]), color, depth, pose.copy() if np.isfinite(pose).all() else None
         )
+
+    def read_depth(self, index: int) -> np.ndarray:
+        return depth_in_meters(self._file.depth(self._usable(index)), self._file.header.units_per_meter)
+
+    def _usable(self, index: int) -> int:
+        """A frame's number in the file."""
+        if index in self._faults:
+            raise DatasetError(self._faults[index])
+        return int(self._order[index])
 
     def describe(self, index: int) -> str:
         return self._file.describe(int(self._order[index]))

@@ -13,7 +13,6 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import Readable
 from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, summed_counts, surface_steps
 
@@ -31,11 +30,11 @@ _INNER, _INNER_SHARE = 2, 0.8
 _BLURRED_SHARE = 0.8
 
 
-def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -> bool:
-    """Whether the depth of a recording is smoothed over edges, judged by a few frames spread over it.
+def edges_are_blurred(depths: Readable[np.ndarray], noise: tuple[float, float]) -> bool:
+    """Whether the depth of a recording is smoothed over edges, judged by a few images spread over it.
 
     Args:
-        frames: of one sensor; those that can't be read don't count.
+        depths: float32 [H, W] each, m, 0 where unknown, of one sensor; those that can't be read don't count.
         noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
     """
 
@@ -46,7 +45,7 @@ def edges_are_blurred(frames: Readable[RgbdFrame], noise: tuple[float, float]) -
             counts += found.sum(), (found & ~profile.sharp()).sum()
         return counts
 
-    edges, blurred = np.broadcast_to(summed_counts(frames, count), 2)
+    edges, blurred = np.broadcast_to(summed_counts(depths, count), 2)
     return bool(edges >= LEAST_EDGES and blurred > _BLURRED_SHARE * edges)
 
 

@@ -64,12 +64,12 @@ def color_mesh(
     """
     parts = [parts] if isinstance(parts, PosedFrames) else parts
     count = sum(len(part) for part in parts)
-    colored = min(_COLORED_EVERY, max(count // _LEAST_COLORED, 1))
+    colored = colored_every(count)
     surveyed = colored * min(_SURVEYED_EVERY, max(count // (colored * _LEAST_SURVEYED), 1))
     parts = _keeping(parts, [len(part) for part in thinned(parts, surveyed)])
     device, survey, looked_at = torch.device(device), thinned(parts, surveyed), 0
     for _ in range(options.subdivisions):
-        edges = mesh_edges(mesh.faces, len(mesh.vertices))
+        edges = mesh_edges(mesh.faces, len(mesh.vertices), device)
         # Where no edge was divided before there is no detail for finer ones either.
         rows = np.flatnonzero(edges.ends[:, 1] >= looked_at)
         looked_at = len(mesh.vertices)
@@ -78,6 +78,11 @@ def color_mesh(
         mesh = split_edges(mesh, edges, chosen, ((first + second + 1) // 2).astype(np.uint8))
     views = thinned(parts, colored)
     return replace(mesh, colors=_mean_colors(mesh, (views, options.noise, device))), sum(map(len, views))
+
+
+def colored_every(count: int) -> int:
+    """Every how many-th of `count` frames vertices get colors from."""
+    return min(_COLORED_EVERY, max(count // _LEAST_COLORED, 1))
 
 
 def _keeping(parts: Sequence[PosedFrames], surveyed: Sequence[int]) -> list[KeptFrames]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import Readable, prefetch
 from spslam.errors import DatasetError
 from spslam.meshing.reading import reading_threads
@@ -20,26 +19,26 @@ _FRAMES, LEAST_EDGES = 8, 100
 _NEAREST_M = 1e-3
 
 
-def summed_counts(frames: Readable[RgbdFrame], count: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """What is counted in the depth images of a few frames spread over a recording, without those that can't be read.
+def summed_counts(depths: Readable[np.ndarray], count: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """What is counted in a few depth images spread over a recording, without those that can't be read.
 
     Args:
-        frames: of one sensor.
+        depths: float32 [H, W] each, of one sensor.
         count: integers [N] of a depth image float32 [H, W], m; called on threads.
 
     Returns:
         int64 [N], the sums; [0] without any frame.
     """
-    positions = np.unique(np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int))[: len(frames)]
-    with prefetch(_Counts(frames, positions, count), *reading_threads()) as counts:
+    positions = np.unique(np.linspace(0, len(depths) - 1, _FRAMES).round().astype(int))[: len(depths)]
+    with prefetch(_Counts(depths, positions, count), *reading_threads()) as counts:
         return sum((each for each in counts if not isinstance(each, DatasetError)), start=np.zeros(1, np.int64))
 
 
 @dataclass(frozen=True)
 class _Counts:
-    """What is counted in each of some frames, worked out on the threads that read."""
+    """What is counted in each of some images, worked out on the threads that read."""
 
-    frames: Readable[RgbdFrame]
+    depths: Readable[np.ndarray]
     positions: np.ndarray
     count: Callable[[np.ndarray], np.ndarray]
 
@@ -47,7 +46,7 @@ class _Counts:
         return len(self.positions)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self.count(self.frames[int(self.positions[index])].depth)
+        return self.count(self.depths[int(self.positions[index])])
 
 
 def surface_steps(depth: np.ndarray, noise: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

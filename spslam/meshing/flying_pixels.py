@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import Readable
 from spslam.meshing.depth_edges import EDGE, LEAST_EDGES, summed_counts, surface_steps
 
@@ -24,11 +23,11 @@ _FLAT = 0.25
 _FLYING_SHARE = 0.8
 
 
-def has_flying_pixels(frames: Readable[RgbdFrame], noise: tuple[float, float]) -> bool:
-    """Whether the edges of a recording are of flying pixels, judged by a few frames spread over it.
+def has_flying_pixels(depths: Readable[np.ndarray], noise: tuple[float, float]) -> bool:
+    """Whether the edges of a recording are of flying pixels, judged by a few images spread over it.
 
     Args:
-        frames: of one sensor; those that can't be read don't count.
+        depths: float32 [H, W] each, m, 0 where unknown, of one sensor; those that can't be read don't count.
         noise: as of `flying_pixels`.
     """
 
@@ -38,7 +37,7 @@ def has_flying_pixels(frames: Readable[RgbdFrame], noise: tuple[float, float]) -
             counts += _crossings(*steps, 0), sum(_crossings(*steps, width) for width in (1, 2))
         return counts
 
-    sharp, flying = np.broadcast_to(summed_counts(frames, count), 2)
+    sharp, flying = np.broadcast_to(summed_counts(depths, count), 2)
     return bool(flying + sharp >= LEAST_EDGES and flying > _FLYING_SHARE * (flying + sharp))
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -46,11 +46,13 @@ class FusionOptions:
         voxel_size_m: edge length of a voxel, m.
         max_memory_mb: of the voxels; larger voxels are taken where they would need more.
         noise: floor (m^2) and growth (1/m^2) of the variance of depth, as of `ops.measure_planes`.
+        color_every: voxels take the colors of every so many-th frame, of all others depth alone is read.
     """
 
     voxel_size_m: float
     max_memory_mb: int
     noise: tuple[float, float]
+    color_every: int = 1
 
     def truncation_m(self, voxel_size_m: float) -> float:
         """Three voxels, or more where all depth is noisy: what lies farther off must not be taken for free space."""
@@ -92,12 +94,16 @@ class PosedFrames:
     def __getitem__(self, position: int) -> RgbdFrame:
         return self.dataset[int(self.indices[position])]
 
-    def read(self) -> Iterator[tuple[RgbdFrame, np.ndarray]]:
-        """Frames and poses in order, read ahead by threads; frames that can't be read are left out."""
+    def depth(self, position: int) -> np.ndarray:
+        """Float32 [H, W], m: of the frame alone, which takes less time."""
+        return self.dataset.depth(int(self.indices[position]))
+
+    def read(self) -> Iterator[tuple[int, RgbdFrame]]:
+        """Positions and frames in order, read ahead by threads; frames that can't be read are left out."""
         with prefetch(self, *reading_threads()) as frames:
-            for frame, pose in zip(frames, self.poses, strict=True):
+            for position, frame in enumerate(frames):
                 if not isinstance(frame, DatasetError):
-                    yield frame, pose
+                    yield position, frame
 
 
 class _EdgeKind(enum.Enum):
@@ -108,9 +114,23 @@ class _EdgeKind(enum.Enum):
     @staticmethod
     def of(part: PosedFrames, noise: tuple[float, float]) -> _EdgeKind:
         """Judged by a few frames."""
-        if edges_are_blurred(part, noise):
+        depths = _DepthImages(part)
+        if edges_are_blurred(depths, noise):
             return _EdgeKind.BLURRED
-        return _EdgeKind.FLYING if has_flying_pixels(part, noise) else _EdgeKind.SHARP
+        return _EdgeKind.FLYING if has_flying_pixels(depths, noise) else _EdgeKind.SHARP
+
+
+@dataclass(frozen=True)
+class _DepthImages:
+    """The depth images of frames."""
+
+    part: PosedFrames
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __getitem__(self, position: int) -> np.ndarray:
+        return self.part.depth(position)
 
 
 def fuse_frames(
@@ -142,7 +162,13 @@ def fuse_frames(
     """
     parts = [frames] if isinstance(frames, PosedFrames) else frames
     noises = [part.noise or options.noise for part in parts]
-    images = [_EdgeImages(part, noise, _EdgeKind.of(part, noise)) for part, noise in zip(parts, noises, strict=True)]
+    befores = np.cumsum([0, *map(len, parts)])  # frames of the parts before each
+    images = [
+        _EdgeImages(
+            part, noise, _EdgeKind.of(part, noise), np.arange(before, before + len(part)) % options.color_every == 0
+        )
+        for part, noise, before in zip(parts, noises, befores, strict=False)
+    ]
     along_rays = [noise_along_rays(part, noise) for part, noise in zip(parts, noises, strict=True)]
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
@@ -189,6 +215,20 @@ def surface_cells(scene: Scene) -> torch.Tensor:
     return near_surface(cells, volume.voxel_size_m, sdf, MAX_SLOPE, CHUNK_POINTS)
 
 
+class _EdgeImage(NamedTuple):
+    """A frame.
+
+    Attributes:
+        depth: float32 [H, W], m.
+        color: uint8 [H, W, 3]; None where it was not read.
+        edges: depth without ramps, float32 [H, W], or which pixels are flying, bool [H, W], or None.
+    """
+
+    depth: np.ndarray
+    color: np.ndarray | None
+    edges: Any
+
+
 @dataclass(frozen=True)
 class _EdgeImages:
     """Frames with what lies between two surfaces in them, found on the threads that read.
@@ -197,51 +237,62 @@ class _EdgeImages:
         part: the frames.
         noise: of their depth.
         edges: of what kind they are.
+        colored: bool [F], of which the color image is read.
     """
 
     part: PosedFrames
     noise: tuple[float, float]
     edges: _EdgeKind
+    colored: np.ndarray
 
     def __len__(self) -> int:
         return len(self.part)
 
-    def __getitem__(self, position: int) -> tuple[RgbdFrame, Any]:
-        """A frame, and depth without ramps, float32 [H, W], or which pixels are flying, bool [H, W]."""
-        frame = self.part[position]
+    def __getitem__(self, position: int) -> _EdgeImage:
+        color = None
+        if self.colored[position]:
+            frame = self.part[position]
+            color, depth = frame.color, frame.depth
+        else:
+            depth = self.part.depth(position)
         if self.edges is _EdgeKind.BLURRED:
-            return frame, without_blurred_edges(frame.depth, self.noise)
-        return frame, flying_pixels(frame.depth, self.noise) if self.edges is _EdgeKind.FLYING else None
+            return _EdgeImage(depth, color, without_blurred_edges(depth, self.noise))
+        return _EdgeImage(depth, color, flying_pixels(depth, self.noise) if self.edges is _EdgeKind.FLYING else None)
 
-    def read(self) -> Iterator[tuple[int, RgbdFrame, Any]]:
-        """Positions, frames and their edges in order; frames that can't be read are left out."""
+    @property
+    def without_color(self) -> _EdgeImages:
+        """The same, of which no color image is read."""
+        return replace(self, colored=np.zeros_like(self.colored))
+
+    def read(self) -> Iterator[tuple[int, _EdgeImage]]:
+        """Positions and images in order; frames that can't be read are left out."""
         with prefetch(self, *reading_threads()) as images:
             for position, image in enumerate(images):
                 if not isinstance(image, DatasetError):
-                    yield position, *image
+                    yield position, image
 
 
 def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages, along_rays: tuple[float, float]) -> None:
     """Fuses the frames of one dataset, whose depth has this noise along rays."""
     device, intrinsics, noise = volume.sdf.device, frame_intrinsics(images.part), images.noise
-    poses = images.part.poses
+    poses = poses7_on(images.part.poses, device)
     if images.edges is _EdgeKind.BLURRED:
-        for position, frame, kept in images.read():
-            ramps = _ramps(on_device(frame.depth, device), on_device(kept, device), intrinsics, noise)
-            volume.make_room(ramps, pose7_on(poses[position], device), intrinsics, along_rays)
-    for position, frame, found in images.read():
-        depth = on_device(frame.depth, device)
+        for position, image in images.without_color.read():
+            ramps = _ramps(on_device(image.depth, device), on_device(image.edges, device), intrinsics, noise)
+            volume.make_room(ramps, poses[position], intrinsics, along_rays)
+    for position, image in images.read():
+        depth = on_device(image.depth, device)
         if images.edges is _EdgeKind.BLURRED:
-            kept = on_device(found, device)
+            kept = on_device(image.edges, device)
             # Smoothed depth: neighbors have the same noise.
             planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
             planes += _ramps(depth, kept, intrinsics, noise)
         else:
             planes = ops.measure_planes(depth, intrinsics, noise)
             if images.edges is _EdgeKind.FLYING:
-                planes[..., 4][on_device(found, device)] *= FLYING_WEIGHT
-        color = on_device(frame.color, device)
-        volume.integrate_planes(planes, pose7_on(poses[position], device), intrinsics, color, along_rays)
+                planes[..., 4][on_device(image.edges, device)] *= FLYING_WEIGHT
+        color = None if image.color is None else on_device(image.color, device)
+        volume.integrate_planes(planes, poses[position], intrinsics, color, along_rays)
 
 
 def _ramps(
@@ -262,9 +313,11 @@ def frame_intrinsics(part: PosedFrames) -> ops.Intrinsics:
 
 def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """An array as a tensor, of the same memory on the CPU where it is contiguous."""
-    return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    # From page-locked memory, which torch keeps for the next one, the copy waits for nothing that the device does.
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
-def pose7_on(pose: np.ndarray, device: torch.device) -> torch.Tensor:
-    """T_world_camera [4, 4] as float32 [7]: unit quaternion (w, x, y, z) and translation."""
-    return torch.from_numpy(matrix_to_pose7(pose)).to(device, torch.float32)
+def poses7_on(poses: np.ndarray, device: torch.device) -> torch.Tensor:
+    """T_world_camera [F, 4, 4] as float32 [F, 7]: unit quaternions (w, x, y, z) and translations."""
+    return torch.from_numpy(matrix_to_pose7(poses)).to(device, torch.float32)

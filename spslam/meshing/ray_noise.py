@@ -81,14 +81,14 @@ class _Pairs:
     def __getitem__(self, index: int) -> np.ndarray:
         """Float64 [2, N]: depth and its difference from the second frame's, m."""
         first = int(self.firsts[index])
-        depth, pose = self.frames[first].depth, self.frames.poses[first]
+        depth, pose = self.frames.depth(first), self.frames.poses[first]
         found = np.zeros((2, 0))
         for step in _STEPS:
             second = first + step
             if second >= len(self.frames):
                 continue
             motion = np.linalg.inv(self.frames.poses[second]) @ pose
-            found, share = depth_differences(depth, self.frames[second].depth, motion, self.frames.dataset.camera)
+            found, share = depth_differences(depth, self.frames.depth(second), motion, self.frames.dataset.camera)
             if share >= _LEAST_SHARE:
                 break
         return found
@@ -136,8 +136,6 @@ def depth_differences(
 
 def _fit(depth: np.ndarray, difference: np.ndarray, noise: tuple[float, float]) -> tuple[float, float]:
     """Floor and growth that fit the differences at all depths; those given where the differences do not say."""
-    from scipy.optimize import nnls  # takes a while to load
-
     bins = np.floor(_BINS_PER_OCTAVE * np.log2(depth)).astype(int)
     rows = []
     for each in np.unique(bins):
@@ -151,5 +149,16 @@ def _fit(depth: np.ndarray, difference: np.ndarray, noise: tuple[float, float]) 
     if at.max() < _LEAST_SPAN * at.min():
         return float(np.average(variance - noise[1] * at**4, weights=residuals)), noise[1]
     weight = np.sqrt(residuals / (residuals + _HALF_WEIGHT))
-    (floor, growth), _ = nnls(np.stack([weight / variance, weight * at**4 / variance], axis=1), weight)
-    return float(floor), float(growth)
+    return _not_negative(np.stack([weight / variance, weight * at**4 / variance], axis=1), weight)
+
+
+def _not_negative(matrix: np.ndarray, right: np.ndarray) -> tuple[float, float]:
+    """The numbers from 0 on, of two, with the least squared error of `matrix` [N, 2] times them from `right` [N].
+
+    What SciPy's nnls finds, which takes 0.2 s to load: if one is negative, the best lies where it or the other is 0.
+    """
+    best = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    if (best < 0).any():
+        alone = np.maximum(right @ matrix / (matrix * matrix).sum(0), 0)
+        best = min(np.diag(alone), key=lambda numbers: float(((matrix @ numbers - right) ** 2).sum()))
+    return float(best[0]), float(best[1])

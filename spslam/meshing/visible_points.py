@@ -9,7 +9,7 @@ import torch
 
 from spslam import ops
 from spslam.datasets.base import RgbdFrame
-from spslam.meshing.frame_fusion import PosedFrames, frame_intrinsics, on_device, pose7_on
+from spslam.meshing.frame_fusion import PosedFrames, frame_intrinsics, on_device, poses7_on
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def read_seen(
     """
     device = surface.points.device
     for part in parts:
-        intrinsics = frame_intrinsics(part)
-        for frame, pose in part.read():
+        intrinsics, poses = frame_intrinsics(part), poses7_on(part.poses, device)
+        for position, frame in part.read():
             images = on_device(frame.depth, device), on_device(frame.color, device)
-            yield ops.see_points(surface, *images, pose7_on(pose, device), intrinsics, part.noise or noise)
+            yield ops.see_points(surface, *images, poses[position], intrinsics, part.noise or noise)

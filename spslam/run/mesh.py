@@ -16,7 +16,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import OutputError
 from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
-from spslam.meshing.color_detail import ColorOptions, color_mesh
+from spslam.meshing.color_detail import ColorOptions, color_mesh, colored_every
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
@@ -24,6 +24,7 @@ from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.options import MeshOptions
 from spslam.run.threads import library_threads_limited
 from spslam.scene import Scene
+from spslam.slam.interpreter import interpreter_shared
 from spslam.trajectory import Trajectory
 
 
@@ -131,8 +132,10 @@ def _extracted(job: MeshJob) -> tuple[TriangleMesh, dict[str, Any]]:
 def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh of the frames, and figures. If it is to have a texture, its vertices have the voxels' colors."""
     frames, noise = frames_of(job, dataset), job.noise or DEFAULT_NOISE
-    fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, noise)
-    with library_threads_limited():
+    # Colors of voxels are for a texture, or else for vertices that no frame that gives colors sees.
+    color_every = colored_every(sum(map(len, frames))) if job.texture is None else 1
+    fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, noise, color_every)
+    with library_threads_limited(), interpreter_shared():
         volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
     mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job))
     figures = {
@@ -144,7 +147,7 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     del volume  # the largest of what is held, not needed for colors
     if job.texture is None:
         options = ColorOptions(noise, job.options.color_subdivisions)
-        with library_threads_limited():
+        with library_threads_limited(), interpreter_shared():
             mesh, figures["mesh_color_frames"] = color_mesh(mesh, frames, options, job.scene.device)
     return mesh, figures
 

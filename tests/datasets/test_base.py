@@ -45,6 +45,18 @@ def test_depth_range_is_inclusive():
     assert [float(frame.depth.max()) for frame in dataset] == [0, 0, 2, 3, 4, 5, 0, 0, 0, 0]
 
 
+def test_depth_alone_is_the_frames():
+    dataset = Subset(Ramp(), 1, None, 2)
+    dataset.depth_range, dataset.border_px = (2.0, 7.0), 1
+    for index, frame in enumerate(dataset):
+        np.testing.assert_array_equal(dataset.depth(index), frame.depth)
+    with pytest.raises(IndexError, match=r"ramp: frame must be in 0\.\.4, got 5"):
+        dataset.depth(5)
+    dataset.read_depth = lambda index: np.zeros((2, 4), np.float32)
+    with pytest.raises(DatasetError, match="as large as the sequence's first, 4x3, got 4x2"):
+        dataset.depth(1)
+
+
 def test_sizes_are_checked():
     dataset = Ramp()
     dataset.read = lambda index: RgbdFrame(index, 0, np.zeros((3, 4, 3), np.uint8), np.zeros((2, 4), np.float32))

@@ -52,7 +52,9 @@ ROTATED = pose_from(TURN, np.zeros(3))
 def check(color_size, depth_size, place, seed=0, unseen=None):
     both = cameras(color_size, depth_size)
     color, depth = images(color_size, depth_size, seed)
-    found, kept = ColorToDepth(*both, place, unseen)(color, depth)
+    registration = ColorToDepth(*both, place, unseen)
+    found, kept = registration(color, depth)
+    np.testing.assert_array_equal(registration.depth(depth), kept)
     expected, expected_kept = color_to_depth(both, place, color, depth, unseen)
     assert found.dtype == np.uint8 and kept.dtype == np.float32
     assert np.abs(found - expected).max() <= LEVELS

@@ -70,6 +70,7 @@ def test_a_recording_is_found_out_and_gives_its_frames(tmp_path, name):
             difference = frame.color.astype(int) - color_image(i)
             assert np.abs(difference[1:-1, away_from_the_edge]).max() <= 12
             np.testing.assert_allclose(frame.pose, poses(COUNT)[i], atol=1e-6)
+            np.testing.assert_array_equal(dataset.depth(i), frame.depth)
 
 
 @pytest.mark.parametrize("name", ["stray_scanner", "r3d", "arkitscenes"])
@@ -86,7 +87,9 @@ def test_depth_of_low_confidence_is_missing(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["stray_scanner", "scannetpp", "arkitscenes"])
 def test_depth_may_be_brought_to_the_color_image(tmp_path, name):
-    frame = open_path(FORMATS[name][1](tmp_path / "mine", 2), "dataset.register_to=color")[1]
+    dataset = open_path(FORMATS[name][1](tmp_path / "mine", 2), "dataset.register_to=color")
+    frame = dataset[1]
+    np.testing.assert_array_equal(dataset.depth(1), frame.depth)
     assert frame.depth.shape == (96, 128)
     assert frame.color.shape == (96, 128, 3)
     assert np.median(frame.depth[frame.depth > 0]) == pytest.approx(np.median(depth_meters(1)), abs=0.03)

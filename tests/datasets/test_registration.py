@@ -142,6 +142,7 @@ def test_lenses_and_places_together(color_lens, depth_lens, view):
     color, depth = both(color_lens, depth_lens, color_from_depth)
     geometry = FrameGeometry(Calibration(color_lens, depth_lens, color_from_depth), view)
     found, kept = geometry(color, depth, "frame")
+    np.testing.assert_array_equal(geometry.depth(depth, "frame"), kept)
     pose = POSE @ inverse(color_from_depth) @ geometry.color_from_camera
     true_color, truth = render(Lens(geometry.camera), pose)
     known = kept > 0
@@ -167,6 +168,8 @@ def test_an_image_of_another_size_is_named():
     color, depth = np.zeros((180, 320, 3), np.uint8), np.ones((60, 80), np.float32)
     with pytest.raises(DatasetError, match="frame 3: the depth image must be as large as its camera, 160x120, got 80x"):
         geometry(color, depth, "frame 3")
+    with pytest.raises(DatasetError, match="frame 3: the depth image must be as large as its camera, 160x120, got 80x"):
+        geometry.depth(depth, "frame 3")
     with pytest.raises(DatasetError, match="frame 3: the color image must be as large as its camera, 320x180, got 160"):
         geometry(color[:, ::2], depth, "frame 3")
 
@@ -183,6 +186,7 @@ def test_depth_where_a_lens_leaves_no_color_is_missing(depth_camera, view):
     depth = np.full((depth_camera.height, depth_camera.width), 2.0, np.float32)
     _, plain = FrameGeometry(Calibration(Lens(COLOR), Lens(depth_camera), place), view)(color, depth, "frame")
     _, kept = geometry(color, depth, "frame")
+    np.testing.assert_array_equal(geometry.depth(depth, "frame"), kept)
     assert (kept > 0).sum() < (plain > 0).sum()
     middle = slice(geometry.camera.height // 3, 2 * geometry.camera.height // 3)
     across = slice(geometry.camera.width // 3, 2 * geometry.camera.width // 3)

@@ -41,6 +41,7 @@ def test_every_format_gives_the_same_frames(tmp_path, kind):
         assert frame.depth.dtype == np.float32
         assert frame.color.flags.c_contiguous
         np.testing.assert_allclose(frame.depth, depth_meters(index), atol=2e-4)
+        np.testing.assert_array_equal(dataset.depth(index), frame.depth)
 
 
 def test_generated_needs_no_folder():

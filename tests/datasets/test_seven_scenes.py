@@ -216,6 +216,9 @@ def test_color_of_the_kinect_comes_to_its_depth(tmp_path):
     # The middle of the image, by hand: turned by 0.008 to either side and 2.6 cm beside, at 525 px and 1 m.
     u, v = 320 + 525 * (-0.0079041 - 0.0255589), 240 + 525 * (-0.0081505 + 0.0001011)
     np.testing.assert_allclose(frame.color[240, 320, :2], (u * 255 / 640, v * 255 / 480), atol=1)
+    for path in tmp_path.rglob("*.color.*"):
+        path.unlink()
+    np.testing.assert_array_equal(dataset.depth(0), frame.depth)  # for which no color image is read
 
 
 def test_color_may_be_left_as_it_is(tmp_path):

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from spslam.datasets.base import RgbdFrame
 from spslam.errors import DatasetError
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
 
@@ -21,18 +20,14 @@ def boxes(sigma_px=0.0, seed=0):
     return cv2.GaussianBlur(depth, (0, 0), sigma_px) if sigma_px else depth
 
 
-def frames(*depths):
-    return [RgbdFrame(i, float(i), np.zeros((*depth.shape, 3), np.uint8), depth) for i, depth in enumerate(depths)]
-
-
 @pytest.mark.parametrize(("sigma_px", "blurred"), [(0.0, False), (0.4, False), (1.2, True), (1.6, True)])
 def test_smoothed_edges_are_found(sigma_px, blurred):
-    assert edges_are_blurred(frames(*[boxes(sigma_px, seed) for seed in range(3)]), NOISE) == blurred
+    assert edges_are_blurred([boxes(sigma_px, seed) for seed in range(3)], NOISE) == blurred
 
 
 def test_a_steep_surface_is_no_edge():
     depth = 1 / (1 / NEAR_M - np.arange(128, dtype=np.float32)[None] * np.ones((96, 1), np.float32) * 6e-3)
-    assert not edges_are_blurred(frames(depth), NOISE)
+    assert not edges_are_blurred([depth], NOISE)
     assert np.array_equal(without_blurred_edges(depth, NOISE), depth)
 
 
@@ -62,8 +57,8 @@ def test_little_is_not_enough_to_judge():
 
     empty = np.zeros((0, 0), np.float32)
     assert not edges_are_blurred([], NOISE)
-    assert not edges_are_blurred(Broken(frames(boxes(1.2))), NOISE)
-    assert not edges_are_blurred(frames(empty, np.zeros((4, 5), np.float32)), NOISE)
+    assert not edges_are_blurred(Broken([boxes(1.2)]), NOISE)
+    assert not edges_are_blurred([empty, np.zeros((4, 5), np.float32)], NOISE)
     assert without_blurred_edges(empty, NOISE).shape == (0, 0)
     flat = np.full((40, 50), np.nan, np.float32)
     flat[:, 10:] = FAR_M

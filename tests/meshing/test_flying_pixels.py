@@ -6,7 +6,7 @@ import pytest
 
 from spslam.errors import DatasetError
 from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
-from tests.meshing.test_blurred_edges import FAR_M, NEAR_M, NOISE, boxes, frames
+from tests.meshing.test_blurred_edges import FAR_M, NEAR_M, NOISE, boxes
 
 # Of a pixel's footprint relative to its size, as of the time-of-flight camera.
 FOOTPRINT_PX = 0.6
@@ -45,8 +45,8 @@ def test_a_step_between_two_others_is_a_surface_from_three_pixels_on(width_px):
 
 
 def test_a_recording_is_judged_by_its_edges():
-    assert has_flying_pixels(frames(*[mixed(seed) for seed in range(3)]), NOISE)
-    assert not has_flying_pixels(frames(*[boxes(seed=seed) for seed in range(3)]), NOISE)
+    assert has_flying_pixels([mixed(seed) for seed in range(3)], NOISE)
+    assert not has_flying_pixels([boxes(seed=seed) for seed in range(3)], NOISE)
 
 
 def test_treads_of_a_stair_are_no_flying_pixels():
@@ -54,7 +54,7 @@ def test_treads_of_a_stair_are_no_flying_pixels():
     widths = (6, 1, 6, 6, 2, 6, 6, 3, 6)
     rows = np.repeat(NEAR_M + 0.2 * np.arange(len(widths), dtype=np.float32), widths)
     depth = np.tile(rows[:, None], (1, 100))
-    assert flying_pixels(depth, NOISE).any() and not has_flying_pixels(frames(depth), NOISE)
+    assert flying_pixels(depth, NOISE).any() and not has_flying_pixels([depth], NOISE)
 
 
 def test_little_is_not_enough_to_judge():
@@ -63,6 +63,6 @@ def test_little_is_not_enough_to_judge():
             raise DatasetError("can't be read")
 
     assert not has_flying_pixels([], NOISE)
-    assert not has_flying_pixels(Broken(frames(mixed())), NOISE)
-    assert not has_flying_pixels(frames(np.zeros((0, 0), np.float32), np.zeros((4, 5), np.float32)), NOISE)
+    assert not has_flying_pixels(Broken([mixed()]), NOISE)
+    assert not has_flying_pixels([np.zeros((0, 0), np.float32), np.zeros((4, 5), np.float32)], NOISE)
     assert flying_pixels(np.zeros((0, 0), np.float32), NOISE).shape == (0, 0)

@@ -81,6 +81,26 @@ def test_frames_that_cannot_be_read_are_left_out(room):
     assert torch.equal(fused(broken).sdf, fused(without).sdf)
 
 
+def test_colors_of_every_third_frame(room):
+    """Counted through two parts; depth counts as ever, and no color of the other frames is read."""
+
+    class Counted(GeneratedDataset):
+        def __getitem__(self, index):
+            whole.append(index)
+            return super().__getitem__(index)
+
+    whole = []
+    dataset = Counted(frames=6, width=160, height=120)
+    parts = [PosedFrames(dataset, room.indices[rows], room.poses[rows]) for rows in (slice(4), slice(4, None))]
+    thinned = fuse_frames(parts, FusionOptions(VOXEL_M, 500, EXACT, color_every=3))
+    assert sorted(whole) == [0, 3]
+    every, those = fused(room), fused(PosedFrames(dataset, room.indices[[0, 3]], room.poses[[0, 3]]))
+    assert torch.equal(thinned.sdf, every.sdf)
+    rows = thinned.blocks.find(those.block_coords).long()
+    assert torch.equal(thinned.colors[rows], those.colors)
+    assert (thinned.colors.sum() > 0) and (thinned.colors != every.colors).any()
+
+
 def test_little_of_ramps_between_surfaces_stays(room):
     class Smoothed(GeneratedDataset):
         def read(self, index):
@@ -115,8 +135,11 @@ class _Views(PosedFrames):
         super().__init__(dataset, np.arange(len(depths)), np.tile(np.eye(4), (len(depths), 1, 1)))
         object.__setattr__(self, "depths", depths)
 
+    def depth(self, position):
+        return self.depths[position]
+
     def __getitem__(self, position):
-        depth = self.depths[position]
+        depth = self.depth(position)
         return RgbdFrame(position, float(position), np.zeros((*depth.shape, 3), np.uint8), depth)
 
 

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import scipy.optimize
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
@@ -10,7 +11,7 @@ from spslam.datasets.generated import GeneratedDataset
 from spslam.errors import DatasetError
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
-from spslam.meshing.ray_noise import depth_differences, noise_along_rays
+from spslam.meshing.ray_noise import _not_negative, depth_differences, noise_along_rays
 
 GIVEN = (1e-8, 1e-9)
 SHARE = 0.75  # of the deviation
@@ -33,6 +34,9 @@ class Walls(PosedFrames):
         super().__init__(GeneratedDataset(frames=1, width=160, height=120), np.arange(count), poses)
         inverse = np.linspace(1 / ends_m[0], 1 / ends_m[1], 160)
         self.__dict__.update(deviation=deviation, exact=np.tile(1 / inverse, (120, 1)), blur_px=blur_px, broken=broken)
+
+    def depth(self, position):
+        return self[position].depth
 
     def __getitem__(self, position):
         if position in self.broken:
@@ -125,3 +129,14 @@ def test_a_far_wall_of_noisy_depth_is_one_surface():
     edges = np.diff(mesh.vertices[mesh.faces[inner[mesh.faces].all(1)]], axis=1)
     area_m2 = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
     assert area_m2 < 1.08 * 4  # 1.13 times with the noise that tracking measured
+
+
+def test_numbers_that_are_not_negative_are_those_of_scipy():
+    random = np.random.default_rng(0)
+    zeros = 0
+    for _ in range(200):
+        matrix, right = random.random((6, 2)), random.normal(0.3, 1, 6)
+        expected, _ = scipy.optimize.nnls(matrix, right)
+        np.testing.assert_allclose(_not_negative(matrix, right), expected, atol=1e-12)
+        zeros += (expected == 0).sum()
+    assert 50 < zeros < 350

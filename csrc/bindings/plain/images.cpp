@@ -16,8 +16,9 @@ extern "C" __attribute__((visibility("default"))) int spslam_runs_here() {
 #endif
 }
 
-// sizes: of the color image, the depth image and the depth buffer, width and height each. numbers: those of a
-// `PixelMap` in its order, the typical depth and the hidden share. Returns 0, or 1 where there is not enough memory.
+// colors and registered_colors: null where only depth is wanted. sizes: of the color image, the depth image and the
+// depth buffer, width and height each. numbers: those of a `PixelMap` in its order, the typical depth and the hidden
+// share. Returns 0, or 1 where there is not enough memory.
 extern "C" __attribute__((visibility("default"))) int spslam_register_color(
     const std::uint8_t* colors, const std::uint8_t* unseen, const float* depth, const std::int32_t* sizes,
     const float* numbers, std::uint8_t* registered_colors, float* registered_depth) {

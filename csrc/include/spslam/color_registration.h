@@ -25,16 +25,16 @@ struct ColorRegistration {
   float hidden_share;
 };
 
-// The images that are read: colors [color_height, color_width, 3], unseen [color_height, color_width] not 0 where
-// colors have no content, or null, and depth [height, width], m.
+// The images that are read: colors [color_height, color_width, 3], or null where only depth is wanted, unseen
+// [color_height, color_width] not 0 where colors have no content, or null, and depth [height, width], m.
 struct RegisteredImages {
   const std::uint8_t* colors;
   const std::uint8_t* unseen;
   const float* depth;
 };
 
-// Writes colors [height, width, 3], linearly interpolated and repeated beyond the border, and depth [height, width]: 0
-// where it was, or where the color camera doesn't see the point.
+// Writes colors [height, width, 3], linearly interpolated and repeated beyond the border, unless they are null, and
+// depth [height, width]: 0 where it was, or where the color camera doesn't see the point.
 void register_color(Cpu device, const ColorRegistration& registration, const RegisteredImages& images,
                     std::uint8_t* colors, float* depth);
 
