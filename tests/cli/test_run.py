@@ -11,6 +11,7 @@ import time
 from functools import partial
 
 import pytest
+import torch
 
 from experiments.wrong_recordings import FAULTS, WrongRecording
 from spslam.cli.progress import ProgressBar, ProgressLines, summarize
@@ -227,8 +228,8 @@ def test_first_frames_that_do_not_fit_stop_a_run_unless_told_otherwise(tmp_path)
     assert "warnings" not in json.loads((tmp_path / "other" / "metrics.json").read_text())
 
 
-def test_mesh_command_makes_the_runs_own_mesh_again(tmp_path):
-    run(tmp_path, "--frames", "0:3", "--output", "out", "--quiet")
+def test_mesh_command_makes_the_runs_own_mesh_again(tmp_path, device):
+    run(tmp_path, "--frames", "0:3", "--output", "out", "--quiet", f"--device={device}")
     own = (tmp_path / "out" / "mesh.ply").read_bytes()
     result = spslam("mesh", "out", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -237,6 +238,16 @@ def test_mesh_command_makes_the_runs_own_mesh_again(tmp_path):
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["mesh_source"] == "tsdf" and metrics["mesh_resolution_m"] == 0.01
     assert metrics["mesh_frames"] == metrics["mesh_color_frames"] == 3
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the device isn't absent here")
+def test_mesh_command_on_a_device_that_is_absent(finished):
+    folder, _ = finished
+    before = (folder / "out" / "mesh.ply").read_bytes()
+    refused = spslam("mesh", "out", "--device", "cuda", cwd=folder)
+    assert_refused(refused, "device cuda is not available")
+    assert "use --device cpu" in refused.stderr
+    assert (folder / "out" / "mesh.ply").read_bytes() == before
 
 
 def test_mesh_command_divides_edges_for_finer_colors(finished):
