@@ -109,7 +109,7 @@ def depth_differences(
         Float64 [2, N]: depth in the other camera, and that less the other image's depth, bilinear in inverse depth, m,
         of at most 20,000 pixels that fall on the same surface. And the share of all that were projected, 0 to 1.
     """
-    rows, columns = np.nonzero(depth > 0)
+    rows, columns = np.nonzero((depth > 0) & (depth < np.inf))
     chosen = slice(None, None, max(-(-len(rows) // _PIXELS), 1))
     rows, columns = rows[chosen], columns[chosen]
     if not len(rows):

@@ -119,6 +119,16 @@ def test_differences_are_of_one_surface():
     assert nowhere.shape == (2, 0) and share == 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_depth_that_is_no_number_does_not_count():
+    camera = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+    wall = np.full((120, 160), 2.0, np.float32)
+    wall[::2, ::2], wall[1::2, ::2] = np.inf, np.nan
+    found, _ = depth_differences(wall, np.full_like(wall, 2.005), np.eye(4), camera)
+    assert found.shape[1] > 5000
+    np.testing.assert_allclose(found[1], -0.005, atol=1e-6)
+
+
 def test_a_far_wall_of_noisy_depth_is_one_surface():
     """Stereo: noise of a pixel's width, of which tracking measured a third."""
     frames = Walls(40, lambda z: 0.004 * z**2, ends_m=(3.9, 4.1), blur_px=0.7)
