@@ -82,7 +82,8 @@ def seen_depth(
     view: ColorView, depth: np.ndarray, unseen: np.ndarray | None, hidden_share: float, in_place: bool = False
 ) -> np.ndarray:
     """The depth that `register_color` returns, without a color image; arguments and errors as there."""
-    return _register(view, (None, None), depth, unseen, (1.0, hidden_share), in_place)
+    typical_m = 1.0  # where a pixel without depth finds its color, of which there is none
+    return _register(view, (None, None), depth, unseen, (typical_m, hidden_share), in_place)
 
 
 def _register(

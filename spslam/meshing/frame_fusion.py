@@ -315,7 +315,9 @@ def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """An array as a tensor, of the same memory on the CPU where it is contiguous."""
     tensor = torch.from_numpy(np.ascontiguousarray(array))
     # From page-locked memory, which torch keeps for the next one, the copy waits for nothing that the device does.
-    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
+    if device.type == "cuda" and array.size:
+        return tensor.pin_memory().to(device, non_blocking=True)
+    return tensor.to(device)
 
 
 def poses7_on(poses: np.ndarray, device: torch.device) -> torch.Tensor:
