@@ -66,8 +66,10 @@ def start(*arguments, code=None):
 
 
 def frames_logged(output):
+    """Of the complete lines: a run that goes on may have written a part of the next."""
     log = output / "log.jsonl"
-    return [json.loads(line)["frame"] for line in log.read_text().splitlines()] if log.exists() else []
+    lines = log.read_text().splitlines(keepends=True) if log.exists() else []
+    return [json.loads(line)["frame"] for line in lines if line.endswith("\n")]
 
 
 def kill_after(process, output, frames, delay_s):
