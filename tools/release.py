@@ -1,7 +1,7 @@
-"""Builds the wheel and the source distribution, and checks both in fresh environments.
+"""Builds the source distribution, the wheel from that, and checks the wheel in fresh environments.
 
 python tools/release.py                       everything, for every GPU architecture
-python tools/release.py --short               one GPU architecture, the source distribution built without CUDA: for CI
+python tools/release.py --short               one GPU architecture, shorter checks: for CI
 python tools/release.py --torch 2.11.0 --torch 2.14.1     the checks under these versions of torch
 
 Needs a C++17 compiler and, for the CUDA kernels, nvcc, but no GPU. What it leaves is in dist/. The first torch named is
@@ -60,12 +60,24 @@ class Environment:
         return run(self.path / "bin" / name, *arguments, PATH=search)
 
 
-def build_wheel(environment: Environment, short: bool) -> Path:
+def torch_environment(version: str) -> Environment:
+    """A fresh one with that torch alone."""
+    return Environment(f"torch-{version}", f"torch=={version}")
+
+
+def build_sdist(tools: Environment) -> Path:
+    """All that building needs."""
+    tools.python("-m", "build", "--sdist", "--outdir", DIST, ROOT)
+    (sdist,) = DIST.glob("*.tar.gz")
+    return sdist
+
+
+def build_wheel(environment: Environment, sdist: Path, short: bool) -> Path:
     """Every CPU instruction set, and CUDA, in one wheel."""
     folder = WORK / "wheel"
     shutil.rmtree(folder, ignore_errors=True)
     options = {"SPSLAM_CUDA": "ON"} | ({"SPSLAM_CUDA_ARCHS": "90-real"} if short else {})
-    environment.pip("wheel", "--no-deps", "--wheel-dir", folder, ROOT, **options)
+    environment.pip("wheel", "--no-deps", "--wheel-dir", folder, sdist, **options)
     (wheel,) = folder.glob("*.whl")
     return wheel
 
@@ -97,9 +109,9 @@ def check_wheel_file(tools: Environment, wheel: Path) -> None:
     print(tools.tool("torch-abi-audit", "--check", "torch", unpacked / "spslam"))
 
 
-def check_install(package: Path, environment: Environment, short: bool) -> None:
-    """Installs a package beside the torch that is there and runs what a user would, away from the checkout."""
-    environment.pip("install", package, SPSLAM_CUDA="OFF", SPSLAM_CPU_ISAS="baseline")
+def check_install(wheel: Path, environment: Environment, short: bool) -> None:
+    """Installs the wheel beside the torch that is there and runs what a user would, away from the checkout."""
+    environment.pip("install", wheel)
     print(environment.python(CHECK, *(["--short"] if short else [])))
 
 
@@ -112,14 +124,13 @@ def main() -> None:
     shutil.rmtree(DIST, ignore_errors=True)
     WORK.mkdir(parents=True, exist_ok=True)
     tools = Environment("tools", *TOOLS)
-    builder = Environment("builder", f"torch=={versions[0]}")
-    wheel = repair(tools, build_wheel(builder, args.short))
+    sdist = build_sdist(tools)
+    first = torch_environment(versions[0])  # building leaves nothing in it
+    wheel = repair(tools, build_wheel(first, sdist, args.short))
     check_wheel_file(tools, wheel)
-    for torch in versions:
-        check_install(wheel, Environment(f"torch-{torch}", f"torch=={torch}"), args.short)
-    tools.python("-m", "build", "--sdist", "--outdir", DIST, ROOT)
-    (sdist,) = DIST.glob("*.tar.gz")
-    check_install(sdist, builder, short=True)
+    check_install(wheel, first, args.short)
+    for version in versions[1:]:
+        check_install(wheel, torch_environment(version), args.short)
     print(f"release: {wheel.name} and {sdist.name} in {DIST}")
 
 

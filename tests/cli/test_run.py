@@ -155,6 +155,7 @@ def test_interruption_is_one_line_and_resumes_to_the_same_bytes(tmp_path):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_demo_replaces_an_earlier_run_over_the_room(finished, few_samples, tmp_path):
     shutil.copytree(finished[0] / "out", tmp_path / "runs" / "demo")
     result = spslam("demo", "--frames", 1, "--device", "cpu", cwd=tmp_path)

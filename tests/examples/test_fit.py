@@ -21,6 +21,7 @@ def run(name, *arguments):
     return subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def test_sphere_is_fitted(tmp_path, device):
     path = tmp_path / "ball.obj"

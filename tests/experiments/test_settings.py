@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from experiments.settings import parse_job, print_table, read_settings
 from tests.cli.command import ROOT
 
@@ -27,6 +29,7 @@ def test_settings_come_from_a_file(tmp_path):
     assert read_settings(path) == ["balanced", "balanced,mapping.every=2"]
 
 
+@pytest.mark.slow
 def test_rows_are_written_as_runs_finish_and_are_not_run_again(tmp_path):
     rows = tmp_path / "rows.jsonl"
     sequence = "room=demo::0:3," + ",".join(f"dataset.{option}" for option in SMALL)

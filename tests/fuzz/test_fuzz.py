@@ -164,7 +164,11 @@ def test_a_seed_gives_the_same_files(prepared, tmp_path, name):
 def test_some_cases_are_read_and_some_refused(prepared, tmp_path, name):
     """Else the mutations say nothing: either all are refused at the first byte, or none does harm."""
     (tmp_path / "root").mkdir()
-    kinds = {run_case(prepared[name], seed, tmp_path / "root").kind for seed in range(40)}
+    kinds = set()
+    for seed in range(40):
+        kinds.add(run_case(prepared[name], seed, tmp_path / "root").kind)
+        if kinds >= {"ok", "refused"}:
+            break
     assert kinds == {"ok", "refused"}
 
 

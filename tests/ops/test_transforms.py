@@ -87,6 +87,7 @@ def test_gradients_by_torch_func(name, device, generator):
         torch.testing.assert_close(summed, want, rtol=1e-4, atol=1e-4 * max(1.0, want.abs().max().item()))
 
 
+@pytest.mark.slow
 def test_compiled_code_runs(generator):
     """With torch's own compiler behind it, not only the tracer."""
     call = arguments("trilinear_interpolate", generator)

@@ -160,7 +160,6 @@ def test_validation_is_reproducible():
     assert first["mean"] == first["torus"]
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 def test_a_minute_of_training_reduces_the_error(tmp_path):
     provenance = pretrain(tmp_path / "prior.safetensors", PretrainSettings(steps=400))

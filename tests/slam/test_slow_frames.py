@@ -21,7 +21,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+# `make test` has the first.
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, id=name, marks=[pytest.mark.slow] * bool(at)) for at, (name, case) in enumerate(CASES.items())],
+)
 def test_it_is_followed(case, device):
     place, sensor, motion, seed, frames = case
     options = [f"dataset.place={place}", f"dataset.sensor={sensor}", f"dataset.motion={motion}", f"dataset.seed={seed}"]

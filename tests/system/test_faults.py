@@ -93,6 +93,7 @@ def test_the_trajectory_has_a_gap_where_the_camera_was_lost(monkeypatch, tmp_pat
     assert all(line["error_probability"] < 0.1 for line in log[1:] if not line["lost"])
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_lost_goes_on_to_the_same_bytes(monkeypatch, tmp_path):
     dataset = Edited(AWAY_AND_BACK, {i: COVERS[0] for i in BLACK})
     run_on(monkeypatch, dataset, tmp_path / "whole")

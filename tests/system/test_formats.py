@@ -175,7 +175,6 @@ def test_a_wide_color_image_beside_depth_gives_as_good_a_path():
     assert ate(track(dataset).poses, dataset.poses())["ate_rmse_cm"] < 0.3
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("view", ["depth", "color"])
 @pytest.mark.parametrize("place", PLACES)
@@ -185,7 +184,6 @@ def test_any_two_cameras_give_as_good_a_path(color, depth, place, view):
     check(f"{color}, depth {depth}, {place}", COLORS[color], DEPTHS[depth], PLACES[place], view)
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("view", ["depth", "color"])
 def test_full_sizes_give_as_good_a_path(view):
@@ -193,7 +191,6 @@ def test_full_sizes_give_as_good_a_path(view):
     check("1280x720 Brown, depth 640x480, side by side", color, Lens(wide(640, 480)), extrinsics(), view)
 
 
-@pytest.mark.slow
 @pytest.mark.sweep
 @pytest.mark.parametrize("view", ["depth", "color"])
 def test_a_phone_gives_as_good_a_path(view):

@@ -84,6 +84,7 @@ def kill_after(process, output, frames, delay_s):
     process.communicate()
 
 
+@pytest.mark.slow
 def test_run_killed_at_random_times_resumes_to_the_same_bytes(data, uninterrupted, tmp_path):
     output, chance = tmp_path / "out", random.Random(os.getpid())
     for frames in (4, 9):

@@ -22,7 +22,7 @@ from tests.tasks.examples import InThisProcess, task, wait_for
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'spslam[cluster]'")
 
 # `test_schedule.py` and `test_local.py` are without a cluster, and `test_node_data.py` without Ray.
-pytestmark = [pytest.mark.slow, pytest.mark.sweep]
+pytestmark = pytest.mark.sweep
 
 NODE = {"num_cpus": 1, "memory": 8 << 30, "object_store_memory": 80 << 20}
 TIMED = ("fps", "_ms", "_s", "_per_iteration", "_rss_mb")  # ends of the names of what differs from run to run

@@ -123,6 +123,7 @@ def test_frames_may_follow_the_end(sequence):
     assert system.state.scene.volume.num_voxels > 0.9 * whole.state.scene.volume.num_voxels
 
 
+@pytest.mark.slow
 def test_a_known_place_needs_no_more_keyframes(sequence, tmp_path, monkeypatch):
     """Keyframes stop to grow, frames of those left out follow, and a resumed system goes on alike."""
     monkeypatch.setattr(redundancy, "SIMILAR", 1)  # of the ten that there are

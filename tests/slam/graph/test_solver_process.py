@@ -40,6 +40,12 @@ def world():
     return place("room", 96)[0], numbered, drifted
 
 
+@pytest.fixture(scope="module")
+def solved(world):
+    """By this process: the content and the solution, and the keyframes that are left."""
+    return solve_in_parts(GraphSolver(world[0]), world)
+
+
 @pytest.fixture(autouse=True)
 def ended_in_the_end():
     yield
@@ -82,8 +88,8 @@ def test_the_function_that_the_process_runs_exists():
     assert getattr(module, solver_launch.SERVICE_FUNCTION) is serve
 
 
-def test_two_runs_after_each_other_are_solved_by_one_process(world):
-    want, left = solve_in_parts(GraphSolver(world[0]), world)
+def test_two_runs_after_each_other_are_solved_by_one_process(world, solved):
+    want, left = solved
     assert len(left) < len(world[1])  # some are left out, so numbers change between solutions
     pids = []
     for _ in range(2):
@@ -111,7 +117,7 @@ def test_features_that_the_process_found_come_back(world):
         assert np.array_equal(features.descriptors, keyframe.features.descriptors)
 
 
-def test_a_process_that_ends_is_done_without(world):
+def test_a_process_that_ends_is_done_without(world, solved):
     solver = SolverProcess(world[0])
 
     def end_second(end):
@@ -121,27 +127,27 @@ def test_a_process_that_ends_is_done_without(world):
 
     with pytest.warns(UserWarning, match="solves the keyframe graph ended by SIGKILL; this one does it from now on"):
         got, _ = solve_in_parts(solver, world, before_part=end_second)
-    assert_same(got, solve_in_parts(GraphSolver(world[0]), world)[0])
+    assert_same(got, solved[0])
     solver.close()
     assert SOLVERS.waiting is None
 
 
-def test_a_failure_keeps_its_traceback_and_the_process_goes_on(world):
+def test_a_failure_keeps_its_traceback_and_the_process_goes_on(world, solved):
     config, frames, poses = world
     solver = SolverProcess(config)
     no_noise = GraphProblem([Link(np.eye(4), False)] * 3, poses[:3], GraphContent(), {})
     with pytest.raises(RuntimeError, match="(?s)solving the keyframe graph failed:\n.*KeyError"):
         solver.solve(frames[:3], no_noise)
-    assert_same(solve_in_parts(solver, world)[0], solve_in_parts(GraphSolver(config), world)[0])
+    assert_same(solve_in_parts(solver, world)[0], solved[0])
     solver.close()
 
 
-def test_other_keyframes_after_a_state_was_loaded(world):
+def test_other_keyframes_after_a_state_was_loaded(world, solved):
     config, frames, poses = world
     solver = SolverProcess(config)
     solve_in_parts(solver, world, parts=(12, 24))
     loaded = [keyframe.changed() for keyframe in frames]
-    assert_same(solve_in_parts(solver, (config, loaded, poses))[0], solve_in_parts(GraphSolver(config), world)[0])
+    assert_same(solve_in_parts(solver, (config, loaded, poses))[0], solved[0])
     solver.close()
 
 
