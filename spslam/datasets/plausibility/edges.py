@@ -41,6 +41,8 @@ class EdgeMatch:
         displacement: the largest that this takes within the image, as a share of the width.
         least_offset: the smallest of the quarters' offsets, as a share of the width.
         misfit: how far the quarters' offsets are from one shift, scale and rotation, as a share of the width.
+        similarity: float64 [4], those three: to the right and down as shares of the width, the factor less 1, and the
+            sine of the angle, about the middle of the image.
         turned_scores: by name, with the depth image mirrored or turned.
     """
 
@@ -49,6 +51,7 @@ class EdgeMatch:
     displacement: float
     least_offset: float
     misfit: float
+    similarity: np.ndarray
     turned_scores: dict[str, float]
 
     @property
@@ -57,6 +60,15 @@ class EdgeMatch:
         if self.score < _CLEAR_SCORE:
             return False
         return self.displacement <= SAME_PLACE or self.score > _NEARLY_BEST * self.best_score
+
+    def moved(self, depth: np.ndarray) -> np.ndarray:
+        """A depth image [H, W], m, with its edges at their best offset; 0 where it has nothing to show then."""
+        height, width = depth.shape
+        right, down, larger, turn = self.similarity
+        linear = np.array([[1 + larger, -turn], [turn, 1 + larger]])
+        middle = np.array([(width - 1) / 2, (height - 1) / 2])
+        to = middle + width * np.array([right, down]) - linear @ middle
+        return cv2.warpAffine(depth, np.column_stack((linear, to)), (width, height), flags=cv2.INTER_NEAREST)
 
 
 def match_edges(views: Sequence[View]) -> EdgeMatch | None:
@@ -78,12 +90,12 @@ def match_edges(views: Sequence[View]) -> EdgeMatch | None:
     }
     quarters = [_best_offset(color, depth, quarter) for quarter in _quarters(*color[0].shape)]
     found = [quarter for quarter in quarters if quarter is not None]
-    best, displacement, least, misfit = score, 0.0, 0.0, 1.0
+    best, displacement, least, misfit, similarity = score, 0.0, 0.0, 1.0, np.zeros(4)
     if len(found) >= _LEAST_QUARTERS:
         best = float(np.mean([quarter[2] for quarter in found]))
-        displacement, misfit = _similarity(np.array([quarter[:2] for quarter in found]), color[0].shape)
+        similarity, displacement, misfit = _similarity(np.array([quarter[:2] for quarter in found]), color[0].shape)
         least = min(float(np.hypot(*quarter[1])) for quarter in found) / color[0].shape[1]
-    return EdgeMatch(score, best, displacement, least, misfit, turned)
+    return EdgeMatch(score, best, displacement, least, misfit, similarity, turned)
 
 
 TURNS = {
@@ -122,15 +134,15 @@ def _best_offset(
     return center, np.array([column - reach, row - reach], np.float64), float(total.max()) / count
 
 
-def _similarity(found: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
-    """Largest displacement in the image, and the misfit, of a shift, scale and rotation fitted to offsets.
+def _similarity(found: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, float, float]:
+    """A shift, scale and rotation fitted to offsets, their largest displacement in the image, and the misfit.
 
     Args:
         found: [Q, 2, 2], centers and offsets, px.
         shape: of the image.
 
     Returns:
-        Both as shares of the width.
+        As in `EdgeMatch`.
     """
     (x, y), offsets = found[:, 0].T, found[:, 1]
     one, zero = np.ones(len(x)), np.zeros(len(x))
@@ -141,7 +153,7 @@ def _similarity(found: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float
     height, width = shape
     corners = [(sx * width / 2, sy * height / 2) for sx in (-1, 1) for sy in (-1, 1)]
     moved = [np.hypot(shift_x + scale * u - turn * v, shift_y + scale * v + turn * u) for u, v in corners]
-    return float(max(moved)) / width, misfit / width
+    return np.array([shift_x / width, shift_y / width, scale, turn]), float(max(moved)) / width, misfit / width
 
 
 def _color_edges(gray: np.ndarray) -> np.ndarray:

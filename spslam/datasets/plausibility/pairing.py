@@ -2,7 +2,8 @@
 
 Points of the color image move by how far away they are. So the depth that explains their motion is theirs: each other
 reading of the depth image that occurs in practice is tried, and named if it explains the motion clearly better. Where
-the camera only turns, motion says nothing, and the edges of the images decide.
+the camera only turns, motion says nothing, and the edges of the images decide, unless it speaks against what they say: a
+few edges without contrast may lie beside stronger ones by chance.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ _EDGES_BETTER, _EDGES_CLEAR, _EDGES_CERTAIN = 0.12, 0.2, 0.3
 # As shares of the width. Color that is so far from its depth is another camera's.
 _DOUBTFUL_OFFSET, _CERTAIN_OFFSET = 0.04, 0.045
 _EDGES_LEFT, _MOST_MISFIT = 0.5, 0.01
+# Sum over segments of the log of errors by which depth where edges want it is worse than depth as it is.
+_CONTRADICTED = 0.2
 
 Reading = Callable[[Sequence[View], int], np.ndarray | None]
 
@@ -46,14 +49,19 @@ def pairing_findings(
         lens: as the recording says.
         edges: None where there are too few.
     """
-    by_motion = _better_reading(views, segments, lens)
+    longest = sorted(segments, key=lambda segment: segment.first - segment.last)[:_MOST_SEGMENTS]
+    by_motion = _better_reading(views, longest, lens)
     if by_motion is not None:
         return [by_motion]
-    return [] if edges is None else _edge_findings(edges)
+    by_edges = None if edges is None else _turned_edges(edges) or _moved_edges(edges)
+    if by_edges is None:
+        return []
+    finding, reading = by_edges
+    gains = [_gain(views, segment, lens, reading) for segment in longest]
+    return [] if sum(gain for gain in gains if gain is not None) < -_CONTRADICTED else [finding]
 
 
-def _better_reading(views: Sequence[View], segments: Sequence[Segment], lens: Lens) -> Finding | None:
-    longest = sorted(segments, key=lambda segment: segment.first - segment.last)[:_MOST_SEGMENTS]
+def _better_reading(views: Sequence[View], longest: Sequence[Segment], lens: Lens) -> Finding | None:
     best: tuple[float, Finding] | None = None
     if _median_error(views, longest, lens) < _FITS_PX:
         return None
@@ -145,21 +153,24 @@ _READINGS: dict[str, tuple[Reading, str]] = {
 }
 
 
-def _edge_findings(edges: EdgeMatch) -> list[Finding]:
+def _turned_edges(edges: EdgeMatch) -> tuple[Finding, Reading] | None:
+    """What edges say of a depth image that was turned over, and that reading of it."""
     name = max(edges.turned_scores, key=lambda name: edges.turned_scores[name])
     turned = edges.turned_scores[name]
-    if turned > edges.score + _EDGES_BETTER and turned > _EDGES_CLEAR and turned > 0.9 * edges.best_score:
-        text = f"depth does not belong to color: its edges lie on color's where the depth image is {name}"
-        return [Finding("pairing", text, f"turn one of the two: {_REGISTER}", certain=True)]
-    return _registration(edges)
+    if turned <= edges.score + _EDGES_BETTER or turned <= _EDGES_CLEAR or turned <= 0.9 * edges.best_score:
+        return None
+    text = f"depth does not belong to color: its edges lie on color's where the depth image is {name}"
+    return Finding("pairing", text, f"turn one of the two: {_REGISTER}", certain=True), _turned(name)
 
 
-def _registration(edges: EdgeMatch) -> list[Finding]:
+def _moved_edges(edges: EdgeMatch) -> tuple[Finding, Reading] | None:
+    """What edges say of depth that is not where color is, and depth where they want it."""
     far, moved = edges.displacement, edges.score < _EDGES_LEFT * edges.best_score
     if far < _DOUBTFUL_OFFSET or edges.best_score < _EDGES_CLEAR or not moved or edges.misfit > _MOST_MISFIT:
-        return []
+        return None
     if edges.least_offset <= SAME_PLACE:
-        return []  # a part of the image where they do lie on each other: of the rest chance, or texture, is likelier
+        return None  # a part of the image where they do lie on each other: of the rest chance, or texture, is likelier
     text = f"color and depth are not registered: their edges are up to {100 * far:.0f} % of the width apart"
     certain = far > _CERTAIN_OFFSET and edges.best_score > _EDGES_CERTAIN
-    return [Finding("registration", text, "register depth to the color camera (or color to depth)", certain)]
+    finding = Finding("registration", text, "register depth to the color camera (or color to depth)", certain)
+    return finding, lambda views, view: edges.moved(views[view].depth)
