@@ -2,8 +2,8 @@
 
 Points of the color image move by how far away they are. So the depth that explains their motion is theirs: each other
 reading of the depth image that occurs in practice is tried, and named if it explains the motion clearly better. Where
-the camera only turns, motion says nothing, and the edges of the images decide, unless it speaks against what they say: a
-few edges without contrast may lie beside stronger ones by chance.
+the camera only turns, motion says nothing, and the edges of the images decide, unless it speaks against what they say:
+a few edges without contrast may lie beside stronger ones by chance.
 """
 
 from __future__ import annotations
