@@ -41,8 +41,8 @@ class EdgeMatch:
         displacement: the largest that this takes within the image, as a share of the width.
         least_offset: the smallest of the quarters' offsets, as a share of the width.
         misfit: how far the quarters' offsets are from one shift, scale and rotation, as a share of the width.
-        similarity: float64 [4], those three: to the right and down as shares of the width, the factor less 1, and the
-            sine of the angle, about the middle of the image.
+        similarity: float64 [4], the shift to the right and down as shares of the width, then s cos a - 1 and s sin a of
+            the scale s and the angle a (clockwise), about the middle of the image.
         turned_scores: by name, with the depth image mirrored or turned.
     """
 
