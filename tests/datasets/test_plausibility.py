@@ -13,7 +13,7 @@ from spslam.datasets.base import RgbdDataset
 from spslam.datasets.places import Capture, PlacesDataset
 from spslam.datasets.plausibility import Finding, check_first_frames, folded, require_sound
 from spslam.datasets.plausibility.edges import TURNS, EdgeMatch
-from spslam.datasets.plausibility.flow_fit import Points, fit_flow
+from spslam.datasets.plausibility.flow_fit import Points, fit_flow, fit_flows
 from spslam.datasets.plausibility.intrinsics import CERTAIN_SIGMAS, estimate_lens
 from spslam.datasets.plausibility.lens import FOCAL, RADIAL, SHIFT_X, Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
@@ -304,6 +304,31 @@ def test_a_focal_length_is_estimated_from_exact_points():
     assert fit.numbers[FOCAL] == pytest.approx(0, abs=1e-3)
     assert fit.error_px < 0.01
     assert fit.translation == pytest.approx([0.1, 0, 0.05], abs=1e-3)
+
+
+def test_pairs_of_views_are_fitted_together_as_each_by_itself():
+    """They have different numbers of points, motions and errors."""
+    lens = Lens(CAMERA, 2.0, np.array([0.02, 0.01, -0.01, 0.01, 0.1, 0.05, 0.02]))
+    pairs = [turned_points(0.1 * k, lens, k) for k in range(4)]
+    pairs[1] = Points(*(each[:41] for each in (pairs[1].pixels_first, pairs[1].depth, pairs[1].pixels_last)))
+    for free in ((), (FOCAL, RADIAL)):
+        for pair, fit in zip(pairs, fit_flows(pairs, Lens(CAMERA, 2.0), free), strict=True):
+            alone = fit_flow(pair, Lens(CAMERA, 2.0), free)
+            np.testing.assert_allclose(fit.motion, alone.motion, atol=1e-8)
+            np.testing.assert_allclose(fit.numbers, alone.numbers, atol=1e-8)
+            np.testing.assert_allclose(fit.information, alone.information, rtol=1e-5, atol=1e-5)
+            assert fit.error_px == pytest.approx(alone.error_px, abs=1e-8)
+    assert fit_flows([], lens) == []
+
+
+def test_derivatives_of_pixels_by_points_are_those_of_differences():
+    lens = Lens(CAMERA, 2.0, np.array([0.02, 0.01, -0.01, 0.01, 0.1, 0.05, 0.02]))
+    points = np.random.default_rng(0).uniform((-1, -1, 0.5), (1, 1, 3), (20, 3))
+    pixels, by_point = lens.pixels_and_derivatives(points)
+    np.testing.assert_allclose(pixels, lens.pixels(points))
+    for axis, shift in enumerate(1e-6 * np.eye(3)):
+        differences = (lens.pixels(points + shift) - lens.pixels(points - shift)) / 2e-6
+        np.testing.assert_allclose(by_point[..., axis], differences, rtol=1e-5, atol=1e-3)
 
 
 def test_findings_of_a_kind_are_folded_with_their_number():

@@ -14,7 +14,7 @@ import numpy as np
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.plausibility.edges import match_edges
 from spslam.datasets.plausibility.findings import Finding, folded
-from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flow
+from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flows
 from spslam.datasets.plausibility.intrinsics import LensEstimate, center_findings, estimate_lens, lens_finding
 from spslam.datasets.plausibility.lens import Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
@@ -143,7 +143,7 @@ def _geometry_findings(
     if finding is not None and (is_registered or finding.certain) and not any(found.certain for found in findings):
         findings.append(finding)
     if not any(found.certain for found in findings):
-        findings += pose_findings(stretch, segments, [fit_flow(each, lens) for each in points], lens, is_registered)
+        findings += pose_findings(stretch, segments, fit_flows(points, lens), lens, is_registered)
     return findings
 
 

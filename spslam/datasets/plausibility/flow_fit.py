@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from spslam.datasets.plausibility import lens as numbers_of
 from spslam.datasets.plausibility.lens import Lens
+from spslam.pose_graph import rotation_matrices
 
 _ITERATIONS = 12
 # Tracks are no better than this, or a perfect rendering would make one point decide.
@@ -91,55 +91,106 @@ def fit_flow(points: Points, lens: Lens, free: Sequence[int] = ()) -> FlowFit:
         lens: to begin with.
         free: which of its numbers may change.
     """
-    rotation, translation, numbers = np.eye(3), np.zeros(3), lens.numbers.copy()
-    chosen = list(free)
+    return fit_flows([points], lens, free)[0]
+
+
+def fit_flows(points: Sequence[Points], lens: Lens, free: Sequence[int] = ()) -> list[FlowFit]:
+    """`fit_flow` of several pairs of views, all at once: each has few points.
+
+    Args:
+        points: of each pair.
+        lens, free: as of `fit_flow`, of each pair by itself.
+    """
+    batch, chosen = _Batch.of(points), list(free)
+    count = len(points)
+    rotation, translation = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    numbers = np.tile(lens.numbers, (count, 1))
     prior = np.concatenate((np.zeros(6), 1 / PRIOR[chosen] ** 2))
-    for _ in range(_ITERATIONS):
-        residual, *changed = _residuals(points, lens, *_variations(rotation, translation, numbers, chosen))
-        jacobian = (np.stack(changed, axis=-1) - residual[..., None]) / _STEP
-        distance = np.linalg.norm(residual, axis=1)
-        sigma = max(1.4826 * float(np.median(distance)), _LEAST_SIGMA_PX)
-        weight = 1 / (1 + (distance / sigma) ** 2) ** 2 / sigma**2
-        weighted = jacobian * weight[:, None, None]
-        hessian = np.einsum("nij,nik->jk", weighted, jacobian)
-        gradient = np.einsum("nij,ni->j", weighted, residual)
-        damped = hessian + np.diag(prior + 1e-9 * (1 + np.diag(hessian)))
-        gradient[6:] += prior[6:] * numbers[chosen]
-        step = -np.linalg.solve(damped, gradient)
-        rotation = cv2.Rodrigues(step[:3])[0] @ rotation
-        translation = translation + step[3:6]
-        numbers[chosen] += np.clip(step[6:], -_MOST_CHANGE, _MOST_CHANGE)
-    information = np.zeros((numbers_of.COUNT, numbers_of.COUNT))
-    if chosen:
-        motion = hessian[:6, :6] + 1e-9 * np.diag(1 + np.diag(hessian[:6, :6]))
-        marginal = hessian[6:, 6:] - hessian[6:, :6] @ np.linalg.solve(motion, hessian[:6, 6:])
-        information[np.ix_(chosen, chosen)] = (marginal + marginal.T) / 2
-    final = _residuals(points, lens, rotation[None], translation[None], numbers[None])[0]
-    error = float(np.median(np.linalg.norm(final, axis=1)))
-    return FlowFit(rotation, translation, error, numbers, information)
+    for _ in range(_ITERATIONS if count else 0):
+        residual, jacobian = batch.linearized(lens.with_numbers(numbers), rotation, translation, chosen)
+        distance = np.linalg.norm(residual, axis=-1)
+        sigma = np.maximum(1.4826 * batch.medians(distance), _LEAST_SIGMA_PX)[:, None]
+        weight = batch.known / (1 + (distance / sigma) ** 2) ** 2 / sigma**2
+        transposed = (jacobian * weight[..., None, None]).reshape(count, -1, len(prior)).swapaxes(1, 2)
+        hessian = transposed @ jacobian.reshape(count, -1, len(prior))
+        gradient = transposed @ residual.reshape(count, -1, 1)
+        gradient[:, 6:, 0] += prior[6:] * numbers[:, chosen]
+        step = -np.linalg.solve(hessian + _diagonal(prior + 1e-9 * (1 + _diagonals(hessian))), gradient)[..., 0]
+        rotation = rotation_matrices(step[:, :3]) @ rotation
+        translation = translation + step[:, 3:6]
+        numbers[:, chosen] += np.clip(step[:, 6:], -_MOST_CHANGE, _MOST_CHANGE)
+    information = np.zeros((count, numbers_of.COUNT, numbers_of.COUNT))
+    if chosen and count:
+        motion = hessian[:, :6, :6]
+        motion = motion + _diagonal(1e-9 * (1 + _diagonals(motion)))
+        coupling = hessian[:, :6, 6:]
+        marginal = hessian[:, 6:, 6:] - coupling.swapaxes(1, 2) @ np.linalg.solve(motion, coupling)
+        information[(slice(None), *np.ix_(chosen, chosen))] = (marginal + marginal.swapaxes(1, 2)) / 2
+    final = batch.residuals(lens.with_numbers(numbers), rotation, translation)
+    errors = batch.medians(np.linalg.norm(final, axis=-1)).tolist()
+    return [FlowFit(*fit) for fit in zip(rotation, translation, errors, numbers, information, strict=True)]
 
 
-_SHIFTS = _STEP * np.eye(3)
-_TURNS = np.stack([cv2.Rodrigues(turn)[0] for turn in _SHIFTS])
+@dataclass(frozen=True)
+class _Batch:
+    """Points of K pairs of views, as many of each as the longest has.
+
+    Attributes:
+        pixels_first, pixels_last: float64 [K, N, 2].
+        depth: float64 [K, N], m; what is none of a pair's points lies in the image's corner at 1 m.
+        known: bool [K, N], which are points.
+    """
+
+    pixels_first: np.ndarray
+    depth: np.ndarray
+    pixels_last: np.ndarray
+    known: np.ndarray
+
+    @classmethod
+    def of(cls, points: Sequence[Points]) -> _Batch:
+        """Of the points of each pair."""
+        shape = len(points), max((len(each.depth) for each in points), default=0)
+        first, last, depth = np.zeros((*shape, 2)), np.zeros((*shape, 2)), np.ones(shape)
+        known = np.zeros(shape, bool)
+        for row, each in enumerate(points):
+            own = row, slice(len(each.depth))
+            first[own], depth[own], last[own], known[own] = each.pixels_first, each.depth, each.pixels_last, True
+        return cls(first, depth, last, known)
+
+    def medians(self, values: np.ndarray) -> np.ndarray:
+        """Median of each pair's values [K, N]."""
+        ordered = np.sort(np.where(self.known, values, np.inf), axis=1)
+        count = self.known.sum(axis=1)
+        row = np.arange(len(ordered))
+        return (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2
+
+    def residuals(self, lens: Lens, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+        """Pixel errors [K, N, 2] of K lenses, rotations [K, 3, 3] and translations [K, 3]."""
+        moved = lens.points(self.pixels_first, self.depth) @ rotation.swapaxes(1, 2) + translation[:, None]
+        return lens.pixels(moved) - self.pixels_last
+
+    def linearized(
+        self, lens: Lens, rotation: np.ndarray, translation: np.ndarray, chosen: Sequence[int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel errors, and their derivatives [K, N, 2, 6 + C] by a turn, a shift and C chosen numbers of the lens.
+
+        Those by numbers are differences.
+        """
+        turned = lens.points(self.pixels_first, self.depth) @ rotation.swapaxes(1, 2)
+        pixels, by_point = lens.pixels_and_derivatives(turned + translation[:, None])
+        residual = pixels - self.pixels_last
+        derivatives = [np.cross(turned[:, :, None], by_point), by_point]
+        for number in chosen:
+            changed = lens.with_numbers(lens.numbers + _STEP * np.eye(numbers_of.COUNT)[number])
+            derivatives.append((self.residuals(changed, rotation, translation) - residual)[..., None] / _STEP)
+        return residual, np.concatenate(derivatives, axis=-1)
 
 
-def _variations(
-    rotation: np.ndarray, translation: np.ndarray, numbers: np.ndarray, chosen: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Motion and numbers as they are, then with each free parameter changed by a step: [K, 3, 3], [K, 3], [K, 7]."""
-    count = 7 + len(chosen)
-    rotations, translations = np.tile(rotation, (count, 1, 1)), np.tile(translation, (count, 1))
-    all_numbers = np.tile(numbers, (count, 1))
-    rotations[1:4] = _TURNS @ rotation
-    translations[4:7] += _SHIFTS
-    all_numbers[np.arange(7, count), chosen] += _STEP
-    return rotations, translations, all_numbers
+def _diagonals(matrices: np.ndarray) -> np.ndarray:
+    """Diagonals [K, P] of matrices [K, P, P]."""
+    return np.diagonal(matrices, axis1=1, axis2=2)
 
 
-def _residuals(
-    points: Points, lens: Lens, rotations: np.ndarray, translations: np.ndarray, numbers: np.ndarray
-) -> np.ndarray:
-    """Pixel errors of K motions with as many numbers, float64 [K, N, 2]: all in one go, as N is small."""
-    lenses = lens.with_numbers(numbers)
-    moved = lenses.points(points.pixels_first, points.depth) @ rotations.transpose(0, 2, 1) + translations[:, None]
-    return lenses.pixels(moved) - points.pixels_last
+def _diagonal(values: np.ndarray) -> np.ndarray:
+    """Diagonal matrices [K, P, P] of values [K, P]."""
+    return values[..., None] * np.eye(values.shape[-1])

@@ -18,7 +18,7 @@ from spslam.camera import Camera
 from spslam.datasets.clock import LATE_S
 from spslam.datasets.plausibility import lens as number
 from spslam.datasets.plausibility.findings import Finding
-from spslam.datasets.plausibility.flow_fit import PRIOR, FlowFit, Points, fit_flow
+from spslam.datasets.plausibility.flow_fit import PRIOR, FlowFit, Points, fit_flows
 from spslam.datasets.plausibility.lens import Lens
 
 # Below these the trajectory suffers little, or real recordings are often that far off (rolling shutter, a color camera
@@ -97,7 +97,7 @@ def estimate_lens(segments: Sequence[Points], lens: Lens, seconds: Sequence[floa
     if not segments:
         return None
     start = _start(segments, lens)
-    fits = [fit_flow(points, start, range(number.COUNT)) for points in segments]
+    fits = fit_flows(segments, start, range(number.COUNT))
     information = np.sum([fit.information for fit in fits], axis=0)
     weighted = np.sum([fit.information @ fit.numbers for fit in fits], axis=0)
     with np.errstate(divide="ignore"):
@@ -106,7 +106,7 @@ def estimate_lens(segments: Sequence[Points], lens: Lens, seconds: Sequence[floa
     chosen = _choose(information, weighted)
     values, sigmas = _judge(fits, chosen, model_error)
     focal = float(weighted[number.FOCAL] / max(information[number.FOCAL, number.FOCAL], 1e-12))
-    given = float(np.mean([fit_flow(points, lens).error_px for points in segments]))
+    given = float(np.mean([fit.error_px for fit in fit_flows(segments, lens)]))
     gain = given / max(float(np.mean([fit.error_px for fit in fits])), _LEAST_ERROR_PX)
     return LensEstimate(lens, chosen, values, sigmas, focal, np.hypot(sigma, _MODEL_ERROR), gain)
 
@@ -160,7 +160,7 @@ def _start(segments: Sequence[Points], lens: Lens) -> Lens:
         numbers = np.zeros(number.COUNT)
         numbers[number.FOCAL] = log_focal
         tried = lens.with_numbers(numbers)
-        error = float(np.mean([fit_flow(points, tried).error_px for points in segments]))
+        error = float(np.mean([fit.error_px for fit in fit_flows(segments, tried)]))
         if error < 0.7 * least:
             best, least = tried, error
         if least < _GOOD_START_PX:

@@ -48,6 +48,19 @@ class Lens:
         rays = rays * (1 + self._each(RADIAL) * _square(rays))[..., None]
         return rays * self.focal[..., None, :] + self.center[..., None, :]
 
+    def pixels_and_derivatives(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `pixels`, and the derivatives [N, 2, 3] by the points."""
+        least = 1e-3 * self.median_m
+        depth = np.maximum(points[..., 2:], least)
+        rays = points[..., :2] / depth
+        radial, focal = self._each(RADIAL), self.focal[..., None, :]
+        factor = (1 + radial * _square(rays))[..., None]
+        by_ray = factor[..., None] * np.eye(2) + 2 * radial[..., None, None] * rays[..., :, None] * rays[..., None, :]
+        by_ray = by_ray * focal[..., None]
+        by_depth = -(by_ray @ rays[..., None]) * (depth > least)[..., None]
+        by_point = np.concatenate((by_ray, by_depth), axis=-1) / depth[..., None]
+        return rays * factor * focal + self.center[..., None, :], by_point
+
     def _each(self, number: int) -> np.ndarray:
         """One of the numbers, to be combined with points."""
         return self.numbers[..., number, None]

@@ -14,7 +14,7 @@ import numpy as np
 
 from spslam.datasets.plausibility.edges import SAME_PLACE, TURNS, EdgeMatch
 from spslam.datasets.plausibility.findings import Finding
-from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flow
+from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flows
 from spslam.datasets.plausibility.lens import Lens
 from spslam.datasets.plausibility.tracks import Segment
 from spslam.datasets.plausibility.views import View
@@ -57,7 +57,7 @@ def pairing_findings(
     if by_edges is None:
         return []
     finding, reading = by_edges
-    gains = [_gain(views, segment, lens, reading) for segment in longest]
+    (gains,) = _gains(views, longest, lens, [reading])
     return [] if sum(gain for gain in gains if gain is not None) < -_CONTRADICTED else [finding]
 
 
@@ -65,8 +65,8 @@ def _better_reading(views: Sequence[View], longest: Sequence[Segment], lens: Len
     best: tuple[float, Finding] | None = None
     if _median_error(views, longest, lens) < _FITS_PX:
         return None
-    for name, (reading, remedy) in _READINGS.items():
-        gains = [_gain(views, segment, lens, reading) for segment in longest]
+    all_gains = _gains(views, longest, lens, [reading for reading, _ in _READINGS.values()])
+    for (name, (_, remedy)), gains in zip(_READINGS.items(), all_gains, strict=True):
         known = np.array([gain for gain in gains if gain is not None])
         if len(known) < _LEAST_SEGMENTS or np.median(known) < _BETTER_EACH or known.sum() < _BETTER:
             continue
@@ -78,32 +78,39 @@ def _better_reading(views: Sequence[View], longest: Sequence[Segment], lens: Len
 
 
 def _median_error(views: Sequence[View], segments: Sequence[Segment], lens: Lens) -> float:
-    errors = []
+    found = []
     for segment in segments:
         depth = depth_at(views[segment.first].depth, segment.pixels_first)
         known = depth > 0
         if np.count_nonzero(known) >= _LEAST_POINTS:
-            errors.append(_error(segment, depth, known, lens))
-    return float(np.median(errors)) if errors else 0.0
+            found.append(_points(segment, depth, known))
+    return float(np.median([fit.error_px for fit in fit_flows(found, lens)])) if found else 0.0
 
 
-def _gain(views: Sequence[View], segment: Segment, lens: Lens, reading: Reading) -> float | None:
-    """Log of how many times smaller the error is with another reading; None where too few points have both."""
-    other = reading(views, segment.first)
-    if other is None:
-        return None
-    given = depth_at(views[segment.first].depth, segment.pixels_first)
-    changed = depth_at(np.ascontiguousarray(other), segment.pixels_first)
-    known = (given > 0) & (changed > 0)
-    if np.count_nonzero(known) < _LEAST_POINTS:
-        return None
-    errors = [_error(segment, depth, known, lens) for depth in (given, changed)]
-    return float(np.log(errors[0] + _NOISE_PX) - np.log(errors[1] + _NOISE_PX))
+def _gains(
+    views: Sequence[View], segments: Sequence[Segment], lens: Lens, readings: Sequence[Reading]
+) -> list[list[float | None]]:
+    """For each reading, log of how many times smaller each segment's error is with it; None where too few points have
+    both depths."""
+    given = [depth_at(views[segment.first].depth, segment.pixels_first) for segment in segments]
+    found: list[Points] = []
+    is_known = []
+    for reading in readings:
+        for segment, depth in zip(segments, given, strict=True):
+            other = reading(views, segment.first)
+            changed = 0 * depth if other is None else depth_at(np.ascontiguousarray(other), segment.pixels_first)
+            known = (depth > 0) & (changed > 0)
+            is_known.append(np.count_nonzero(known) >= _LEAST_POINTS)
+            if is_known[-1]:
+                found += [_points(segment, each, known) for each in (depth, changed)]
+    logs = [float(np.log(fit.error_px + _NOISE_PX)) for fit in fit_flows(found, lens)]
+    gains = (before - after for before, after in zip(logs[::2], logs[1::2], strict=True))
+    each = [next(gains) if known else None for known in is_known]
+    return [each[k * len(segments) : (k + 1) * len(segments)] for k in range(len(readings))]
 
 
-def _error(segment: Segment, depth: np.ndarray, known: np.ndarray, lens: Lens) -> float:
-    points = Points(segment.pixels_first[known], depth[known], segment.pixels_last[known])
-    return fit_flow(points, lens).error_px
+def _points(segment: Segment, depth: np.ndarray, known: np.ndarray) -> Points:
+    return Points(segment.pixels_first[known], depth[known], segment.pixels_last[known])
 
 
 def _turned(name: str) -> Reading:
