@@ -38,7 +38,7 @@ from spslam.meshing.color_detail import ColorOptions, color_mesh
 from spslam.meshing.frame_fusion import FusionOptions, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.render import rasterize, render_colors
-from spslam.meshing.shading import barycentric, cross
+from spslam.meshing.shading import cross
 from spslam.meshing.texture import TexturedMesh, TextureOptions, texture_mesh
 from spslam.meshing.texture.registration import register
 from spslam.meshing.texture.views import ColorView
@@ -147,10 +147,26 @@ def _rendered(mesh: TriangleMesh | TexturedMesh, camera: Camera, pose: np.ndarra
     points = transform_points(np.linalg.inv(pose), mesh.vertices.astype(np.float64)).astype(np.float32)
     corners = points[mesh.faces[faces]]
     normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    weights = barycentric(corners, (camera.ray_directions() * raster.depth[..., None])[hit], normals)
+    weights = _barycentric(corners, (camera.ray_directions() * raster.depth[..., None])[hit], normals)
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
     image[hit] = np.rint(mesh.colors_at(faces, weights))
     return image, raster.depth
+
+
+def _barycentric(corners: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Barycentric weights [N, 3] of points in the planes of triangles."""
+    area = np.maximum(_dot(normals, normals), 1e-30)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    wb = _dot(cross(points - a, c - a), normals) / area
+    wc = _dot(cross(b - a, points - a), normals) / area
+    weights = [np.clip(weight, 0, 1) for weight in (1 - wb - wc, wb, wc)]
+    total = np.maximum(weights[0] + weights[1] + weights[2], 1e-12)
+    return np.stack([weight / total for weight in weights], axis=1).astype(np.float32)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Dot products [N] of vectors [N, 3]; a sum over so short an axis takes NumPy several times as long."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _corrected_db(color: np.ndarray, frame: RgbdFrame, camera: Camera, shown: np.ndarray) -> float:

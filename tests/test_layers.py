@@ -33,6 +33,7 @@ GROUND = {
     "errors",
     "geometry",
     "helper_process",
+    "image_library",
     "io",
     "loading",
     "notebook",

@@ -1,22 +1,13 @@
-"""Compiled functions on images, which need no torch: data is opened and looked at while torch is loaded.
-
-There is a library for each instruction set, of which the best that this processor has is loaded at the first call;
-`SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, as it does for `spslam.ops`.
-"""
+"""Compiled functions on images as they are read."""
 
 from __future__ import annotations
 
-import ctypes
-import os
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-_FOLDER = Path(__file__).resolve().parent.parent
-# The best first.
-_LIBRARY_OF_ISA = {"avx512": "_images_cpu_avx512.so", "avx2": "_images_cpu_avx2.so", "baseline": "_images_cpu.so"}
+from spslam.image_library import image_library
+
 _CHANNELS = 3
 _MOST_BYTES = 2**31 - 1  # places in an image are 32-bit numbers
 _NO_MEMORY = 1  # returned by compiled functions
@@ -103,7 +94,7 @@ def _register(
     constants = np.array([*view.pixel_map.T.ravel(), *numbers], np.float32)
     color, registered = colors
     arrays = color, unseen, depth, sizes, constants, registered, kept
-    if _library().spslam_register_color(*(None if array is None else array.ctypes.data for array in arrays)):
+    if image_library().spslam_register_color(*(None if array is None else array.ctypes.data for array in arrays)):
         raise MemoryError("register_color: not enough memory for images of this size")
     return kept
 
@@ -130,7 +121,7 @@ def unfilter_png(filtered: bytes, shape: tuple[int, int], channels: int, bits: i
         raise ValueError(f"unfilter_png: not an image {[rows, columns, channels]} of {bits} bits")
     image = np.empty((rows, columns) if channels == 1 else (rows, columns, channels), np.dtype(f"u{bits // 8}"))
     sizes = np.array([rows, row_bytes, pixel_bytes], np.int32)
-    failure = _library().spslam_unfilter_png(filtered, sizes.ctypes.data, int(bits == 16), image.ctypes.data)
+    failure = image_library().spslam_unfilter_png(filtered, sizes.ctypes.data, int(bits == 16), image.ctypes.data)
     if failure == _NO_MEMORY:
         raise MemoryError("unfilter_png: not enough memory for an image of this size")
     return None if failure else image
@@ -141,21 +132,3 @@ def _checked(name: str, image: np.ndarray, dtype: type, shape: tuple[int, ...]) 
         wanted = f"{np.dtype(dtype).name} {list(shape)}"
         raise ValueError(f"register_color: {name} must be {wanted}, got {image.dtype} {list(image.shape)}")
     return np.ascontiguousarray(image)
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    chosen = os.environ.get("SPSLAM_CPU_ISA")
-    names = list(_LIBRARY_OF_ISA) if not chosen else [chosen]
-    for name in names:
-        path = _FOLDER / _LIBRARY_OF_ISA.get(name, f"no instruction set {name}")
-        if path.exists():
-            library = ctypes.CDLL(str(path))
-            if chosen or library.spslam_runs_here():
-                library.spslam_register_color.argtypes = [ctypes.c_void_p] * 7
-                library.spslam_unfilter_png.argtypes = [ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p]
-                return library
-    raise ImportError(
-        f"spslam: no compiled image functions for {' or '.join(names)} in {_FOLDER}; install the wheel, "
-        "or build in place with `make dev`"
-    )

@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.image_library import image_library
 
 _BACKGROUND = 255
 # A headlight slightly above the camera, and ambient light.
 _LIGHT = np.array([0.25, -0.5, -1.0]) / np.linalg.norm([0.25, -0.5, -1.0])
 _AMBIENT, _DIFFUSE = 0.55, 0.55
+_GRAY = 200
 
 
 @dataclass(frozen=True)
@@ -38,52 +40,40 @@ def shade(
         faces: integers [L, 3].
         colors: uint8 [V, 3] RGB of the vertices; None is plain gray.
         camera: intrinsics of the view.
-        raster: what is visible.
+        raster: what is visible of these faces.
     """
-    hit = raster.face_ids >= 0
-    image = np.full((*hit.shape, 3), _BACKGROUND, dtype=np.uint8)
-    if not hit.any():
-        return image
-    shown = faces[raster.face_ids[hit]]
-    corners = points.astype(np.float32)[shown]
-    places = (camera.ray_directions() * raster.depth[..., None])[hit]
-    normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    light = _lighting(normals, places, hit)
     if colors is None:
-        base: np.ndarray | float = 200.0
-    else:
-        weights = barycentric(corners, places, normals)
-        base = np.einsum("nk,nkc->nc", weights, np.asarray(colors)[shown, :3].astype(np.float32))
-    image[hit] = np.clip(base * light[:, None], 0, 255).astype(np.uint8)
+        colors = np.full((len(points), 3), _GRAY, np.uint8)
+    normals, base = surface(points, faces, colors, camera, raster)
+    # Blurred slightly, to hide facets.
+    smooth = np.ascontiguousarray(cv2.GaussianBlur(normals, (0, 0), 1.0))
+    light = np.array([*_LIGHT, _AMBIENT, _DIFFUSE], np.float32)
+    image = np.empty(base.shape, np.uint8)
+    arrays = light, raster.face_ids, smooth, base, image
+    light_, face_ids, *rest = (array.ctypes.data for array in arrays)
+    image_library().spslam_light_pixels(light_, raster.face_ids.size, face_ids, *rest[:2], _BACKGROUND, rest[2])
     return image
 
 
-def _lighting(normals: np.ndarray, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Brightness of each foreground pixel; normals face the viewer and are blurred slightly, to hide facets."""
-    length = np.sqrt(_dot(normals, normals))[:, None]
-    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    normals = np.where((_dot(normals, points) > 0)[:, None], -normals, normals)
-    image = np.zeros((*hit.shape, 3), dtype=np.float32)
-    image[hit] = normals
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)[hit]
-    smooth /= np.maximum(np.sqrt(_dot(smooth, smooth)), 1e-6)[:, None]
-    return _AMBIENT + _DIFFUSE * np.clip(smooth @ _LIGHT.astype(np.float32), 0, 1)
+def surface(
+    points: np.ndarray, faces: np.ndarray, colors: np.ndarray, camera: Camera, raster: Raster
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normals and colors of what is visible, without light; arguments as of `shade`.
 
-
-def barycentric(corners: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Barycentric weights [N, 3] of points in the planes of triangles."""
-    area = np.maximum(_dot(normals, normals), 1e-30)
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    wb = _dot(cross(points - a, c - a), normals) / area
-    wc = _dot(cross(b - a, points - a), normals) / area
-    weights = [np.clip(weight, 0, 1) for weight in (1 - wb - wc, wb, wc)]
-    total = np.maximum(weights[0] + weights[1] + weights[2], 1e-12)
-    return np.stack([weight / total for weight in weights], axis=1).astype(np.float32)
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Dot products [N] of vectors [N, 3]; a sum over so short an axis takes NumPy several times as long."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+    Returns:
+        Unit normals towards the camera, and colors between those of the vertices, float32 [H, W, 3] each; 0 for
+        background.
+    """
+    points, faces = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int32)
+    colors = np.ascontiguousarray(np.asarray(colors)[:, :3], np.uint8)
+    depth, face_ids = np.ascontiguousarray(raster.depth), np.ascontiguousarray(raster.face_ids)
+    size = np.array([camera.width, camera.height], np.int32)
+    numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    normals, found = (np.empty((camera.height, camera.width, 3), np.float32) for _ in range(2))
+    mesh = points.ctypes.data, faces.ctypes.data, len(faces), colors.ctypes.data
+    arrays = size, numbers, depth, face_ids, normals, found
+    image_library().spslam_rastered_surface(*mesh, *(array.ctypes.data for array in arrays))
+    return normals, found
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

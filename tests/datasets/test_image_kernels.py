@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from spslam import image_library
 from spslam.camera import Camera
-from spslam.datasets import image_kernels
 from spslam.datasets.image_kernels import ColorView, register_color
 from spslam.datasets.registration import ColorToDepth, typical_depth
 from spslam.geometry import pose_from
@@ -149,10 +149,10 @@ def test_other_shapes_are_refused(color, depth, unseen, message):
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(image_kernels, "_FOLDER", tmp_path)
+    monkeypatch.setattr(image_library, "_FOLDER", tmp_path)
     monkeypatch.setenv("SPSLAM_CPU_ISA", "avx2")
     with pytest.raises(ImportError, match="no compiled image functions for avx2 in .*; install the wheel, or build"):
-        image_kernels._library.__wrapped__()
+        image_library.image_library.__wrapped__()
 
 
 def test_a_registration_can_be_sent_to_another_process():

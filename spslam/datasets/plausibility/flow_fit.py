@@ -125,7 +125,8 @@ def fit_flows(points: Sequence[Points], lens: Lens, free: Sequence[int] = ()) ->
         motion = motion + _diagonal(1e-9 * (1 + _diagonals(motion)))
         coupling = hessian[:, :6, 6:]
         marginal = hessian[:, 6:, 6:] - coupling.swapaxes(1, 2) @ np.linalg.solve(motion, coupling)
-        information[(slice(None), *np.ix_(chosen, chosen))] = (marginal + marginal.swapaxes(1, 2)) / 2
+        rows, columns = np.ix_(chosen, chosen)
+        information[:, rows, columns] = (marginal + marginal.swapaxes(1, 2)) / 2
     final = batch.residuals(lens.with_numbers(numbers), rotation, translation)
     errors = batch.medians(np.linalg.norm(final, axis=-1)).tolist()
     return [FlowFit(*fit) for fit in zip(rotation, translation, errors, numbers, information, strict=True)]

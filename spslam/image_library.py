@@ -1,0 +1,47 @@
+"""Compiled functions on images, without torch: it is still being loaded when data is looked at, and no report needs it.
+
+There is a library for each instruction set, of which the best that this processor has is loaded at the first call;
+`SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, as it does for `spslam.ops`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from functools import cache
+from pathlib import Path
+
+_FOLDER = Path(__file__).resolve().parent
+# The best first.
+_LIBRARY_OF_ISA = {"avx512": "_images_cpu_avx512.so", "avx2": "_images_cpu_avx2.so", "baseline": "_images_cpu.so"}
+
+
+@cache
+def image_library() -> ctypes.CDLL:
+    """The library for this processor; csrc/bindings/plain declares its functions.
+
+    Raises:
+        ImportError: there is none.
+    """
+    chosen = os.environ.get("SPSLAM_CPU_ISA")
+    names = list(_LIBRARY_OF_ISA) if not chosen else [chosen]
+    for name in names:
+        path = _FOLDER / _LIBRARY_OF_ISA.get(name, f"no instruction set {name}")
+        if path.exists():
+            library = ctypes.CDLL(str(path))
+            if chosen or library.spslam_runs_here():
+                _declare(library)
+                return library
+    raise ImportError(
+        f"spslam: no compiled image functions for {' or '.join(names)} in {_FOLDER}; install the wheel, "
+        "or build in place with `make dev`"
+    )
+
+
+def _declare(library: ctypes.CDLL) -> None:
+    pointer, integer, count = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
+    library.spslam_register_color.argtypes = [pointer] * 7
+    library.spslam_unfilter_png.argtypes = [ctypes.c_char_p, pointer, integer, pointer]
+    library.spslam_rasterize.argtypes = [pointer, pointer, count, pointer, pointer, integer, pointer, pointer]
+    library.spslam_rastered_surface.argtypes = [pointer, pointer, count, *[pointer] * 7]
+    library.spslam_light_pixels.argtypes = [pointer, count, *[pointer] * 3, integer, pointer]
