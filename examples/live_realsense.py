@@ -18,12 +18,12 @@ def start(recording):
     settings, pipeline = rs.config(), rs.pipeline()
     if recording:
         settings.enable_device_from_file(recording, repeat_playback=False)
+        player = settings.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback()
+        player.set_real_time(False)  # every frame, however long one takes
     else:
         settings.enable_stream(rs.stream.depth, 640, 480, rs.format.z16, 30)
         settings.enable_stream(rs.stream.color, 640, 480, rs.format.rgb8, 30)
     profile = pipeline.start(settings)
-    if recording:
-        profile.get_device().as_playback().set_real_time(False)  # every frame, however long one takes
     lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     return pipeline, spslam.Camera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy)
 
