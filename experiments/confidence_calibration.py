@@ -24,7 +24,6 @@ from spslam.geometry import rotation_angle
 from spslam.slam.fit import Fit
 from spslam.slam.pixels import FramePixels, sample_frame
 from spslam.slam.poses import pose_tensor
-from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.verifier import Verifier
 from spslam.slam.system import SlamSystem
@@ -81,8 +80,7 @@ def fit_from(
 ) -> tuple[Fit, np.ndarray]:
     """The fit of what tracking alone makes of a start, verified, and its pose."""
     estimate = system.tracker.track(TrackingProblem(system.state.scene, pixels.records, start, number))
-    alignment = IcpAlignment(pixels, system.camera)
-    fit = verifier.verified(estimate.fit, estimate.pose, system.state.scene, alignment, system.history, pixels)
+    fit = verifier.verified(estimate.fit, estimate.pose, system.state.scene, pixels, system.history)
     return fit, matrix(estimate.pose)
 
 

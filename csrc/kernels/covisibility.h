@@ -41,14 +41,19 @@ SPS_INLINE Vec3<double> pixel_point(const std::int32_t* record, const Pose<doubl
   return pose.rotation * local + pose.translation;
 }
 
+// A world point in the axes of a frame.
+SPS_INLINE Vec3<double> in_frame(const Pose<double>& pose, const Vec3<double>& point) {
+  const Vec3<double> d = point - pose.translation;
+  const double* r = pose.rotation.m;
+  return {r[0] * d.x + r[3] * d.y + r[6] * d.z, r[1] * d.x + r[4] * d.y + r[7] * d.z,
+          r[2] * d.x + r[5] * d.y + r[8] * d.z};
+}
+
 // A depth thumbnail cell holds the depth of its middle pixel; pixel u lies in cell (u + 1/2) / step, so that no pixel
 // is on the border of two.
 SPS_INLINE bool sees_point(const FrameThumbnails& frames, std::int64_t frame, const Pose<double>& pose,
                            const Vec3<double>& point) {
-  const Vec3<double> d = point - pose.translation;
-  const double* r = pose.rotation.m;
-  const double x = r[0] * d.x + r[3] * d.y + r[6] * d.z, y = r[1] * d.x + r[4] * d.y + r[7] * d.z,
-               z = r[2] * d.x + r[5] * d.y + r[8] * d.z;
+  const auto [x, y, z] = in_frame(pose, point);
   if (!(z > kMinPointDepth)) return false;
   const Intrinsics& k = frames.intrinsics;
   const double step = static_cast<double>(frames.step);

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from spslam.datasets.base import RgbdFrame
-from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle, transform_points
+from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
 from spslam.slam.frame_history import FrameHistory
-from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
+from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.free_space import surface_counts, surface_shares
-from spslam.slam.recovery.icp_alignment import surface_maps
 from spslam.slam.recovery.place_recognition import (
     MIN_SEPARATION,
     retrieve,
@@ -138,10 +137,7 @@ def test_without_a_known_frame_there_is_nothing(dataset, pixels):
 
 
 def free_space_violation(history, pixels, pose, camera):
-    vertices, _, intrinsics = surface_maps(pixels, camera)
-    rows = history.compared_rows()
-    known = history.poses[rows], history.depth_thumbnails[rows]
-    counts, _ = surface_counts(vertices, intrinsics, pose, *known, camera)
+    counts, _ = surface_counts(pixels, pose, history.poses, history.depth_thumbnails, history.compared_rows(), camera)
     return surface_shares(*counts.tolist(), UNKNOWN_SHARE)
 
 
@@ -182,57 +178,9 @@ def test_a_column_that_is_known_hides_nothing(dataset, is_known):
         depth = np.tile(np.where(is_column, 1.0, 2.0), (camera.height, 1)).astype(np.float32)
         return sample_frame(replace(dataset[0], depth=depth), camera, settings())
 
-    vertices, _, intrinsics = surface_maps(seen(5, True), camera)
     thumbnails = torch.stack([seen(number, is_known).depth_thumbnail for number in k[:5]])
     known = torch.from_numpy(matrix_to_pose7(poses[:5])).float()
-    counts, _ = surface_counts(vertices, intrinsics, pose_tensor(poses[5], CPU), known, thumbnails, camera)
+    pose = pose_tensor(poses[5], CPU)
+    counts, _ = surface_counts(seen(5, True), pose, known, thumbnails, torch.arange(5), camera)
     occluded_share = surface_shares(*counts.tolist(), UNKNOWN_SHARE)[1]
     assert occluded_share < 0.02 if is_known else occluded_share > 0.15
-
-
-def test_counts_by_the_formula(dataset, pixels, device):
-    """Point by point in NumPy."""
-    camera, rows = dataset.camera, [0, 5, 10]
-    pose = dataset.poses()[12]
-    pose[:3, 3] += [0.1, -0.1, 0.2]
-    vertices, _, k = surface_maps(pixels[12], camera)
-    counts, hidden, known = [0, 0, 0], [], np.zeros(vertices.shape[:2], bool)
-    for row in rows:
-        into = np.linalg.inv(pose) @ dataset.poses()[row]
-        depth_thumbnail = pixels[row].depth_thumbnail.double().numpy()
-        for line, column in np.argwhere(depth_thumbnail > 0):
-            u, v = (THUMBNAIL_STEP_PX * (cell + 0.5) for cell in (column, line))
-            ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1])
-            x, y, z = transform_points(into, depth_thumbnail[line, column] * ray[None])[0]
-            i, j = int(np.floor(y / z * k.fy + k.cy + 0.5)), int(np.floor(x / z * k.fx + k.cx + 0.5))
-            if z <= 0.05 or not (0 <= i < vertices.shape[0] and 0 <= j < vertices.shape[1]) or vertices[i, j, 2] == 0:
-                continue
-            behind, tolerance = float(vertices[i, j, 2]) - z, 0.05 + 0.02 * z
-            counts[0] += abs(behind) < tolerance
-            counts[1] += behind > 1.5 * tolerance
-            known[i, j] |= abs(behind) < tolerance
-            if behind < -1.5 * tolerance:
-                hidden.append((i, j))
-    # What is nearer hides only where it is not known itself.
-    counts[2] = sum(not known[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].any() for i, j in hidden)
-    found, best = surface_counts(
-        vertices.to(device),
-        k,
-        pose_tensor(pose, device),
-        torch.from_numpy(matrix_to_pose7(dataset.poses()[rows])).float().to(device),
-        torch.stack([pixels[row].depth_thumbnail for row in rows]).to(device),
-        camera,
-    )
-    assert min(counts) > 2
-    assert sorted(best.tolist()) == list(range(len(rows)))
-    # Single precision moves a point or two over a cell's edge.
-    np.testing.assert_allclose(found.tolist(), counts, atol=2)
-
-
-def test_conflict_of_nothing_is_none(dataset, pixels):
-    pose = pose_tensor(np.eye(4), CPU)
-    vertices, _, k = surface_maps(pixels[0], dataset.camera)
-    depth_thumbnails = pixels[0].depth_thumbnail[None]
-    assert not surface_counts(0 * vertices, k, pose, pose[None], depth_thumbnails, dataset.camera)[0].any()
-    assert not surface_counts(vertices, k, pose, pose[None], 0 * depth_thumbnails, dataset.camera)[0].any()
-    assert not surface_counts(vertices, k, pose, pose[None][:0], depth_thumbnails[:0], dataset.camera)[0].any()

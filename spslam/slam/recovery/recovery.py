@@ -184,14 +184,13 @@ class Recovery:
     def _check_occlusion(
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
-        alignment = IcpAlignment(pixels, self._camera)
-        fit = self._verifier.verified(tracked.fit, tracked.pose, problem.scene, alignment, history)
+        fit = self._verifier.verified(tracked.fit, tracked.pose, problem.scene, pixels, history, False)
         return self._judged(replace(tracked, fit=fit))
 
     def _verify(self, frame: DoubtfulFrame, tracked: TrackedFrame) -> TrackedFrame:
         """The pose judged with what other frames have seen: surface, brightness and image features."""
         scene = frame.problem.scene
-        fit = self._verifier.verified(tracked.fit, tracked.pose, scene, frame.alignment, frame.history, frame.pixels)
+        fit = self._verifier.verified(tracked.fit, tracked.pose, scene, frame.pixels, frame.history)
         return self._judged(replace(tracked, fit=frame.with_features(fit, tracked.pose)))
 
     def _recover(

@@ -14,7 +14,6 @@ from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.appearance import POINTS, brightness_correlation, brightness_sums
 from spslam.slam.recovery.free_space import surface_counts, surface_shares
-from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 
 
@@ -36,30 +35,23 @@ class Verifier:
         fit: Fit,
         pose: torch.Tensor,
         scene: Scene,
-        alignment: IcpAlignment,
+        pixels: FramePixels,
         history: FrameHistory,
-        pixels: FramePixels | None = None,
+        compares_brightness: bool = True,
     ) -> Fit:
-        """The fit with free-space violation, occluded share and map coverage, and with pixels the correlation too.
+        """The fit with free-space violation, occluded share and map coverage, and the correlation of brightness.
 
         Args:
             fit: of the pose to the map.
             pose: float32 [7].
             scene: the map.
-            alignment: with the frame's vertex map.
+            pixels: of the frame, with images where their brightness is compared.
             history: the frames before.
-            pixels: the frame's, to compare its brightness.
+            compares_brightness: or leave that out.
         """
-        rows, (vertices, _, intrinsics) = history.compared_rows(), alignment.maps
-        counts, best = surface_counts(
-            vertices,
-            intrinsics,
-            pose,
-            history.poses[rows],
-            history.depth_thumbnails[rows],
-            self._camera,
-        )
-        brightness = [] if pixels is None else [self._brightness_sums(pixels, pose, rows[best], history)]
+        rows = history.compared_rows()
+        counts, best = surface_counts(pixels, pose, history.poses, history.depth_thumbnails, rows, self._camera)
+        brightness = [self._brightness_sums(pixels, pose, rows[best], history)] if compares_brightness else []
         # Waits for the device, once.
         numbers = torch.cat([counts, self._map_coverage(scene, history), *brightness]).tolist()
         seen, through, occluded = numbers[:3]
