@@ -184,7 +184,9 @@ class Recovery:
     def _check_occlusion(
         self, problem: TrackingProblem, tracked: TrackedFrame, pixels: FramePixels, history: FrameHistory
     ) -> TrackedFrame:
-        fit = self._verifier.verified(tracked.fit, tracked.pose, problem.scene, pixels, history, False)
+        fit = self._verifier.verified(
+            tracked.fit, tracked.pose, problem.scene, pixels, history, compares_brightness=False
+        )
         return self._judged(replace(tracked, fit=fit))
 
     def _verify(self, frame: DoubtfulFrame, tracked: TrackedFrame) -> TrackedFrame:
