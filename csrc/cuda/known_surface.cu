@@ -51,7 +51,8 @@ __global__ void select_kernel(KnownSurfaceSpace space, std::int64_t num_rows, st
     const std::int64_t rank = rank_of(space.counts, i, num_rows);
     if (rank >= num_best) continue;
     best[rank] = i;
-    for (int kind = 0; kind < kSurfaceCounts; ++kind) atomicAdd(sums + kind, static_cast<unsigned long long>(space.counts[kSurfaceCounts * i + kind]));
+    for (int kind = 0; kind < kSurfaceCounts; ++kind)
+      atomicAdd(sums + kind, static_cast<unsigned long long>(space.counts[kSurfaceCounts * i + kind]));
   }
   __syncthreads();
   if (threadIdx.x < kSurfaceCounts) counts[threadIdx.x] = static_cast<std::int64_t>(sums[threadIdx.x]);
