@@ -48,10 +48,16 @@ def shade(
     # Blurred slightly, to hide facets.
     smooth = np.ascontiguousarray(cv2.GaussianBlur(normals, (0, 0), 1.0))
     light = np.array([*_LIGHT, _AMBIENT, _DIFFUSE], np.float32)
-    image = np.empty(base.shape, np.uint8)
-    arrays = light, raster.face_ids, smooth, base, image
-    light_, face_ids, *rest = (array.ctypes.data for array in arrays)
-    image_library().spslam_light_pixels(light_, raster.face_ids.size, face_ids, *rest[:2], _BACKGROUND, rest[2])
+    face_ids, image = np.ascontiguousarray(raster.face_ids), np.empty(base.shape, np.uint8)
+    image_library().spslam_light_pixels(
+        light.ctypes.data,
+        face_ids.size,
+        face_ids.ctypes.data,
+        smooth.ctypes.data,
+        base.ctypes.data,
+        _BACKGROUND,
+        image.ctypes.data,
+    )
     return image
 
 
@@ -63,7 +69,12 @@ def surface(
     Returns:
         Unit normals towards the camera, and colors between those of the vertices, float32 [H, W, 3] each; 0 for
         background.
+
+    Raises:
+        ValueError: not a color for each vertex.
     """
+    if np.ndim(colors) != 2 or len(colors) != len(points) or np.shape(colors)[1] < 3:
+        raise ValueError(f"colors must be [{len(points)}, 3], one for each vertex, got {list(np.shape(colors))}")
     points, faces = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int32)
     colors = np.ascontiguousarray(np.asarray(colors)[:, :3], np.uint8)
     depth, face_ids = np.ascontiguousarray(raster.depth), np.ascontiguousarray(raster.face_ids)

@@ -47,7 +47,7 @@ class Verifier:
             scene: the map.
             pixels: of the frame, with images where their brightness is compared.
             history: the frames before.
-            compares_brightness: or leave that out.
+            compares_brightness: false leaves the correlation unknown (NaN).
         """
         rows = history.compared_rows()
         counts, best = surface_counts(pixels, pose, history.poses, history.depth_thumbnails, rows, self._camera)
