@@ -1,4 +1,4 @@
-"""Compiled functions on images, without torch: it is still being loaded when data is looked at, and no report needs it.
+"""Compiled functions on images and meshes, without torch, which is still being loaded when data is looked at.
 
 There is a library for each instruction set, of which the best that this processor has is loaded at the first call;
 `SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, as it does for `spslam.ops`.
@@ -38,6 +38,17 @@ def image_library() -> ctypes.CDLL:
     )
 
 
+def check_memory(result: int) -> int:
+    """What a function returned that returns -1 where there was not enough memory.
+
+    Raises:
+        MemoryError: there was not enough.
+    """
+    if result < 0:
+        raise MemoryError("spslam: not enough memory for this mesh")
+    return result
+
+
 def _declare(library: ctypes.CDLL) -> None:
     pointer, integer, count = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
     library.spslam_register_color.argtypes = [pointer] * 7
@@ -45,3 +56,11 @@ def _declare(library: ctypes.CDLL) -> None:
     library.spslam_rasterize.argtypes = [pointer, pointer, count, pointer, pointer, integer, pointer, pointer]
     library.spslam_rastered_surface.argtypes = [pointer, pointer, count, *[pointer] * 7]
     library.spslam_light_pixels.argtypes = [pointer, count, *[pointer] * 3, integer, pointer]
+    library.spslam_vertex_normals.argtypes = [pointer, count, count, pointer, pointer]
+    library.spslam_vertex_normals.restype = count
+    library.spslam_component_areas.argtypes = [pointer, count, count, pointer, pointer]
+    library.spslam_component_areas.restype = count
+    library.spslam_mesh_edges.argtypes = [pointer, count, count, pointer, pointer]
+    library.spslam_mesh_edges.restype = count
+    library.spslam_edge_middles.argtypes = [count, *[pointer] * 5]
+    library.spslam_divide_faces.argtypes = [pointer, count, count, *[pointer] * 3]

@@ -40,7 +40,7 @@ def edges_are_blurred(depths: Readable[np.ndarray], noise: tuple[float, float]) 
 
     def count(depth: np.ndarray) -> np.ndarray:
         counts = np.zeros(2, np.int64)
-        for profile in _profiles(depth, noise):
+        for profile in _whole_profiles(depth, noise):
             found = profile.middles() & profile.whole()
             counts += found.sum(), (found & ~profile.sharp()).sum()
         return counts
@@ -70,37 +70,37 @@ def without_blurred_edges(depth: np.ndarray, noise: tuple[float, float]) -> np.n
 
 @dataclass(frozen=True)
 class _Profiles:
-    """Inverse depth along the rows, or the columns, around each pixel. Comparisons with what is unknown are False.
+    """Inverse depth along the rows, or the columns, around pixels. Comparisons with what is unknown are False.
 
     Attributes:
-        around: float32 [2 (_REACH + _BEYOND) + 1, H, W], NaN where unknown; the middle one is the pixel.
-        gate: float32 [H, W], what two pixels of one surface differ by at most.
+        around: float32 [2 (_REACH + _BEYOND) + 1, ...], NaN where unknown; the middle one is the pixel.
+        gate: float32 [...], what two pixels of one surface differ by at most.
     """
 
     around: np.ndarray
     gate: np.ndarray
 
     def middles(self) -> np.ndarray:
-        """Bool [H, W]: pixels in the middle of an edge between two flat surfaces."""
+        """Bool [...]: pixels in the middle of an edge between two flat surfaces."""
         steps = np.nan_to_num(np.abs(np.diff(self.around[_BEYOND:-_BEYOND], axis=0)))
         return self._edge() & (steps[_REACH - 1 : _REACH + 1].max(0) >= steps.max(0))
 
     def whole(self) -> np.ndarray:
-        """Bool [H, W]: depth is known all around."""
+        """Bool [...]: depth is known all around."""
         return np.isfinite(self.around).all(0)
 
     def narrow(self) -> np.ndarray:
-        """Bool [H, W]: most of the change is near the middle."""
+        """Bool [...]: most of the change is near the middle."""
         before, after = self._within(_INNER)
         return np.abs(after - before) >= _INNER_SHARE * self._change
 
     def sharp(self) -> np.ndarray:
-        """Bool [H, W]: two neighboring steps make nearly all of the change."""
+        """Bool [...]: two neighboring steps make nearly all of the change."""
         inner = self.around[_BEYOND:-_BEYOND]
         return np.abs(inner[2:] - inner[:-2]).max(0) >= _SHARP * self._change
 
     def between(self) -> np.ndarray:
-        """Bool [H, W]: pixels at an edge that are on neither side."""
+        """Bool [...]: pixels at an edge that are on neither side."""
         before, after = self._sides
         middle = self.around[_REACH + _BEYOND]
         apart = np.minimum(np.abs(middle - before), np.abs(middle - after))
@@ -142,3 +142,23 @@ def _profiles(depth: np.ndarray, noise: tuple[float, float]) -> tuple[_Profiles,
     steps = range(2 * margin + 1)
     rows = _Profiles(np.stack([wide[:, step : step + width] for step in steps]), gate)
     return rows, _Profiles(np.stack([high[step : step + height] for step in steps]), gate)
+
+
+def _whole_profiles(depth: np.ndarray, noise: tuple[float, float]) -> tuple[_Profiles, _Profiles]:
+    """Those around the N pixels that may be at an edge and have known depth all around, [11, N]; others may be among
+    them. A tenth of the time of all."""
+    inverse, gate = surface_steps(depth, noise)
+    along_rows = _at_changes(inverse, gate)
+    return along_rows, _at_changes(np.ascontiguousarray(inverse.T), np.ascontiguousarray(gate.T))
+
+
+def _at_changes(inverse: np.ndarray, gate: np.ndarray) -> _Profiles:
+    """Those along rows around pixels with another depth in reach before them than after."""
+    margin = _REACH + _BEYOND
+    if inverse.shape[1] <= 2 * margin:
+        return _Profiles(np.zeros((2 * margin + 1, 0), np.float32), np.zeros(0, np.float32))
+    change = inverse[:, margin + _REACH : -_BEYOND] - inverse[:, _BEYOND : -margin - _REACH]
+    rows, columns = np.nonzero(np.abs(change) > EDGE * gate[:, margin:-margin])
+    columns += margin
+    around = np.stack([inverse[rows, columns + step] for step in range(-margin, margin + 1)])
+    return _Profiles(around, gate[rows, columns])

@@ -13,7 +13,7 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.meshing.mesh import compact, face_components, face_normals
+from spslam.meshing.mesh import compact, component_areas
 from spslam.scene import SparseVolume
 
 # More views than this add nothing, as neighboring views see the same surface.
@@ -118,6 +118,4 @@ def in_large_component(vertices: np.ndarray, faces: np.ndarray, min_area_m2: flo
     """
     if min_area_m2 <= 0 or len(faces) == 0:
         return np.ones(len(faces), dtype=bool)
-    component = face_components(faces, len(vertices))
-    areas = np.linalg.norm(face_normals(vertices, faces), axis=1) / 2
-    return np.bincount(component, areas)[component] >= min_area_m2
+    return component_areas(vertices, faces) >= min_area_m2

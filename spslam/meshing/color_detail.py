@@ -23,8 +23,8 @@ _LEAST_COLORED, _LEAST_SURVEYED = 120, 20
 DETAIL_LEVELS, _DETAIL_DEVIATIONS = 4.0, 3.0
 # What the color that a vertex has counts, in pixels per m^2 of a frame: all where none sees it, else next to nothing.
 _OWN_WEIGHT = 100.0
-# So many bytes of the surveyed frames are kept, as these are looked at again.
-_KEPT_BYTES, _PIXEL_BYTES = 1 << 27, 7
+# So many bytes of the frames that give colors are kept, as these are looked at again.
+_KEPT_BYTES, _PIXEL_BYTES = 1 << 28, 7
 
 
 @dataclass(frozen=True)
@@ -54,29 +54,25 @@ def color_mesh(
 
     Args:
         mesh: of these frames. Its colors are kept where no frame sees it.
-        parts: the frames, of one dataset or of several in one world.
+        parts: the frames, of one dataset or of several in one world; of `keep_colored`, where they were read before.
         options: how.
         device: where frames are looked at.
 
     Returns:
         The mesh, and the number of frames that colors are of; frames that can't be read are left out. Memory beside the
-        meshes: 50 bytes per vertex and 90 per edge, and at most 128 MiB of frames. The same input gives the same bytes.
+        meshes: 50 bytes per vertex and 90 per edge, and at most 256 MiB of frames. The same input gives the same bytes.
     """
-    parts = [parts] if isinstance(parts, PosedFrames) else parts
-    count = sum(len(part) for part in parts)
-    colored = colored_every(count)
-    surveyed = colored * min(_SURVEYED_EVERY, max(count // (colored * _LEAST_SURVEYED), 1))
-    parts = _keeping(parts, [len(part) for part in thinned(parts, surveyed)])
-    device, survey, looked_at = torch.device(device), thinned(parts, surveyed), 0
+    parts = keep_colored([parts] if isinstance(parts, PosedFrames) else parts)
+    device, survey, looked_at = torch.device(device), thinned(parts, _surveyed_every(parts)), 0
     for _ in range(options.subdivisions):
-        edges = mesh_edges(mesh.faces, len(mesh.vertices), device)
+        edges = mesh_edges(mesh.faces, len(mesh.vertices))
         # Where no edge was divided before there is no detail for finer ones either.
         rows = np.flatnonzero(edges.ends[:, 1] >= looked_at)
         looked_at = len(mesh.vertices)
         chosen = rows[_has_detail(mesh, edges, rows, (survey, options.noise, device))]
         first, second = mesh.colors[edges.ends[chosen]].astype(np.uint16).transpose(1, 0, 2)
         mesh = split_edges(mesh, edges, chosen, ((first + second + 1) // 2).astype(np.uint8))
-    views = thinned(parts, colored)
+    views = thinned(parts, colored_every(sum(map(len, parts))))
     return replace(mesh, colors=_mean_colors(mesh, (views, options.noise, device))), sum(map(len, views))
 
 
@@ -85,15 +81,33 @@ def colored_every(count: int) -> int:
     return min(_COLORED_EVERY, max(count // _LEAST_COLORED, 1))
 
 
-def _keeping(parts: Sequence[PosedFrames], surveyed: Sequence[int]) -> list[KeptFrames]:
-    """The parts, of which so many frames each that are read first are kept, as far as `_KEPT_BYTES` go."""
-    kept, left = [], _KEPT_BYTES
-    for part, count in zip(parts, surveyed, strict=True):
-        frame_bytes = part.dataset.camera.width * part.dataset.camera.height * _PIXEL_BYTES
-        most = min(count, left // frame_bytes)
-        left -= most * frame_bytes
-        kept.append(KeptFrames(part.dataset, part.indices, part.poses, part.noise, most))
-    return kept
+def _surveyed_every(parts: Sequence[PosedFrames]) -> int:
+    """Every how many-th frame of all parts is surveyed for detail."""
+    count = sum(map(len, parts))
+    colored = colored_every(count)
+    return colored * min(_SURVEYED_EVERY, max(count // (colored * _LEAST_SURVEYED), 1))
+
+
+def keep_colored(parts: Sequence[PosedFrames]) -> list[KeptFrames]:
+    """The parts, whose frames that `color_mesh` looks at are kept once they were read, as far as 256 MiB go.
+
+    The surveyed ones first, at which it looks once more than at others. What is kept already stays so.
+    """
+    if all(isinstance(part, KeptFrames) for part in parts):
+        return [part for part in parts if isinstance(part, KeptFrames)]
+    wanted: list[set[int]] = [set() for _ in parts]
+    left = _KEPT_BYTES
+    for every in (_surveyed_every(parts), colored_every(sum(map(len, parts)))):
+        for chosen, part in zip(wanted, thinned(parts, every), strict=True):
+            more = [index for index in part.indices.tolist() if index not in chosen]
+            frame_bytes = part.dataset.camera.width * part.dataset.camera.height * _PIXEL_BYTES
+            more = more[: left // frame_bytes]
+            left -= len(more) * frame_bytes
+            chosen.update(more)
+    return [
+        KeptFrames(part.dataset, part.indices, part.poses, part.noise, frozenset(chosen))
+        for part, chosen in zip(parts, wanted, strict=True)
+    ]
 
 
 def thinned(parts: Sequence[PosedFrames], every: int) -> list[PosedFrames]:

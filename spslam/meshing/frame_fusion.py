@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,15 +122,19 @@ class _EdgeKind(enum.Enum):
 
 @dataclass(frozen=True)
 class _DepthImages:
-    """The depth images of frames."""
+    """The depth images of frames; what was read is kept."""
 
     part: PosedFrames
+    kept: dict[int, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.part)
 
     def __getitem__(self, position: int) -> np.ndarray:
-        return self.part.depth(position)
+        depth = self.kept.get(position)
+        if depth is None:
+            depth = self.kept[position] = self.part.depth(position)
+        return depth
 
 
 def fuse_frames(
@@ -163,12 +167,11 @@ def fuse_frames(
     parts = [frames] if isinstance(frames, PosedFrames) else frames
     noises = [part.noise or options.noise for part in parts]
     befores = np.cumsum([0, *map(len, parts)])  # frames of the parts before each
-    images = [
-        _EdgeImages(
-            part, noise, _EdgeKind.of(part, noise), np.arange(before, before + len(part)) % options.color_every == 0
-        )
-        for part, noise, before in zip(parts, noises, befores, strict=False)
-    ]
+    device = torch.device(device)
+    images: list[_EdgeImages] = []
+    for part, noise, before in zip(parts, noises, befores, strict=False):
+        colored = np.arange(before, before + len(part)) % options.color_every == 0
+        images.append(_EdgeImages(part, noise, _EdgeKind.of(part, noise), colored, device))
     along_rays = [noise_along_rays(part, noise) for part, noise in zip(parts, noises, strict=True)]
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
@@ -177,8 +180,8 @@ def fuse_frames(
         try:
             if scene is not None:
                 volume.add_blocks(blocks_of_scene(scene, volume))
-            for part, noise in zip(images, along_rays, strict=True):
-                _fuse_part(volume, part, noise)
+            for each, noise in zip(images, along_rays, strict=True):
+                _fuse_part(volume, each, noise)
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -216,7 +219,7 @@ def surface_cells(scene: Scene) -> torch.Tensor:
 
 
 class _EdgeImage(NamedTuple):
-    """A frame.
+    """A frame on the device.
 
     Attributes:
         depth: float32 [H, W], m.
@@ -224,40 +227,45 @@ class _EdgeImage(NamedTuple):
         edges: depth without ramps, float32 [H, W], or which pixels are flying, bool [H, W], or None.
     """
 
-    depth: np.ndarray
-    color: np.ndarray | None
+    depth: torch.Tensor
+    color: torch.Tensor | None
     edges: Any
 
 
 @dataclass(frozen=True)
 class _EdgeImages:
-    """Frames with what lies between two surfaces in them, found on the threads that read.
+    """Frames with what lies between two surfaces in them, found on the threads that read, which upload them too.
 
     Attributes:
         part: the frames.
         noise: of their depth.
         edges: of what kind they are.
         colored: bool [F], of which the color image is read.
+        device: where they are wanted.
     """
 
     part: PosedFrames
     noise: tuple[float, float]
     edges: _EdgeKind
     colored: np.ndarray
+    device: torch.device
 
     def __len__(self) -> int:
         return len(self.part)
 
     def __getitem__(self, position: int) -> _EdgeImage:
-        color = None
+        color = edges = None
         if self.colored[position]:
             frame = self.part[position]
             color, depth = frame.color, frame.depth
         else:
             depth = self.part.depth(position)
         if self.edges is _EdgeKind.BLURRED:
-            return _EdgeImage(depth, color, without_blurred_edges(depth, self.noise))
-        return _EdgeImage(depth, color, flying_pixels(depth, self.noise) if self.edges is _EdgeKind.FLYING else None)
+            edges = without_blurred_edges(depth, self.noise)
+        elif self.edges is _EdgeKind.FLYING:
+            edges = flying_pixels(depth, self.noise)
+        rest = (None if image is None else on_device(image, self.device) for image in (color, edges))
+        return _EdgeImage(on_device(depth, self.device), *rest)
 
     @property
     def without_color(self) -> _EdgeImages:
@@ -276,23 +284,20 @@ def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages, along_rays: tuple[fl
     """Fuses the frames of one dataset, whose depth has this noise along rays."""
     device, intrinsics, noise = volume.sdf.device, frame_intrinsics(images.part), images.noise
     poses = poses7_on(images.part.poses, device)
-    if images.edges is _EdgeKind.BLURRED:
+    is_blurred = images.edges is _EdgeKind.BLURRED
+    if is_blurred:
         for position, image in images.without_color.read():
-            ramps = _ramps(on_device(image.depth, device), on_device(image.edges, device), intrinsics, noise)
+            ramps = _ramps(image.depth, image.edges, intrinsics, noise)
             volume.make_room(ramps, poses[position], intrinsics, along_rays)
     for position, image in images.read():
-        depth = on_device(image.depth, device)
-        if images.edges is _EdgeKind.BLURRED:
-            kept = on_device(image.edges, device)
-            # Smoothed depth: neighbors have the same noise.
-            planes = ops.measure_planes(kept, intrinsics, noise, shared_noise=True)
-            planes += _ramps(depth, kept, intrinsics, noise)
-        else:
-            planes = ops.measure_planes(depth, intrinsics, noise)
-            if images.edges is _EdgeKind.FLYING:
-                planes[..., 4][on_device(image.edges, device)] *= FLYING_WEIGHT
-        color = None if image.color is None else on_device(image.color, device)
-        volume.integrate_planes(planes, poses[position], intrinsics, color, along_rays)
+        # Smoothed depth: neighbors have the same noise.
+        depth = image.edges if is_blurred else image.depth
+        planes = ops.measure_planes(depth, intrinsics, noise, shared_noise=is_blurred)
+        if is_blurred:
+            planes += _ramps(image.depth, depth, intrinsics, noise)
+        elif image.edges is not None:
+            planes[..., 4][image.edges] *= FLYING_WEIGHT
+        volume.integrate_planes(planes, poses[position], intrinsics, image.color, along_rays)
 
 
 def _ramps(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spslam.image_library import check_memory, image_library
 from spslam.notebook import mesh_html
 
 
@@ -77,23 +78,47 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
+def indexed(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Faces as compiled functions read them: int32 [L, 3], contiguous.
+
+    Raises:
+        ValueError: a face of other indices than those of `num_vertices` vertices.
+    """
+    faces = np.asarray(faces).reshape(-1, 3)
+    if faces.size and not 0 <= faces.min() <= faces.max() < num_vertices:
+        raise ValueError(f"faces must be indices of {num_vertices} vertices, got {faces.min()}, {faces.max()}")
+    return np.ascontiguousarray(faces, np.int32)
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals float32 [K, 3] of vertices: area-weighted means over the adjacent faces; 0 where there is none."""
-    normals = face_normals(vertices, faces)
-    total = np.zeros((len(vertices), 3))
-    for axis in range(3):
-        for corner in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], normals[:, axis], len(vertices))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.divide(total, length, out=np.zeros_like(total), where=length > 0).astype(np.float32)
+    """Unit normals float32 [K, 3] of vertices: area-weighted means over the adjacent faces; 0 where there is none.
+
+    Raises:
+        ValueError: a face of other indices than those of vertices.
+        MemoryError: there is not enough.
+    """
+    points, faces = np.ascontiguousarray(vertices, np.float32), indexed(faces, len(vertices))
+    normals = np.empty(points.shape, np.float32)
+    check_memory(
+        image_library().spslam_vertex_normals(
+            faces.ctypes.data, len(faces), len(points), points.ctypes.data, normals.ctypes.data
+        )
+    )
+    return normals
 
 
-def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Label [L] of the connected component of each face; faces that share a vertex are connected."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+def component_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The area, float64 [L], m^2, of the connected component of each face; faces that share a vertex are connected.
 
-    edges = np.concatenate((faces[:, :2], faces[:, 1:]))
-    graph = coo_matrix((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), (num_vertices, num_vertices))
-    _, labels = connected_components(graph, directed=False)
-    return labels[faces[:, 0]]
+    Raises:
+        ValueError: a face of other indices than those of vertices.
+        MemoryError: there is not enough.
+    """
+    points, faces = np.ascontiguousarray(vertices, np.float32), indexed(faces, len(vertices))
+    areas = np.empty(len(faces))
+    check_memory(
+        image_library().spslam_component_areas(
+            faces.ctypes.data, len(faces), len(points), points.ctypes.data, areas.ctypes.data
+        )
+    )
+    return areas

@@ -8,6 +8,7 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.geometry import inverse
 from spslam.image_library import image_library
+from spslam.meshing.mesh import indexed
 from spslam.meshing.shading import Raster, shade, surface
 
 NEAREST_M = 0.02
@@ -99,15 +100,12 @@ def render_colors(
 
 
 def _rasterize(points: np.ndarray, faces: np.ndarray, camera: Camera, cull_back: bool) -> Raster:
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(points):
-        raise ValueError(
-            f"rasterize: faces must be indices of {len(points)} vertices, got {faces.min()}, {faces.max()}"
-        )
     if len(faces) > _MOST_FACES:
         raise ValueError(f"rasterize: at most {_MOST_FACES} faces, got {len(faces)}")
+    faces = indexed(faces, len(points))
     shape = camera.height, camera.width
     raster = Raster(np.empty(shape, np.float32), np.empty(shape, np.int32))
-    corners, faces = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int32)
+    corners = np.ascontiguousarray(points, np.float64)
     size = np.array(shape[::-1], np.int32)
     numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy, NEAREST_M])
     image_library().spslam_rasterize(

@@ -5,23 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
 from spslam import ops
 from spslam.datasets.base import RgbdFrame
+from spslam.datasets.prefetch import prefetch
+from spslam.errors import DatasetError
 from spslam.meshing.frame_fusion import PosedFrames, frame_intrinsics, on_device, poses7_on
+from spslam.meshing.reading import reading_threads
 
 
 @dataclass(frozen=True)
 class KeptFrames(PosedFrames):
-    """Frames of which those that are read first are kept, also by what is made of these by `dataclasses.replace`.
+    """Frames of which some are kept once they were read, also by what is made of these by `dataclasses.replace`.
 
     Attributes:
-        most: how many, but for as many more as threads read at once.
-        kept: those, by their indices in the dataset.
+        wanted: which are to be kept, by their indices in the dataset.
+        kept: those that were read.
     """
 
-    most: int = 0
+    wanted: frozenset[int] = frozenset()
     kept: dict[int, RgbdFrame] = field(default_factory=dict)
 
     def __getitem__(self, position: int) -> RgbdFrame:
@@ -29,9 +33,14 @@ class KeptFrames(PosedFrames):
         frame = self.kept.get(index)
         if frame is None:
             frame = super().__getitem__(position)
-            if len(self.kept) < self.most:
+            if index in self.wanted:
                 self.kept[index] = frame
         return frame
+
+    def depth(self, position: int) -> np.ndarray:
+        """As of `PosedFrames`; of a frame that is kept, its own."""
+        frame = self.kept.get(int(self.indices[position]))
+        return super().depth(position) if frame is None else frame.depth
 
 
 def read_seen(
@@ -50,6 +59,27 @@ def read_seen(
     device = surface.points.device
     for part in parts:
         intrinsics, poses = frame_intrinsics(part), poses7_on(part.poses, device)
-        for position, frame in part.read():
-            images = on_device(frame.depth, device), on_device(frame.color, device)
-            yield ops.see_points(surface, *images, poses[position], intrinsics, part.noise or noise)
+        with prefetch(_Uploaded(part, device), *reading_threads()) as frames:
+            for position, images in enumerate(frames):
+                if not isinstance(images, DatasetError):
+                    yield ops.see_points(surface, *images, poses[position], intrinsics, part.noise or noise)
+
+
+@dataclass(frozen=True)
+class _Uploaded:
+    """Depth and color of frames on a device, where the threads that read put them.
+
+    Attributes:
+        part: the frames.
+        device: where they are wanted.
+    """
+
+    part: PosedFrames
+    device: torch.device
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __getitem__(self, position: int) -> tuple[torch.Tensor, torch.Tensor]:
+        frame = self.part[position]
+        return on_device(frame.depth, self.device), on_device(frame.color, self.device)

@@ -145,6 +145,26 @@ class VoxelHash(VoxelLookup):
         voxel_ids = unflat_rows(voxel_ids, leading)
         return (voxel_ids, unflat_rows(missing, leading)) if return_new else voxel_ids
 
+    def add(self, voxel_coords: torch.Tensor) -> int:
+        """Enters the coordinates that are missing, as `insert`, but does not look up ids.
+
+        Args:
+            voxel_coords: int32 or int64 [N, 3] in [-2^20, 2^20 - 1], repetitions allowed.
+
+        Returns:
+            How many were missing.
+
+        Raises:
+            ValueError, TypeError, VoxelLimitError, RuntimeError: as `insert`.
+        """
+        coords, _ = self._rows("VoxelHash.add", voxel_coords)
+        if not coords.shape[0]:
+            return 0
+        absent = absent_voxels("VoxelHash.add", self.hash_keys, self.hash_values, coords)
+        if absent.shape[0]:
+            self._enter(absent)
+        return absent.shape[0]
+
     @public_op(name="VoxelHash.insert_points")
     def insert_points(self, points: torch.Tensor, voxel_size: float, band: float = 0.0) -> torch.Tensor:
         """Enters the vertices that a field around points needs: of every cell within `band` of a point along each axis.

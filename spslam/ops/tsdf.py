@@ -59,15 +59,32 @@ def tsdf_touched_blocks(
         >>> blocks[:, 2].unique()  # blocks of 0.8 m, from 1.7 to 2.3 m
         tensor([2], dtype=torch.int32)
     """
-    name = "tsdf_touched_blocks"
+    coords = touched_blocks("tsdf_touched_blocks", planes, pose, intrinsics, voxel_size, truncation, noise, step)
+    # Not by a mask, for which torch wakes its own threads, however few rows there are: they would wait for cores.
+    return coords.index_select(0, (coords[:, 0] != NO_BLOCK).nonzero()[:, 0])
+
+
+def touched_blocks(
+    name: str,
+    planes: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    voxel_size: float,
+    truncation: float,
+    noise: tuple[float, float],
+    step: int,
+) -> torch.Tensor:
+    """`tsdf_touched_blocks` on behalf of another function, which its errors name; without waiting for CUDA.
+
+    Returns:
+        int32 [N, 3], among them rows that begin with `NO_BLOCK`, which are none.
+    """
     _check_frame(name, planes, pose, intrinsics)
     _check_sizes(name, voxel_size, truncation)
     check_noise(name, noise)
     check_count(name, "step", step)
     sizes = voxel_size, truncation, list(noise)
-    coords = torch.ops.spslam.tsdf_touched_blocks(planes, pose, list(intrinsics), *sizes, step)
-    # Not by a mask, for which torch wakes its own threads, however few rows there are: they would wait for cores.
-    return coords.index_select(0, (coords[:, 0] != NO_BLOCK).nonzero()[:, 0])
+    return torch.ops.spslam.tsdf_touched_blocks(planes, pose, list(intrinsics), *sizes, step)
 
 
 @public_op()

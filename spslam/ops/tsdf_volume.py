@@ -10,7 +10,15 @@ from spslam.ops.depth_planes import DEFAULT_NOISE, PLANE_SIZE, measure_planes
 from spslam.ops.hash_table import VoxelHash
 from spslam.ops.marching_cubes import marching_cubes
 from spslam.ops.scene_view import Intrinsics
-from spslam.ops.tsdf import BLOCK_SIDE, BLOCK_VOXELS, COLOR_SIZE, tsdf_integrate_, tsdf_query, tsdf_touched_blocks
+from spslam.ops.tsdf import (
+    BLOCK_SIDE,
+    BLOCK_VOXELS,
+    COLOR_SIZE,
+    NO_BLOCK,
+    touched_blocks,
+    tsdf_integrate_,
+    tsdf_query,
+)
 
 TRUNCATION_VOXELS = 3.0
 # Of the truncation, where there is no noise: little of a surface reaches around its edges.
@@ -114,7 +122,7 @@ class TsdfVolume:
         Raises:
             VoxelLimitError: more than `max_blocks`. The volume is then as before.
         """
-        self.blocks.insert(block_coords)
+        self.blocks.add(block_coords)
         rows = len(self._sdf)
         if len(self) > rows:
             # By half, not by two: these are the largest buffers there are.
@@ -198,16 +206,11 @@ class TsdfVolume:
         """
         reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
-        touched = tsdf_touched_blocks(
-            planes,
-            pose,
-            intrinsics,
-            voxel_size=self.voxel_size,
-            truncation=self.truncation,
-            noise=noise,
-            step=step,
-        )
-        self.add_blocks(touched)
+        sizes = self.voxel_size, self.truncation, noise, step
+        touched = touched_blocks("TsdfVolume.make_room", planes, pose, intrinsics, *sizes)
+        missing = (self.blocks.find(touched) < 0) & (touched[:, 0] != NO_BLOCK)
+        # Not by the mask, for which torch would wake its threads.
+        self.add_blocks(touched.index_select(0, missing.nonzero()[:, 0]))
 
     def query(self, points: torch.Tensor, min_weight: float = 1e-3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Distance (m), color and whether both are known, at points float32 [N, 3]; see `tsdf_query`."""

@@ -16,12 +16,13 @@ from spslam.datasets.base import RgbdDataset
 from spslam.errors import OutputError
 from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
-from spslam.meshing.color_detail import ColorOptions, color_mesh, colored_every
+from spslam.meshing.color_detail import ColorOptions, color_mesh, colored_every, keep_colored
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
 from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.options import MeshOptions
+from spslam.run.memory import keep_freed_memory
 from spslam.run.threads import library_threads_limited
 from spslam.scene import Scene
 from spslam.slam.interpreter import interpreter_shared
@@ -132,9 +133,12 @@ def _extracted(job: MeshJob) -> tuple[TriangleMesh, dict[str, Any]]:
 def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh of the frames, and figures. If it is to have a texture, its vertices have the voxels' colors."""
     frames, noise = frames_of(job, dataset), job.noise or DEFAULT_NOISE
+    if job.texture is None:
+        frames = list(keep_colored(frames))
     # Colors of voxels are for a texture, or else for vertices that no frame that gives colors sees.
     color_every = colored_every(sum(map(len, frames))) if job.texture is None else 1
     fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, noise, color_every)
+    keep_freed_memory()
     with library_threads_limited(), interpreter_shared():
         volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
     mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job))

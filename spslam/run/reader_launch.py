@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
 from spslam.helper_process import HelperProcess, Standby
+from spslam.run.memory import LARGEST_KEPT, MOST_KEPT
 
 # What the process runs; a test checks that it exists.
 SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.reader_service", "serve"
@@ -16,9 +17,8 @@ SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.reader_service", "serve"
 AHEAD_PER_WORKER = 3
 _ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
-    # glibc keeps the memory of freed images; otherwise each image would page-fault its memory anew.
-    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
-    "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
+    "MALLOC_MMAP_THRESHOLD_": str(LARGEST_KEPT),
+    "MALLOC_TRIM_THRESHOLD_": str(MOST_KEPT),
 }
 
 

@@ -8,7 +8,7 @@ import torch
 
 from spslam import ops
 from spslam.meshing import color_detail
-from spslam.meshing.color_detail import ColorOptions, color_mesh, thinned
+from spslam.meshing.color_detail import ColorOptions, color_mesh, keep_colored, thinned
 from spslam.meshing.render import render_colors
 from spslam.meshing.subdivision import mesh_edges
 from spslam.meshing.texture.views import read_views
@@ -174,6 +174,27 @@ def test_frames_that_are_looked_at_again_are_read_once(board, monkeypatch):
     assert reads == [24, 3 * 24]
     assert np.array_equal(meshes[0].colors, meshes[1].colors)
     assert np.array_equal(meshes[0].vertices, meshes[1].vertices)
+
+
+def test_frames_that_fusion_has_read_are_not_read_again(board):
+    mesh, views = board
+    counting = _Counting.of(views)
+    kept = keep_colored([counting])
+    for position in range(len(views)):
+        assert np.array_equal(kept[0].depth(position), kept[0][position].depth)
+    before = len(counting.dataset.indices)
+    colored, _ = color_mesh(mesh, kept, OPTIONS)
+    assert len(counting.dataset.indices) == before
+    assert np.array_equal(colored.colors, color_mesh(mesh, _Counting.of(views), OPTIONS)[0].colors)
+
+
+def test_surveyed_frames_are_kept_first(board, monkeypatch):
+    views = board[1]
+    many = replace(views, indices=np.arange(960), poses=views.poses[[0]].repeat(960, axis=0))
+    image = CAMERA.width * CAMERA.height * 7
+    monkeypatch.setattr(color_detail, "_KEPT_BYTES", 50 * image)
+    wanted = keep_colored([many])[0].wanted
+    assert len(wanted) == 50 and {index for index in range(960) if index % 40 == 0} <= wanted
 
 
 class _Counting(_Noisy):

@@ -121,7 +121,7 @@ def test_vertices_that_are_not_finite_show_nothing():
 def test_a_face_without_its_vertex_is_refused(index):
     vertices, faces = box()
     faces[3, 1] = index
-    with pytest.raises(ValueError, match="rasterize: faces must be indices of 8 vertices, got"):
+    with pytest.raises(ValueError, match="faces must be indices of 8 vertices, got"):
         rasterize(vertices, faces, CAMERA, np.eye(4))
 
 

@@ -37,6 +37,20 @@ def test_growing_in_steps_or_at_once_gives_the_same_cells(device, generator):
     assert torch.equal(steps.corner_ids[ids][~missing].long(), renamed[~missing])
 
 
+def test_adding_enters_as_inserting_does(device, generator):
+    coords = torch.randint(-20, 20, (4000, 3), generator=generator, dtype=torch.int32).to(device)
+    inserted, added = ops.VoxelHash(capacity=4, device=device), ops.VoxelHash(capacity=4, device=device)
+    for part in coords.split(300):
+        before = len(inserted)
+        inserted.insert(part)
+        assert added.add(part) == len(inserted) - before
+    assert added.add(coords) == 0 and added.add(coords[:0]) == 0
+    assert torch.equal(added.voxel_coords, inserted.voxel_coords)
+    assert torch.equal(added.corner_ids, inserted.corner_ids)
+    with pytest.raises(ops.VoxelLimitError):
+        ops.VoxelHash(device=device, max_voxels=10).add(coords)
+
+
 def test_nothing_and_repetitions(device):
     cells = ops.VoxelHash(device=device)
     assert cells.insert(torch.zeros(0, 3, dtype=torch.int32, device=device)).shape == (0,)
