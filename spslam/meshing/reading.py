@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from spslam.datasets.prefetch import usable_cores
 
-# At least so many, for two cores, which compute beside; more than so many wait for Python's interpreter: 996 frames on a
-# GPU with 16 cores in 2.1 s by 4 threads, 1.7 by 6, 1.6 by 8 and 2.0 by 12.
+# At least so many, for two cores, which compute beside; more than so many wait for Python's interpreter: 996 frames
+# beside a GPU with 16 cores in 2.1 s by 4 threads, 1.7 by 6, 1.6 by 8 and 2.0 by 12.
 _LEAST, _MOST = 2, 6
 
 

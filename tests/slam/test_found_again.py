@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from spslam.slam.fit import Fit
-from spslam.slam.recovery.doubtful_frame import preferred_by_features
+from spslam.slam.recovery.doubtful_frame import preferred_by_brightness, preferred_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
@@ -135,3 +135,36 @@ def test_of_results_that_are_one_pose_that_with_most_agreement_stands_for_all(re
 def test_few_image_features_decide_nothing():
     likeliest, other = with_features(0.05, 20), with_features(0.1, 50)
     assert preferred_by_features(likeliest, [likeliest, other], 1.2) is likeliest
+
+
+@pytest.mark.parametrize(
+    ("changes", "lost", "decides"),
+    [
+        ({}, False, True),
+        ({}, True, False),
+        ({"mean_robust_weight": 0.75}, False, False),  # surface does not speak for it
+        ({"brightness_correlation": 0.8}, False, False),  # nor does brightness
+        ({"brightness_correlation": math.nan}, False, False),
+    ],
+)
+def test_surface_and_brightness_decide_against_features(changes, lost, decides):
+    """Features of frames that were found again some centimeters off agree with a pose that is off as well."""
+    likeliest, other = with_features(0.01, 270, weight=0.76), with_features(0.02, 220, lost=lost, weight=0.8)
+    likeliest = replace(likeliest, fit=replace(likeliest.fit, brightness_correlation=0.74))
+    other = replace(other, fit=replace(other.fit, **{"brightness_correlation": 0.93, **changes}))
+    assert preferred_by_brightness(likeliest, [likeliest, other]) is (other if decides else likeliest)
+
+
+@pytest.mark.parametrize(("changes", "asks"), [({}, False), ({"prediction_error_cm": 40.0}, True)])
+def test_a_camera_that_has_jumped_may_be_anywhere(recovery, monkeypatch, changes, asks):
+    """A hall had 84 features alike 2.8 m from where the camera had jumped back to."""
+    found = with_features(0.001, 200)
+    found = replace(found, fit=replace(found.fit, **changes))
+    asked = []
+    monkeypatch.setattr(recovery, "_starts_at_last", lambda frame, first: (frame, []))
+    monkeypatch.setattr(recovery, "_likeliest", lambda *args, **kwargs: found)
+    monkeypatch.setattr(recovery, "_relocalize", lambda frame, candidates: asked.append(1) or found)
+    history = SimpleNamespace(consecutive_lost_frames=0, consistent_frames=0)
+    problem = SimpleNamespace(constraints=SimpleNamespace(reference=None))
+    recovery._recover(problem, found, None, history, None)
+    assert bool(asked) == asks

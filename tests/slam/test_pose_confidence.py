@@ -117,6 +117,9 @@ def test_features_that_hold_a_pose_speak_for_it():
     )
     for unsure in ({"feature_inliers": 40}, {"feature_share": 0.7}):
         assert error_probability(GOOD, **far, **{**held, **unsure}) > 0.1
+    # A camera that has jumped may be anywhere, and places alike have features alike.
+    for jump in ({"prediction_error_cm": 40.0}, {"prediction_error_deg": 25.0}):
+        assert error_probability(GOOD, **{**far, **jump}, **held) > 0.5
     anywhere = dict(prediction_error_cm=math.nan, prediction_error_deg=math.nan, brightness_correlation=0.45)
     assert error_probability(GOOD, **anywhere, **held) > 0.5
 

@@ -21,6 +21,7 @@ REGISTERED_PX = 0.5  # measured errors of where colors are; with larger ones fea
 FEW_FEATURES = 0.3
 MIN_DECIDING = 60  # features, or matches with an earlier frame: fewer decide nothing
 MIN_AGREEING = 0.25  # of such matches; a pose with which fewer agree has slid away from where they are
+MORE_ALIKE = 0.1  # by so much brightness correlates better with a pose that decides against features
 MAX_TURN_DEG_S = 300.0  # of a camera; what moves faster in the image has jumped
 
 
@@ -119,3 +120,15 @@ def preferred_by_features(found: TrackedFrame, others: Sequence[TrackedFrame], t
     count = found.fit.feature_inliers
     by_chance = 1 + 1 / math.sqrt(count) if count > 0 else 1.0
     return best if best.agreement > max(times, by_chance) * found.agreement else found
+
+
+def preferred_by_brightness(found: TrackedFrame, others: Sequence[TrackedFrame]) -> TrackedFrame:
+    """The likeliest result, or a trusted one that fits surface better, and earlier images' brightness by far.
+
+    Features of the last frames may be of a part of the map that is off by some centimeters, as after the camera was
+    found again: all of them then agree with a pose that neither surface nor brightness is for.
+    """
+    alike = found.fit.brightness_correlation + MORE_ALIKE
+    better = [other for other in others if not other.lost and other.weight > found.weight]
+    brighter = [other for other in better if other.fit.brightness_correlation > alike]
+    return max(brighter, key=lambda other: other.fit.brightness_correlation, default=found)

@@ -37,6 +37,7 @@ class PoseConfidenceModel:
         max_occluded_share: above it the frame is occluded.
         min_feature_inliers: with as many the pose is known without the motion model.
         min_holding_inliers, min_holding_share: with as many the pose is held where surface leaves it free.
+        max_followed_cm, max_followed_deg: a camera farther from the prediction has jumped, and may be anywhere.
     """
 
     intercept: float
@@ -62,6 +63,8 @@ class PoseConfidenceModel:
     min_feature_share: float
     min_holding_inliers: float
     min_holding_share: float
+    max_followed_cm: float
+    max_followed_deg: float
 
     @classmethod
     def load(cls) -> "PoseConfidenceModel":
@@ -104,7 +107,12 @@ class PoseConfidenceModel:
 
     def is_held(self, fit: Fit) -> bool:
         """Whether image features hold the pose; where the camera may be anywhere, places alike have them alike."""
-        return self.has_many_features(fit) and not math.isnan(fit.prediction_error_cm)
+        is_predicted = not math.isnan(fit.prediction_error_cm) and not self.has_jumped(fit)
+        return is_predicted and self.has_many_features(fit)
+
+    def has_jumped(self, fit: Fit) -> bool:
+        """Whether the pose is too far from the prediction to be followed; False where nothing is predicted."""
+        return fit.prediction_error_cm > self.max_followed_cm or fit.prediction_error_deg > self.max_followed_deg
 
     def has_many_features(self, fit: Fit) -> bool:
         """Whether as many image features agree with the pose as hold one.

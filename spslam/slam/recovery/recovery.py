@@ -13,7 +13,12 @@ from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
-from spslam.slam.recovery.doubtful_frame import MIN_DECIDING, DoubtfulFrame, preferred_by_features
+from spslam.slam.recovery.doubtful_frame import (
+    MIN_DECIDING,
+    DoubtfulFrame,
+    preferred_by_brightness,
+    preferred_by_features,
+)
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches, joined_too
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
@@ -227,7 +232,7 @@ class Recovery:
                 iterations = sum(candidate.iterations for candidate in candidates[1:])
                 candidates = self._track_from(frame, first, starts)
                 found = self._likeliest(frame, candidates, seen=seen)
-        if found is None or found.lost:
+        if found is None or found.lost or self._confidence.has_jumped(found.fit):
             found = self._relocalize(frame, candidates)
         elif self._may_have_slid(found):
             # Tracked on from where features had put it, it may have slid along what surface leaves free.
@@ -329,9 +334,9 @@ class Recovery:
         if anywhere:
             return found
         found = preferred_by_features(found, verified)
-        if seen is None or not (found.lost or seen.weight > found.weight - MAX_FEATURE_NOISE):
-            return found
-        return preferred_by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
+        if seen is not None and (found.lost or seen.weight > found.weight - MAX_FEATURE_NOISE):
+            found = preferred_by_features(found, [self._verify(frame, seen)], MORE_AGREEING)
+        return preferred_by_brightness(found, verified)
 
     @staticmethod
     def _favored(candidates: Sequence[TrackedFrame], i: int) -> float:
