@@ -219,7 +219,7 @@ def surface_cells(scene: Scene) -> torch.Tensor:
 
 
 class _EdgeImage(NamedTuple):
-    """A frame on the device.
+    """A frame, to be uploaded.
 
     Attributes:
         depth: float32 [H, W], m.
@@ -227,21 +227,21 @@ class _EdgeImage(NamedTuple):
         edges: depth without ramps, float32 [H, W], or which pixels are flying, bool [H, W], or None.
     """
 
-    depth: torch.Tensor
+    depth: Any
     color: torch.Tensor | None
     edges: Any
 
 
 @dataclass(frozen=True)
 class _EdgeImages:
-    """Frames with what lies between two surfaces in them, found on the threads that read, which upload them too.
+    """Frames with what lies between two surfaces in them, found on the threads that read.
 
     Attributes:
         part: the frames.
         noise: of their depth.
         edges: of what kind they are.
         colored: bool [F], of which the color image is read.
-        device: where they are wanted.
+        device: where they are to be uploaded to.
     """
 
     part: PosedFrames
@@ -264,8 +264,8 @@ class _EdgeImages:
             edges = without_blurred_edges(depth, self.noise)
         elif self.edges is _EdgeKind.FLYING:
             edges = flying_pixels(depth, self.noise)
-        rest = (None if image is None else on_device(image, self.device) for image in (color, edges))
-        return _EdgeImage(on_device(depth, self.device), *rest)
+        rest = (None if image is None else to_be_uploaded(image, self.device) for image in (color, edges))
+        return _EdgeImage(to_be_uploaded(depth, self.device), *rest)
 
     @property
     def without_color(self) -> _EdgeImages:
@@ -273,11 +273,12 @@ class _EdgeImages:
         return replace(self, colored=np.zeros_like(self.colored))
 
     def read(self) -> Iterator[tuple[int, _EdgeImage]]:
-        """Positions and images in order; frames that can't be read are left out."""
+        """Positions and images on the device, in order; frames that can't be read are left out."""
         with prefetch(self, *reading_threads()) as images:
             for position, image in enumerate(images):
                 if not isinstance(image, DatasetError):
-                    yield position, image
+                    parts = (None if part is None else part.to(self.device, non_blocking=True) for part in image)
+                    yield position, _EdgeImage(*parts)
 
 
 def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages, along_rays: tuple[float, float]) -> None:
@@ -318,11 +319,16 @@ def frame_intrinsics(part: PosedFrames) -> ops.Intrinsics:
 
 def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """An array as a tensor, of the same memory on the CPU where it is contiguous."""
+    return to_be_uploaded(array, device).to(device, non_blocking=True)
+
+
+def to_be_uploaded(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """An array as a tensor on the CPU, from where a copy to the device waits for nothing that this does.
+
+    That is page-locked memory, which torch keeps for the next one; for the CPU it is the same memory.
+    """
     tensor = torch.from_numpy(np.ascontiguousarray(array))
-    # From page-locked memory, which torch keeps for the next one, the copy waits for nothing that the device does.
-    if device.type == "cuda" and array.size:
-        return tensor.pin_memory().to(device, non_blocking=True)
-    return tensor.to(device)
+    return tensor.pin_memory() if device.type == "cuda" and array.size else tensor
 
 
 def poses7_on(poses: np.ndarray, device: torch.device) -> torch.Tensor:

@@ -12,7 +12,7 @@ from spslam import ops
 from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
-from spslam.meshing.frame_fusion import PosedFrames, frame_intrinsics, on_device, poses7_on
+from spslam.meshing.frame_fusion import PosedFrames, frame_intrinsics, poses7_on, to_be_uploaded
 from spslam.meshing.reading import reading_threads
 
 
@@ -59,19 +59,20 @@ def read_seen(
     device = surface.points.device
     for part in parts:
         intrinsics, poses = frame_intrinsics(part), poses7_on(part.poses, device)
-        with prefetch(_Uploaded(part, device), *reading_threads()) as frames:
+        with prefetch(_ToBeUploaded(part, device), *reading_threads()) as frames:
             for position, images in enumerate(frames):
                 if not isinstance(images, DatasetError):
-                    yield ops.see_points(surface, *images, poses[position], intrinsics, part.noise or noise)
+                    depth, color = (image.to(device, non_blocking=True) for image in images)
+                    yield ops.see_points(surface, depth, color, poses[position], intrinsics, part.noise or noise)
 
 
 @dataclass(frozen=True)
-class _Uploaded:
-    """Depth and color of frames on a device, where the threads that read put them.
+class _ToBeUploaded:
+    """Depth and color of frames, as the threads that read leave them.
 
     Attributes:
         part: the frames.
-        device: where they are wanted.
+        device: where they are to be uploaded to.
     """
 
     part: PosedFrames
@@ -82,4 +83,4 @@ class _Uploaded:
 
     def __getitem__(self, position: int) -> tuple[torch.Tensor, torch.Tensor]:
         frame = self.part[position]
-        return on_device(frame.depth, self.device), on_device(frame.color, self.device)
+        return to_be_uploaded(frame.depth, self.device), to_be_uploaded(frame.color, self.device)

@@ -129,8 +129,9 @@ class FeatureAlignment:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
         if len(matches) < MIN_INLIERS:
             return None
+        matrix = self._matrix.copy()  # which this function may write to
         is_found, _, rotation, translation, inliers = cv2.solvePnPRansac(
-            matches.points, matches.positions, self._matrix.copy(), None, params=self._ransac
+            matches.points, matches.positions, matrix, None, params=self._ransac
         )
         if not is_found or inliers is None:
             return None
