@@ -75,7 +75,7 @@ def test_components_have_the_area_of_their_faces(mesh):
     area = np.linalg.norm(face_normals(mesh.vertices.astype(float), mesh.faces), axis=1) / 2
     of_faces = label[mesh.faces[:, 0]]
     wanted = [area[of_faces == each].sum() for each in of_faces]
-    np.testing.assert_allclose(component_areas(mesh.vertices, mesh.faces), wanted, rtol=1e-6)
+    np.testing.assert_allclose(component_areas(mesh.vertices, mesh.faces), wanted, rtol=1e-12)
 
 
 def test_two_components_are_told_apart():

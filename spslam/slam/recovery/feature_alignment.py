@@ -33,7 +33,7 @@ MAX_RATIO = 0.8  # of the distances to the best and to the second-best match
 MAX_ERROR_DEG = 0.33  # of a reprojected point, as seen from the camera: 3 px of a Kinect's 640
 MIN_ERROR_PX = 1.0  # which features of a small image have anyway
 MIN_INLIERS = 20  # fewer may agree by chance, or lie on one small thing
-# At most. More samples do not find more right poses (of 40 % inliers 100 of three find all but 0.2 %), but more of the
+# At most. More samples find more right poses where less than a quarter of the matches agree, but also more of the
 # wrong ones with which some twenty matches agree: those at one edge, after a jump.
 RANSAC_ITERATIONS = 100
 RANSAC_CONFIDENCE = 0.999
