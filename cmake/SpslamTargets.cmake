@@ -70,10 +70,13 @@ function(spslam_export target name set)
   endif()
 endfunction()
 
-# Compiles the torch ops as objects `name`, for LibTorch's stable ABI.
+# Compiles the torch ops as objects `name`, for LibTorch's stable ABI. They check and call: what takes time is in the
+# kernels, and half of the time of compiling them was torch's headers and optimizing what wraps an op.
 function(spslam_op_objects name)
   add_library(${name} OBJECT ${SPSLAM_BINDING_SOURCES})
   spslam_source_includes(${name})
+  target_compile_options(${name} PRIVATE -O1)
+  target_precompile_headers(${name} PRIVATE csrc/bindings/common.h)
   target_include_directories(${name} SYSTEM PRIVATE ${SPSLAM_TORCH_DIR}/include)
   target_compile_definitions(${name} PRIVATE TORCH_TARGET_VERSION=${SPSLAM_TORCH_TARGET})
   # Messages name files from here on, not the folders of the machine that built them.

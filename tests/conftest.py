@@ -1,5 +1,7 @@
 """Fixtures shared by all tests."""
 
+import gc
+
 import pytest
 import torch
 
@@ -13,6 +15,12 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "cuda" in item.keywords:
             item.add_marker(skip)
+
+
+def pytest_collection_finish():
+    # Thousands of tests and torch's modules stay to the end: the collector need not look at them again and again.
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(params=DEVICES)

@@ -73,10 +73,13 @@ def build_sdist(tools: Environment) -> Path:
 
 
 def build_wheel(environment: Environment, sdist: Path, short: bool) -> Path:
-    """Every CPU instruction set, and CUDA, in one wheel."""
+    """Every CPU instruction set, and CUDA, in one wheel; built below the checkout, as a compiler cache needs it."""
     folder = WORK / "wheel"
-    shutil.rmtree(folder, ignore_errors=True)
-    options = {"SPSLAM_CUDA": "ON"} | ({"SPSLAM_CUDA_ARCHS": "90-real"} if short else {})
+    temporary = WORK / "tmp"
+    for path in (folder, temporary):
+        shutil.rmtree(path, ignore_errors=True)
+    temporary.mkdir()
+    options = {"SPSLAM_CUDA": "ON", "TMPDIR": str(temporary)} | ({"SPSLAM_CUDA_ARCHS": "90-real"} if short else {})
     environment.pip("wheel", "--no-deps", "--wheel-dir", folder, sdist, **options)
     (wheel,) = folder.glob("*.whl")
     return wheel

@@ -74,6 +74,10 @@ class RealSenseSource(LiveSource, AbstractContextManager):
             size = width or WIDTH, height or HEIGHT
             if serial is not None:
                 config.enable_device(serial)
+            if not any(
+                serial in (None, each.get_info(sdk.camera_info.serial_number)) for each in sdk.context().devices
+            ):
+                raise SourceError(_not_connected(serial))  # starting would wait for one, 15 s
             config.enable_stream(sdk.stream.depth, *size, sdk.format.z16, rate_hz or RATE_HZ)
             config.enable_stream(sdk.stream.color, *size, sdk.format.rgb8, rate_hz or RATE_HZ)
         self._pipeline: Any = sdk.pipeline()
@@ -220,12 +224,16 @@ def _explained(error: str, recording: Path | None, serial: str | None, wanted: s
     if recording is not None:
         return f"{recording}: can't be played by pyrealsense2: {error}"
     if "No device connected" in error:
-        which = f"with the serial number {serial} " if serial else ""
-        return f"no RealSense camera {which}is connected; check its cable, and the SDK's udev rules (docs/live.md)"
+        return _not_connected(serial)
     if "resolve" in error:
         which = f"camera {serial}" if serial else "RealSense camera"
         return f"no {which} sends color and depth of {wanted}; choose another --size or --rate, or unplug the others"
     return f"the RealSense camera can't be started: {error}"
+
+
+def _not_connected(serial: str | None) -> str:
+    which = f"with the serial number {serial} " if serial else ""
+    return f"no RealSense camera {which}is connected; check its cable, and the SDK's udev rules (docs/live.md)"
 
 
 def _conversion(sdk: Any, color_format: Any, name: str) -> int | None:

@@ -10,6 +10,7 @@ from tests.ops.threads import assert_same_for_any_threads
 
 BOUNDS = [(-0.5, 0.2, -1.0), (1.5, 1.4, 0.7)]
 SIZES = [(5, 4, 6), (9, 8, 3), (2, 1, 11)]
+FEW = [(3, 2, 4), (4, 3, 3)]
 DTYPES = [torch.float32, torch.float64]
 OPCHECKS = ("test_schema", "test_autograd_registration", "test_faketensor", "test_aot_dispatch_dynamic")
 # float32: sums of up to 36 products, and coordinates scaled in another order than grid_sample does.
@@ -36,6 +37,12 @@ def arguments(kind, generator, device, dtype, channels=4, count=200, **more):
     table = torch.randn(grid.num_rows, channels, generator=generator, dtype=dtype)
     points = points_of(generator, dtype, count)
     return table.to(device).requires_grad_(), points.to(device).requires_grad_(), grid
+
+
+def few_rows(kind, generator, device, channels, count):
+    """Float64 arguments of two small levels, of volumes the second hashed: differences are taken row by row."""
+    more = dict(max_level_rows=32) if kind == "volumes" else {}
+    return arguments(kind, generator, device, torch.float64, channels, count, sizes=FEW, **more)
 
 
 def by_grid_sample(kind, table, points, grid):
@@ -127,8 +134,7 @@ def test_images_that_do_not_fit_are_refused():
 @each_kind
 @CONCATENATED
 def test_gradcheck_of_first_and_second_derivatives(kind, concatenate, device, generator):
-    more = dict(max_level_rows=32) if kind == "volumes" else {}
-    table, points, grid = arguments(kind, generator, device, torch.float64, 2, count=6, **more)
+    table, points, grid = few_rows(kind, generator, device, 2, 6)
 
     def run(table, points):
         return INTERPOLATE[kind](table, points, grid, concatenate)
@@ -205,8 +211,7 @@ def test_gradients_by_torch_func(kind, device, generator):
 @each_kind
 def test_third_derivatives(kind, device, generator):
     """The gradient by the table of a loss on second derivatives by coordinates, against a stencil of differences."""
-    table, points, grid = arguments(kind, generator, device, torch.float64, 1, count=4, max_level_rows=32) \
-        if kind == "volumes" else arguments(kind, generator, device, torch.float64, 1, count=4)  # fmt: skip
+    table, points, grid = few_rows(kind, generator, device, 1, 4)
 
     def curvature(table):
         value = INTERPOLATE[kind](table, points, grid).tanh()  # tanh, for a second derivative along an axis too
