@@ -10,7 +10,7 @@ namespace {
 
 constexpr char kName[] = "count_known_surface";
 
-// Places in the lists; spslam/ops/trusted.py fills them.
+// Places in the lists; spslam/ops/comparison.py fills them.
 enum class Integer { kThumbnailStep, kStep, kRows, kColumns, kMostRows, kCount };
 enum class Scalar { kMeters, kShare, kClear, kCount };
 

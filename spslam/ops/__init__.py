@@ -1,6 +1,6 @@
 """Public op library for sparse neural reconstruction, with CPU and CUDA kernels; independent of the rest of spslam."""
 
-from spslam.ops import trusted
+from spslam.ops import comparison, trusted
 from spslam.ops._library import CPU_ISA, CUDA_OFF_REASON, get_num_threads, set_num_threads
 from spslam.ops.alpha_composite import Composite, alpha_composite, neus_alpha, pack_rays, volsdf_density
 from spslam.ops.capture_timing import CaptureTiming, measure_capture_timing_
@@ -111,6 +111,7 @@ __all__ = [
     "alpha_composite",
     "bilinear_interpolate",
     "compare_depth_images",
+    "comparison",
     "copy_rows_",
     "depth_normals",
     "encode_frame_",

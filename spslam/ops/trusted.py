@@ -269,58 +269,6 @@ def unproject_pixels(
     return torch.ops.spslam.unproject_pixels(records, normals, pose, *intrinsics)
 
 
-class ComparedGrid(NamedTuple):
-    """Cells of `step` x `step` px over the image of a frame that is compared.
-
-    Attributes:
-        step: px.
-        rows, columns: of cells.
-    """
-
-    step: int
-    rows: int
-    columns: int
-
-
-def count_known_surface(
-    pixels: tuple[torch.Tensor, torch.Tensor],
-    pose: torch.Tensor,
-    frames: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    intrinsics: Intrinsics,
-    thumbnail_step: int,
-    grid: ComparedGrid,
-    tolerance: tuple[float, float, float],
-    most: int,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """How many surface points of other frames a frame sees, looks through, and has hidden by something nearer.
-
-    The points are those of the others' depth thumbnails. Of the frame's pixels the first one with a normal in each cell
-    counts. What is nearer hides a point only if it is no known surface itself, there or in a cell beside. Computed in
-    float64: the same on every device.
-
-    Args:
-        pixels: int32 [P, 3] packed, and their normals, float32 [P, 3], 0 where unknown.
-        pose: float32 [7] of the frame.
-        frames: poses float32 [F, 7], depth thumbnails float16 [F, h, w] (m), and int64 [M] which of these to compare.
-        intrinsics, thumbnail_step: of all frames, as of `frame_overlap`.
-        grid: cells over the frame's image.
-        tolerance: m, and as a share of the depth, within which a depth is that of a point; how many such tolerances
-            before or behind it are clearly not.
-        most: frames that are counted, those that share most surface with it.
-
-    Returns:
-        int64 [3] the counts, zeros where nothing is known; int64 [min(M, most)] places of the frames counted among the
-        M, those that share most first.
-    """
-    records, normals = pixels
-    poses, thumbnails, rows = frames
-    # The enums in csrc/bindings/known_surface.cpp.
-    return torch.ops.spslam.count_known_surface(
-        records, normals, pose, poses, thumbnails, rows, list(intrinsics), list(tolerance),
-        [thumbnail_step, *grid, most],
-    )  # fmt: skip
-
-
 def optimize_map_(
     scene: SceneView,
     records: torch.Tensor,
@@ -375,8 +323,3 @@ def _(poses, last, readout, records, *_):
 @torch.library.register_fake("spslam::measure_frame_")
 def _(counts, noise, state, timing, *_):
     return None
-
-
-@torch.library.register_fake("spslam::count_known_surface")
-def _(records, normals, pose, poses, depth_thumbnails, rows, intrinsics, scalars, integers):
-    return rows.new_empty(3), rows.new_empty(min(rows.shape[0], integers[-1]))

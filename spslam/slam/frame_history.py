@@ -81,6 +81,11 @@ class FrameHistory:
         return self._state.frames.poses
 
     @property
+    def records(self) -> torch.Tensor:
+        """int32 [F, P, 3] packed pixels of all frames, on the device."""
+        return self._state.pixels.records
+
+    @property
     def depth_thumbnails(self) -> torch.Tensor:
         """float16 [F, h, w] depth thumbnails (m) of all frames, 0 where unknown, on the device."""
         return self._state.frames.depth_thumbnails
@@ -88,10 +93,6 @@ class FrameHistory:
     def frame(self, row: int) -> EarlierFrame:
         """The frame in a row of the frame table."""
         return EarlierFrame(self._state.pixels.records[row], self._state.frames.poses[row])
-
-    def frames(self, rows: torch.Tensor, points: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of the frames in rows int64 [F] of the frame table: so many of their records [F, P, 3], and poses [F, 7]."""
-        return self._state.pixels.records[rows, :points], self._state.frames.poses[rows]
 
     def last(self) -> EarlierFrame | None:
         """The last frame with pixels and a trusted pose; None where there is none."""

@@ -65,9 +65,9 @@ def system(dataset):
 
 def sums_at(system, frame, pose, rows=(3, 6)):
     pixels = sample_frame(frame, system.camera, system.config).to(system.device)
-    records, poses = system.history.frames(torch.tensor(rows, dtype=torch.int64, device=system.device), POINTS)
+    history, rows = system.history, torch.tensor(rows, dtype=torch.int64, device=system.device)
     depth_m = system.config.dataset.max_depth_m
-    return brightness_sums(pixels, pose, records, poses, system.camera, depth_m).tolist()
+    return brightness_sums(pixels, pose, history.records, history.poses, rows, system.camera, depth_m).tolist()
 
 
 def likeness_of(system, frame, pose):
@@ -80,7 +80,7 @@ def test_sums_are_those_of_points_that_the_frame_sees(dataset, system):
     camera, expected = system.camera, []  # pairs of brightness, by cell of the earlier image
     gray = frame.color @ np.array([0.299, 0.587, 0.114]) / 255
     for row in (3, 6):
-        records, earlier = (tensor[0] for tensor in system.history.frames(torch.tensor([row]), POINTS))
+        records, earlier = system.history.records[row, :POINTS], system.history.poses[row]
         to_frame = inverse(pose7_to_matrix(pose.numpy().astype(float))) @ pose7_to_matrix(earlier.numpy().astype(float))
         colors = [[(word >> shift) & 255 for shift in (0, 8, 16)] for word in records[:, 2].tolist()]
         pairs = {}

@@ -167,7 +167,7 @@ def pose_by_features(source: Keyframe, target: Keyframe) -> tuple[torch.Tensor |
     origin = pose_tensor(np.eye(4), torch.device("cpu"))
     matches = image.matches(target.features, origin)
     pose = image.pose(matches, torch.device("cpu"))
-    inliers = 0 if pose is None else image.inliers(matches, pose)
+    inliers = 0 if pose is None else image.inliers(matches, image.color_pose(pose))
     return (pose, inliers) if inliers >= MIN_INLIERS else (None, inliers)
 
 

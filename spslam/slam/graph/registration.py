@@ -224,11 +224,13 @@ class Registrar:
         """The pose that image features agree on, if most of them disagree with `pose`: brightness has a small basin."""
         image = FeatureAlignment(source.features, source.camera.camera)
         matches = image.matches(target.features, self._origin)
-        agreeing = image.inliers(matches, pose)
+        agreeing = image.inliers(matches, image.color_pose(pose))
         if agreeing > MIN_AGREEING * len(matches):
             return None
         found = image.pose(matches, pose.device)
-        return None if found is None or image.inliers(matches, found) < MORE_AGREEING * agreeing else found
+        if found is None or image.inliers(matches, image.color_pose(found)) < MORE_AGREEING * agreeing:
+            return None
+        return found
 
     def _aligned(self, pairs: Sequence[Pair], starts: torch.Tensor, stage: _Stage) -> torch.Tensor:
         """T_target_source float32 [B, 7] after a stage."""

@@ -77,18 +77,19 @@ class DoubtfulFrame:
         """The fit of a pose float32 [7] with what the matches say of it; the fit where there are no image features."""
         if self.image is None:
             return fit
-        inliers = [self.image.inliers(one, pose) for one in self.matches]
+        at = self.image.color_pose(pose)
+        inliers = [self.image.inliers(one, at) for one in self.matches]
         shares: list[float] = []
         if self.colors_are_registered:
             most = max((one.agreeing for one in self.matches), default=0)
             telling = [one for one in self.matches if one.agreeing > FEW_FEATURES * most]
-            within = [self.image.inliers(one, pose, self.late_px) for one in telling]
+            within = [self.image.inliers(one, at, self.late_px) for one in telling]
             shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, telling, strict=True)]
         return replace(
             fit,
             feature_inliers=max(inliers, default=0),
             feature_share=min(shares, default=math.nan),
-            feature_rays=max((self.image.ray_inliers(one, pose) for one in self.matches), default=0),
+            feature_rays=max((self.image.ray_inliers(one, at) for one in self.matches), default=0),
         )
 
     @property

@@ -150,7 +150,7 @@ class FeatureAlignment:
 
     def counted(self, matches: FeatureMatches, pose: torch.Tensor) -> FeatureMatches:
         """The matches, with how many agree with the pose float32 [7] that they give."""
-        return replace(matches, agreeing=self.inliers(matches, pose))
+        return replace(matches, agreeing=self.inliers(matches, self.color_pose(pose)))
 
     def held(
         self, pose: torch.Tensor, information: np.ndarray, matches: Sequence[FeatureMatches], late_px: float = 0.0
@@ -172,7 +172,7 @@ class FeatureAlignment:
         error_px = max(self.max_error_px, late_px)
         for _ in range(HELD_ITERATIONS):
             lever = 1.0 if self._motion is None else self._motion.lever(at)
-            color_pose = self._color_pose(at)
+            color_pose = self._of_color(at)
             agreeing, features, toward = point_equations(self._matrix, points, color_pose, error_px)
             if agreeing < MIN_INLIERS:
                 return None
@@ -187,27 +187,30 @@ class FeatureAlignment:
                 break
         return pose_tensor(at, pose.device)
 
-    def _color_pose(self, pose: np.ndarray) -> np.ndarray:
+    def color_pose(self, pose: torch.Tensor) -> np.ndarray:
+        """Pose float64 [4, 4] of the frame's color image, of a pose float32 [7]; waits for the device."""
+        return self._of_color(pose_matrix(pose))
+
+    def _of_color(self, pose: np.ndarray) -> np.ndarray:
         return pose if self._motion is None else self._motion.color_pose(pose)
 
-    def inliers(self, matches: FeatureMatches, pose: torch.Tensor, late_px: float = 0.0) -> int:
-        """How many matches agree with a pose float32 [7]: their points reproject to within `max_error_px`, and what the
-        noise of their depth may add along their epipolar lines.
+    def inliers(self, matches: FeatureMatches, color_pose: np.ndarray, late_px: float = 0.0) -> int:
+        """How many matches agree with a pose: their points reproject to within `max_error_px`, and what the noise of
+        their depth may add along their epipolar lines.
 
         Args:
             matches: with an earlier frame.
-            pose: of this frame.
+            color_pose: of this frame, see `color_pose`.
             late_px: or to within so much, which the image may have moved since depth was measured.
         """
-        most_px = max(self.max_error_px, late_px)
-        return agreeing_points(self._matrix, matches, self._color_pose(pose_matrix(pose)), most_px)
+        return agreeing_points(self._matrix, matches, color_pose, max(self.max_error_px, late_px))
 
-    def ray_inliers(self, matches: FeatureMatches, pose: torch.Tensor) -> int:
-        """How many rays agree with a pose float32 [7]: reprojected, what lies on them beyond the range of depth may be
-        within `max_error_px` of where the frame shows it."""
+    def ray_inliers(self, matches: FeatureMatches, color_pose: np.ndarray) -> int:
+        """How many rays agree with a pose, see `inliers`: reprojected, what lies on them beyond the range of depth may
+        be within `max_error_px` of where the frame shows it."""
         if matches.rays is None or not len(matches.rays):
             return 0
-        return ray_equations(self._matrix, matches.rays, self._color_pose(pose_matrix(pose)), self.max_error_px)[0]
+        return ray_equations(self._matrix, matches.rays, color_pose, self.max_error_px)[0]
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""

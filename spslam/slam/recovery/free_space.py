@@ -54,13 +54,13 @@ def surface_counts(
         among `rows` of the frames that were counted, those that share most surface first.
     """
     grid = CellGrid.of(camera)
-    return ops.trusted.count_known_surface(
+    return ops.comparison.count_known_surface(
         (pixels.records, pixels.normals),
         pose,
         (poses, depth_thumbnails, rows),
         ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy),
         THUMBNAIL_STEP_PX,
-        ops.trusted.ComparedGrid(grid.step, grid.rows, grid.columns),
+        ops.comparison.ComparedGrid(grid.step, grid.rows, grid.columns),
         (TOLERANCE_M, TOLERANCE_SHARE, CLEAR_TOLERANCES),
         BEST_FRAMES,
     )

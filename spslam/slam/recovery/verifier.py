@@ -12,7 +12,7 @@ from spslam.scene import Scene
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
-from spslam.slam.recovery.appearance import POINTS, brightness_correlation, brightness_sums
+from spslam.slam.recovery.appearance import brightness_correlation, brightness_sums
 from spslam.slam.recovery.free_space import surface_counts, surface_shares
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
 
@@ -68,8 +68,8 @@ class Verifier:
     def _brightness_sums(
         self, pixels: FramePixels, pose: torch.Tensor, rows: torch.Tensor, history: FrameHistory
     ) -> torch.Tensor:
-        records, poses = history.frames(rows, POINTS)
-        return brightness_sums(pixels, pose, records, poses, self._camera, self._config.dataset.max_depth_m)
+        max_depth_m = self._config.dataset.max_depth_m
+        return brightness_sums(pixels, pose, history.records, history.poses, rows, self._camera, max_depth_m)
 
     def _map_coverage(self, scene: Scene, history: FrameHistory) -> torch.Tensor:
         """Share of the last trusted frame's pixels on mapped surface, float32 [1]; NaN where there is no such frame."""
