@@ -74,7 +74,7 @@ example-cpp: $(ENVIRONMENT) ## install the kernels for C++ into build/prefix, wi
 	  else echo "pkg-config is not installed: spslam.pc goes untested"; fi
 
 test-numpy: dev ## install bindings/numpy and test it against the torch ops
-	SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install $(PIP) --no-deps \
+	$(RUN) SPSLAM_CPU_ISAS=$(NATIVE_ISA) $(PYTHON) -m pip install $(PIP) --no-deps \
 	  --force-reinstall ./bindings/numpy
 	$(PYTHON) -m pytest bindings/numpy/tests
 
