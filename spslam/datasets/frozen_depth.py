@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,15 +15,14 @@ from spslam.errors import DatasetError
 
 FROZEN = "the depth image is the same as in the frame before while the color image changed: the depth stream is frozen"
 # Every n-th row is compared: noise makes no two depth images of a sensor alike even there.
-_ROW_STEP = 4
+_DEPTH_ROW_STEP, _COLOR_ROW_STEP = 8, 4
 _CELLS = (16, 12)
 # Mean change of brightness of a cell, in levels of 255. Noise averages out to under a fifth of it, and a hand-held
 # camera passes it within one to five frames.
 _MOVED_LEVELS = 1.5
 
 
-@dataclass(frozen=True)
-class FrameSignature:
+class Signature(Protocol):
     """What is compared of a frame.
 
     Attributes:
@@ -29,23 +30,57 @@ class FrameSignature:
         brightness: float32 [12, 16], mean brightness of the cells of a grid, less the image's mean.
     """
 
+    @property
+    def depth(self) -> int: ...
+
+    @property
+    def brightness(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class FrameSignature:
+    """A `Signature` that is kept, or sent to another process, without its frame."""
+
     depth: int
     brightness: np.ndarray
 
     @classmethod
     def of(cls, frame: RgbdFrame) -> FrameSignature:
         """The signature of a frame."""
-        depth = np.ascontiguousarray(frame.depth[::_ROW_STEP])
-        rows = cv2.resize(frame.color[::_ROW_STEP], _CELLS, interpolation=cv2.INTER_AREA)
-        cells = cv2.cvtColor(rows, cv2.COLOR_RGB2GRAY)
-        brightness = cells.astype(np.float32)
-        return cls(zlib.crc32(depth.tobytes()) if depth.any() else 0, brightness - brightness.mean())
+        return cls(_checksum(frame.depth), _brightness(frame.color))
 
-    def has_moved_from(self, other: FrameSignature) -> bool:
-        """Whether the color images differ by more than noise and exposure, which is a gain and an offset."""
-        square = float(np.vdot(other.brightness, other.brightness))
-        gain = float(np.vdot(self.brightness, other.brightness)) / max(square, 1.0)
-        return float(np.abs(self.brightness - gain * other.brightness).mean()) > _MOVED_LEVELS
+
+class ArrivingSignature:
+    """A `Signature` of a frame whose pose is waited for: brightness is looked at where depth does not tell.
+
+    Args:
+        frame: its color image is kept, and must not change.
+    """
+
+    def __init__(self, frame: RgbdFrame) -> None:
+        self.depth, self._color = _checksum(frame.depth), frame.color
+
+    @cached_property
+    def brightness(self) -> np.ndarray:
+        return _brightness(self._color)
+
+
+def _checksum(depth: np.ndarray) -> int:
+    rows = np.ascontiguousarray(depth[::_DEPTH_ROW_STEP])
+    return zlib.crc32(rows.data) if rows.any() else 0
+
+
+def _brightness(color: np.ndarray) -> np.ndarray:
+    rows = cv2.resize(color[::_COLOR_ROW_STEP], _CELLS, interpolation=cv2.INTER_AREA)
+    cells = cv2.cvtColor(rows, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return cells - cells.mean()
+
+
+def has_moved(now: np.ndarray, before: np.ndarray) -> bool:
+    """Whether images of these brightnesses differ by more than noise and exposure, which is a gain and an offset."""
+    square = float(np.vdot(before, before))
+    gain = float(np.vdot(now, before)) / max(square, 1.0)
+    return float(np.abs(now - gain * before).mean()) > _MOVED_LEVELS
 
 
 class FrozenDepth:
@@ -55,16 +90,16 @@ class FrozenDepth:
         first: of the frames before; None where there are none.
     """
 
-    def __init__(self, first: FrameSignature | None = None) -> None:
+    def __init__(self, first: Signature | None = None) -> None:
         self._first = first
 
-    def check(self, signature: FrameSignature) -> bool:
+    def check(self, signature: Signature) -> bool:
         """Whether the depth of the next frame is frozen. A camera that stands still before an exact sensor is not."""
         first = self._first
         if first is None or not signature.depth or signature.depth != first.depth:
             self._first = signature
             return False
-        return signature.has_moved_from(first)
+        return has_moved(signature.brightness, first.brightness)
 
 
 def frozen_depth_before(dataset: RgbdDataset, start: int) -> FrozenDepth:

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from spslam.datasets.base import clear_border
-from spslam.datasets.frozen_depth import FROZEN, FrameSignature, FrozenDepth
+from spslam.datasets.frozen_depth import FROZEN, ArrivingSignature, FrozenDepth
 from spslam.errors import DatasetError, SpslamError
 from spslam.live.capture import Capture
 from spslam.live.frame_queue import FrameQueue
@@ -144,42 +144,46 @@ class LiveLoop:
         requested, began = self._record(), time.perf_counter()
         item = self._queue.take(_POLL_S)
         if item is not None:
-            self._write_row(log)
-            self._process(item, requested, 1e3 * (time.perf_counter() - began))
+            self._process(item, requested, 1e3 * (time.perf_counter() - began), log)
             self._map(self._least)
 
-    def _process(self, item: LiveFrame | DatasetError, requested: Any, wait_ms: float) -> None:
+    def _process(self, item: LiveFrame | DatasetError, requested: Any, wait_ms: float, log: RunLog) -> None:
         status = self.status
         status.dropped = self._dropped()
-        error = item if isinstance(item, DatasetError) else self._fault(item)
-        if error is not None:
-            self.folder.record_skipped(self.system.state.frames.processed + status.skipped, error)
-            status.skipped += 1
-            self._next_index += 1
-            status.report = None
-        elif isinstance(item, LiveFrame):
+        if isinstance(item, DatasetError):
+            self._skip(item)
+        elif self._frozen_depth.check(ArrivingSignature(item.frame)):
+            self._skip(DatasetError(f"{self.capture.source.name}, frame {item.frame.index}: {FROZEN}"))
+        else:
             queue_ms = 1e3 * (time.monotonic() - item.complete_s)
-            frame = self._prepare(item, requested, wait_ms)
-            known: list[float] = []
-            pending = self.system.submit(frame, lambda pose: known.append(time.monotonic()), defer_mapping=True)
-            latency_ms = 1e3 * (known[0] - item.complete_s)
-            status.report = pending.result()
-            status.latencies.add(latency_ms)
-            # By its number: the source may be ahead, and have left out frames that come after this one.
-            dropped, self._next_index = frame.index - self._next_index, frame.index + 1
-            self._row = _Row(status.report, {"latency_ms": latency_ms, "queue_ms": queue_ms, "dropped": dropped})
-            self.previews.add(status.frames, item.frame)
-            self.poses.append(item.frame.pose)
-            status.frames += 1
-            self.observer.observe(status.report, item.frame)
+            self._submit(item, self._prepare(item, requested, wait_ms), queue_ms, log)
         self.clock.update(status.frames + status.skipped, self.clock.decode_s)
         self._tell()
 
-    def _fault(self, item: LiveFrame) -> DatasetError | None:
-        """Why the frame can't be used; None where it can."""
-        if self._frozen_depth.check(FrameSignature.of(item.frame)):
-            return DatasetError(f"{self.capture.source.name}, frame {item.frame.index}: {FROZEN}")
-        return None
+    def _skip(self, error: DatasetError) -> None:
+        """Records a frame that can't be used."""
+        status = self.status
+        self.folder.record_skipped(self.system.state.frames.processed + status.skipped, error)
+        status.skipped += 1
+        self._next_index += 1
+        status.report = None
+
+    def _submit(self, item: LiveFrame, frame: PreparedFrame, queue_ms: float, log: RunLog) -> None:
+        """Tracks a frame; what need not be done before its pose is known is done then."""
+        status = self.status
+        known: list[float] = []
+        pending = self.system.submit(frame, lambda pose: known.append(time.monotonic()), defer_mapping=True)
+        latency_ms = 1e3 * (known[0] - item.complete_s)
+        self._write_row(log)  # of the frame before, whose mapping has ended; the pose does not wait for it
+        status.report = pending.result()
+        status.latencies.add(latency_ms)
+        # By its number: the source may be ahead, and have left out frames that come after this one.
+        dropped, self._next_index = frame.index - self._next_index, frame.index + 1
+        self._row = _Row(status.report, {"latency_ms": latency_ms, "queue_ms": queue_ms, "dropped": dropped})
+        self.previews.add(status.frames, item.frame)
+        self.poses.append(item.frame.pose)
+        status.frames += 1
+        self.observer.observe(status.report, item.frame)
 
     def _prepare(self, item: LiveFrame, requested: Any, wait_ms: float) -> PreparedFrame:
         began, system, frame = time.perf_counter(), self.system, item.frame

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from spslam.datasets.folder import PLAUSIBLE_MEDIAN_M
+from spslam.datasets.frozen_depth import has_moved
 from spslam.datasets.plausibility.findings import Finding
 from spslam.datasets.plausibility.views import Stretch, View
 
@@ -148,7 +149,7 @@ def repetition_findings(stretch: Stretch, is_whole: bool) -> list[Finding]:
     same_depth = np.array([a.signature.depth == b.signature.depth and a.signature.depth != 0 for a, b in pairs])
     same_color = np.array([a.color_checksum == b.color_checksum for a, b in pairs])
     shown = np.array([a.gray.std() > _BLANK_LEVELS for a, _ in pairs])
-    color_moves = np.array([b.signature.has_moved_from(a.signature) for a, b in pairs])
+    color_moves = np.array([has_moved(b.signature.brightness, a.signature.brightness) for a, b in pairs])
     findings = []
     depth_frozen = float(np.mean(same_depth & ~same_color & color_moves))
     color_frozen = float(np.mean(same_color & shown & ~same_depth))
