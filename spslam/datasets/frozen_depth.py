@@ -47,22 +47,21 @@ class FrameSignature:
     @classmethod
     def of(cls, frame: RgbdFrame) -> FrameSignature:
         """The signature of a frame."""
-        return cls(_checksum(frame.depth), _brightness(frame.color))
+        return cls(_checksum(frame.depth), _brightness(frame.color[::_COLOR_ROW_STEP]))
 
 
 class ArrivingSignature:
     """A `Signature` of a frame whose pose is waited for: brightness is looked at where depth does not tell.
 
-    Args:
-        frame: its color image is kept, and must not change.
+    It keeps rows of the color image, not the frame, whose memory a camera may use again.
     """
 
     def __init__(self, frame: RgbdFrame) -> None:
-        self.depth, self._color = _checksum(frame.depth), frame.color
+        self.depth, self._rows = _checksum(frame.depth), frame.color[::_COLOR_ROW_STEP].copy()
 
     @cached_property
     def brightness(self) -> np.ndarray:
-        return _brightness(self._color)
+        return _brightness(self._rows)
 
 
 def _checksum(depth: np.ndarray) -> int:
@@ -70,9 +69,8 @@ def _checksum(depth: np.ndarray) -> int:
     return zlib.crc32(rows.data) if rows.any() else 0
 
 
-def _brightness(color: np.ndarray) -> np.ndarray:
-    rows = cv2.resize(color[::_COLOR_ROW_STEP], _CELLS, interpolation=cv2.INTER_AREA)
-    cells = cv2.cvtColor(rows, cv2.COLOR_RGB2GRAY).astype(np.float32)
+def _brightness(rows: np.ndarray) -> np.ndarray:
+    cells = cv2.cvtColor(cv2.resize(rows, _CELLS, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(np.float32)
     return cells - cells.mean()
 
 

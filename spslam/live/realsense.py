@@ -74,10 +74,6 @@ class RealSenseSource(LiveSource, AbstractContextManager):
             size = width or WIDTH, height or HEIGHT
             if serial is not None:
                 config.enable_device(serial)
-            if not any(
-                serial in (None, each.get_info(sdk.camera_info.serial_number)) for each in sdk.context().devices
-            ):
-                raise SourceError(_not_connected(serial))  # starting would wait for one, 15 s
             config.enable_stream(sdk.stream.depth, *size, sdk.format.z16, rate_hz or RATE_HZ)
             config.enable_stream(sdk.stream.color, *size, sdk.format.rgb8, rate_hz or RATE_HZ)
         self._pipeline: Any = sdk.pipeline()
@@ -88,6 +84,8 @@ class RealSenseSource(LiveSource, AbstractContextManager):
                 player.set_real_time(real_time)
                 # It would play from the start of its first stream on, and lose what the other had until its own start.
                 player.pause()
+            elif not _is_connected(sdk, serial):
+                raise SourceError(_not_connected(serial))  # starting would wait for one, 15 s
             profile = self._pipeline.start(config)
             if recording is not None:
                 _resume(player)
@@ -229,6 +227,14 @@ def _explained(error: str, recording: Path | None, serial: str | None, wanted: s
         which = f"camera {serial}" if serial else "RealSense camera"
         return f"no {which} sends color and depth of {wanted}; choose another --size or --rate, or unplug the others"
     return f"the RealSense camera can't be started: {error}"
+
+
+def _is_connected(sdk: Any, serial: str | None) -> bool:
+    """Whether there is a camera, or that one. Some devices have no serial number."""
+    number = sdk.camera_info.serial_number
+    devices = list(sdk.context().devices)
+    known = [device.get_info(number) for device in devices if device.supports(number)]
+    return serial in known if serial is not None else len(devices) > 0
 
 
 def _not_connected(serial: str | None) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spslam.datasets.base import RgbdFrame
-from spslam.datasets.frozen_depth import FrameSignature, FrozenDepth, frozen_depth_before
+from spslam.datasets.frozen_depth import ArrivingSignature, FrameSignature, FrozenDepth, frozen_depth_before
 from spslam.datasets.generated import GeneratedDataset
 from spslam.errors import DatasetError
 
@@ -22,8 +22,14 @@ def with_depth_of(frame, other):
 
 
 def checks(frames):
-    frozen = FrozenDepth()
-    return [frozen.check(FrameSignature.of(frame)) for frame in frames]
+    """By signatures that are kept, and by those of a camera that has all its images in the same memory."""
+    frozen, arriving, answers = FrozenDepth(), FrozenDepth(), []
+    color, depth = np.empty_like(frames[0].color), np.empty_like(frames[0].depth)
+    for frame in frames:
+        color[:], depth[:] = frame.color, frame.depth
+        answers.append(frozen.check(FrameSignature.of(frame)))
+        assert arriving.check(ArrivingSignature(RgbdFrame(frame.index, frame.timestamp, color, depth))) is answers[-1]
+    return answers
 
 
 def test_a_moving_camera(frames):

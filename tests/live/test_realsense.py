@@ -4,6 +4,7 @@ import functools
 import json
 import sys
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.errors import SourceError
 from spslam.live import realsense
-from spslam.live.realsense import RealSenseSource, _explained
+from spslam.live.realsense import RealSenseSource, _explained, _is_connected
 from tests.cli.command import assert_refused, spslam
 from tests.live.realsense_sdk import load_sdk, record
 from tests.system.sequences import Recorded
@@ -145,6 +146,30 @@ def test_files_that_cannot_be_played_are_named(sdk, tmp_path):
 def test_without_a_camera_one_line_says_so(sdk, tmp_path):
     assert_refused(spslam("live", "realsense", cwd=tmp_path), "no RealSense camera is connected; check its cable")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("numbers", "serial", "found"),
+    [([], None, False), ([None], None, True), (["7"], None, True), ([None, "7"], "7", True), ([None, "8"], "7", False)],
+)
+def test_a_camera_is_looked_for_among_those_connected(numbers, serial, found):
+    """Of some devices the SDK has no serial number, and raises where it is asked for one."""
+
+    class Device:
+        def __init__(self, number):
+            self.number = number
+
+        def supports(self, info):
+            return self.number is not None
+
+        def get_info(self, info):
+            if self.number is None:
+                raise RuntimeError("info not supported by the device")
+            return self.number
+
+    devices = SimpleNamespace(devices=[Device(number) for number in numbers])
+    sdk = SimpleNamespace(context=lambda: devices, camera_info=SimpleNamespace(serial_number=0))
+    assert _is_connected(sdk, serial) is found
 
 
 def test_what_the_sdk_refuses_is_explained():

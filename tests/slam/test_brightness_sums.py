@@ -7,11 +7,10 @@ import torch
 from spslam import ops
 from spslam.geometry import inverse, pose7_to_matrix, transform_points
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_unit
-from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.appearance import CELLS, MAX_DEPTH_DIFFERENCE
 from tests.ops.arguments import opcheck
-from tests.slam.test_known_surface import moved
+from tests.slam.compared_frames import moved, poses_of, sampled
 from tests.system.sequences import Recorded, settings
 
 FRAMES = 6
@@ -28,14 +27,13 @@ def recorded():
 
 @pytest.fixture(scope="module")
 def pixels(recorded):
-    return [sample_frame(frame, recorded.camera, settings()) for frame in recorded]
+    return sampled(recorded)
 
 
 def known(recorded, pixels, device):
     """Records and poses of all frames."""
     count = min(len(each.records) for each in pixels)
-    poses = torch.stack([pose_tensor(pose, CPU) for pose in recorded.poses()]).to(device)
-    return torch.stack([each.records[:count] for each in pixels]).to(device), poses
+    return torch.stack([each.records[:count] for each in pixels]).to(device), poses_of(recorded, device)
 
 
 def shown_of(frame, camera):
@@ -100,7 +98,7 @@ def test_frames_add_up_and_rows_out_of_range_add_nothing(recorded, pixels, devic
     records, poses = known(recorded, pixels, device)
     call = pixels[2].to(device), poses[2], records, poses
     alone = [sums_by_op(*call, [row], recorded.camera) for row in (1, 4)]
-    both = sums_by_op(*call, [1, -1, 4, FRAMES], recorded.camera)
+    both = sums_by_op(*call, [1, -1, 4, FRAMES], recorded.camera)  # in another order, so to rounding
     torch.testing.assert_close(both, alone[0] + alone[1], rtol=1e-12, atol=0)
     assert sums_by_op(*call, [], recorded.camera).tolist() == [0.0] * 5
     assert sums_by_op(*call, [1], recorded.camera, points=0).tolist() == [0.0] * 5
@@ -132,6 +130,7 @@ def test_cuda_sums_the_same(recorded, pixels):
             pose = pose_tensor(moved(recorded.poses()[seed], seed), device)
             found.append(sums_by_op(pixels[seed].to(device), pose, records, poses, range(FRAMES), recorded.camera))
         assert found[0][0] == found[1][0].cpu()
+        # Of the same whole numbers, but for fused multiply-adds at the end.
         torch.testing.assert_close(found[0], found[1].cpu(), rtol=1e-12, atol=0)
 
 

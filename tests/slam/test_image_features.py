@@ -256,7 +256,7 @@ def test_they_contradict_a_pose_only_where_colors_are_where_depth_is(dataset, fe
     matches = image.matches(features[2], pose_of(dataset, 2))
     noise = torch.tensor([1e-6, 1e-6, 1e-4, colors_off_px**2])
     problem = SimpleNamespace(constraints=Constraints(noise=noise))
-    frame = DoubtfulFrame(problem, None, None, None, image, (image.counted(matches, pose_of(dataset, 4)),))
+    frame = DoubtfulFrame(problem, None, None, None, image, (image.counted(matches, pose_matrix(pose_of(dataset, 4))),))
     fit = frame.with_features(Fit(), pose_of(dataset, 12))
     assert fit.feature_inliers < MIN_INLIERS
     assert fit.feature_share < 0.5 if counts else np.isnan(fit.feature_share)
@@ -271,7 +271,9 @@ def test_colors_of_a_turning_camera_may_be_late(dataset, features, seconds, is_t
     noise = torch.tensor([1e-6, 1e-6, 1e-4, 0.01])
     history = SimpleNamespace(seconds_since=lambda row: seconds)
     problem = SimpleNamespace(constraints=Constraints(noise=noise))
-    frame = DoubtfulFrame(problem, None, history, None, image, (image.counted(found, pose_of(dataset, 4)),))
+    frame = DoubtfulFrame(
+        problem, None, history, None, image, (image.counted(found, pose_matrix(pose_of(dataset, 4))),)
+    )
     late = frame.with_speed(2, [found])
     assert late.late_px == pytest.approx(0.02 * found.motion_px / seconds if is_turn else 0.0)
     assert frame.with_speed(2, []).late_px == 0
@@ -299,7 +301,7 @@ def test_features_that_may_be_late_hold_a_pose_less(dataset, features):
 def test_few_features_of_a_frame_that_is_hardly_seen_contradict_nothing(dataset, features, share, contradicts):
     """Matches with an earlier frame that agree on another pose, beside many that agree with the right one."""
     image, pose = FeatureAlignment(features[4], dataset.camera), pose_of(dataset, 4)
-    many = image.counted(image.matches(features[2].with_depth(), pose_of(dataset, 2)), pose)
+    many = image.counted(image.matches(features[2].with_depth(), pose_of(dataset, 2)), image.color_pose(pose))
     assert many.agreeing > 40
     count = int(share * many.agreeing)
     few = some_of(many, np.arange(count))

@@ -16,6 +16,7 @@ from spslam.slam.recovery.free_space import (
 )
 from spslam.slam.recovery.icp_alignment import surface_maps
 from tests.ops.arguments import opcheck
+from tests.slam.compared_frames import moved, poses_of, sampled
 from tests.system.sequences import Recorded, settings
 
 FRAMES = 12
@@ -32,26 +33,12 @@ def recorded():
 
 @pytest.fixture(scope="module")
 def pixels(recorded):
-    return [sample_frame(frame, recorded.camera, settings()) for frame in recorded]
+    return sampled(recorded)
 
 
 def known(recorded, pixels, device):
     """Poses and depth thumbnails of all frames."""
-    poses = torch.stack([pose_tensor(pose, CPU) for pose in recorded.poses()]).to(device)
-    return poses, torch.stack([each.depth_thumbnail for each in pixels]).to(device)
-
-
-def moved(pose, seed):
-    """A pose up to half a meter and 20 degrees off."""
-    random = np.random.default_rng(seed)
-    turn = random.normal(0, 0.15, 3)
-    angle = np.linalg.norm(turn)
-    x, y, z = turn / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    change = np.eye(4)
-    change[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    change[:3, 3] = random.normal(0, 0.2, 3)
-    return pose @ change
+    return poses_of(recorded, device), torch.stack([each.depth_thumbnail for each in pixels]).to(device)
 
 
 def expected(frame, pose, poses, thumbnails, rows, camera):

@@ -148,9 +148,9 @@ class FeatureAlignment:
         found = inverse(to_camera)
         return pose_tensor(found if self._motion is None else self._motion.depth_pose(found), device)
 
-    def counted(self, matches: FeatureMatches, pose: torch.Tensor) -> FeatureMatches:
-        """The matches, with how many agree with the pose float32 [7] that they give."""
-        return replace(matches, agreeing=self.inliers(matches, self.color_pose(pose)))
+    def counted(self, matches: FeatureMatches, color_pose: np.ndarray) -> FeatureMatches:
+        """The matches, with how many agree with the pose that they give, see `color_pose`."""
+        return replace(matches, agreeing=self.inliers(matches, color_pose))
 
     def held(
         self, pose: torch.Tensor, information: np.ndarray, matches: Sequence[FeatureMatches], late_px: float = 0.0

@@ -180,7 +180,8 @@ class Recovery:
         if pose is None:
             return None, sum(map(len, matches)) >= MIN_DECIDING
         estimate = self._tracker.measure(frame.problem, pose)
-        frame = replace(frame, matches=tuple(image.counted(one, pose) for one in matches))
+        at = image.color_pose(pose)
+        frame = replace(frame, matches=tuple(image.counted(one, at) for one in matches))
         held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.read)
         held = self._judged(held)
         fits = held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted
@@ -284,7 +285,7 @@ class Recovery:
         for matched in joined_too(found):
             start = frame.image.pose(matched, frame.problem.predicted.device)
             if start is not None:
-                matches.append(frame.image.counted(matched, start))
+                matches.append(frame.image.counted(matched, frame.image.color_pose(start)))
                 starts.append(start)
         return replace(frame, matches=tuple(matches)), starts
 
