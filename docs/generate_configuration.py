@@ -36,7 +36,8 @@ example, `configs/replica.yaml` sets the paper's iterations for Replica and does
 options, wrong types and values out of range are errors before anything runs. So is an option from a file or `--set`
 that has no effect with the other options: "only with" below names the condition. The resolved options of a run are in
 its `config.yaml`, marked with `resolved: true`, which can be given to `spslam run` again. Sections and equations in the
-tables are those of the paper.
+tables are those of the paper. The column *default* is of the default preset, `balanced`; what the
+[others](#presets) have instead is listed there.
 
 From Python:
 
@@ -59,11 +60,12 @@ def page() -> str:
     defaults = _load("defaults.yaml")
     presets = {name: _load(f"presets/{name}.yaml") for name in PRESETS}
     parts = [HEADER.format(names=", ".join(f"`{name}`" for name in config_names()))]
-    parts.append(_section("Options of the whole run", Config, "", defaults))
+    values = _merged(defaults, presets["balanced"])
+    parts.append(_section("Options of the whole run", Config, "", values))
     for name, field in Config.model_fields.items():
         if _is_section(field.annotation):
             title = f"`{name}`: {_sentence(field.annotation)}"
-            parts.append(_section(title, field.annotation, f"{name}.", defaults.get(name) or {}))
+            parts.append(_section(title, field.annotation, f"{name}.", values.get(name) or {}))
     parts.append(_preset_table(defaults, presets))
     return "\n".join(parts)
 
@@ -97,6 +99,11 @@ def _preset_table(defaults: dict[str, Any], presets: dict[str, dict[str, Any]]) 
 
 def _load(name: str) -> dict[str, Any]:
     return yaml.safe_load((ROOT / "configs" / name).read_text(encoding="utf-8")) or {}
+
+
+def _merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
+    both = {key: _merged(values[key], other) for key, other in others.items() if isinstance(other, dict)}
+    return values | others | both
 
 
 def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -33,7 +33,7 @@ CLOUD_STEP_PX = 4
 
 @dataclass(frozen=True)
 class StampedFrame(LiveFrame):
-    """A frame with the header of its color image, whose exact stamp TF needs."""
+    """A frame with the header of its poses: the color image's frame, and the depth image's exact stamp, as TF needs."""
 
     header: Header
 
@@ -99,11 +99,12 @@ class SlamNode(Node):
         arrived = time.monotonic()
         try:
             rgb, stored, units_per_meter = images(color, depth)
-            frame = spslam.RgbdFrame.from_arrays(rgb, stored, seconds(color), depth_scale=units_per_meter)
+            frame = spslam.RgbdFrame.from_arrays(rgb, stored, seconds(depth), depth_scale=units_per_meter)
         except (TypeError, ValueError) as error:
             self.get_logger().error(f"a frame is left out: {error}", throttle_duration_sec=5.0)
         else:
-            self.queue.put(StampedFrame(frame, arrived, color.header))
+            header = Header(stamp=depth.header.stamp, frame_id=color.header.frame_id)
+            self.queue.put(StampedFrame(frame, arrived, header))
 
     def work(self):
         """Tracks the newest frame; optimizes the map while there is none."""

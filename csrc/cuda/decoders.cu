@@ -96,6 +96,7 @@ void launch(Cuda device, void (*kernel)(Network<T>, Arguments...), std::int64_t 
   SPS_CUDA_CHECK(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes));
   kernel<<<static_cast<int>(blocks), network.layout.warps() * kWarp, bytes, static_cast<cudaStream_t>(device.stream)>>>(
       network, values...);
+  SPS_CUDA_CHECK(cudaGetLastError());
 }
 
 }  // namespace
@@ -132,6 +133,7 @@ void mlp_backward(Device device, const MlpShape& shape, const T* grad, const T* 
   sum_kernel<<<static_cast<int>(chunk_count(num_params, kWarp)), fused::kSumThreads, 0,
                static_cast<cudaStream_t>(device.stream)>>>(workspace, static_cast<int>(blocks), num_params,
                                                            grad_params);
+  SPS_CUDA_CHECK(cudaGetLastError());
 }
 
 #define SPS_INSTANTIATE_DECODERS(T)                                                            \

@@ -110,6 +110,7 @@ void launch_encoder(Cuda device, const VertexSums& sums, const float* points, co
   SPS_CUDA_CHECK(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, gpu));
   encode_listed<kPrecision><<<kBlocksPerProcessor * processors, encoder_warps<kPrecision>() * kWarpSize, 0,
                               static_cast<cudaStream_t>(device.stream)>>>(sums, points, normals, params, settings);
+  SPS_CUDA_CHECK(cudaGetLastError());
 }
 
 }  // namespace

@@ -99,9 +99,9 @@ SPS_INLINE ReadPlace read_place(const ShutterCamera& camera, ReadPixel from) {
           from.row - static_cast<float>(top)};
 }
 
-// Depth of the nearest pixel that was read.
+// Depth of the nearest pixel that was read; unknown where it would lie behind the camera.
 SPS_INLINE std::uint16_t rectified_depth(float scale, float depth) {
-  return static_cast<std::uint16_t>(smaller(scale * depth + 0.5f, 65535.0f));
+  return static_cast<std::uint16_t>(smaller(larger(scale * depth + 0.5f, 0.0f), 65535.0f));
 }
 
 // Intensity between four pixels that were read.

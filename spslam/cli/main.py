@@ -26,7 +26,7 @@ COMMANDS = {
     "eval": "evaluate a finished run against ground truth",
     "view": "show a finished run in a browser",
     "merge": "join the maps of finished runs that share a place",
-    "mesh": "extract a mesh from the map of a finished run",
+    "mesh": "make a mesh of a finished run: fuse its frames, or extract its map",
     "download": "download a public dataset",
     "import": "copy a recording of any format into a folder of images",
     "check-data": "check a dataset for problems before running on it",

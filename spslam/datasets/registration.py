@@ -95,9 +95,10 @@ class _DepthBuffer:
             z: [N], m, from the color camera; 0 for points that don't count.
         """
         half = np.float32(0.5)
-        column = ((u + half) * self._scale[0]).astype(np.int32)
-        row = ((v + half) * self._scale[1]).astype(np.int32)
-        inside = (u > -half) & (v > -half) & (column < self.width) & (row < self.height)
+        x, y = (u + half) * self._scale[0], (v + half) * self._scale[1]
+        inside = (x > 0) & (y > 0) & (x < self.width) & (y < self.height)
+        # Others may be farther outside than whole numbers reach.
+        column, row = (np.where(inside, place, 0).astype(np.int32) for place in (x, y))
         cell = np.where(inside, row * self.width + column, -1)
         counts = np.flatnonzero(inside & (z > 0))
         nearest = np.full(self.height * self.width, np.inf, dtype=np.float32)

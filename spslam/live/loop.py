@@ -96,7 +96,7 @@ class LiveLoop:
     Attributes:
         status: where the run stands.
         previews: frames for the report.
-        poses: ground truth of the frames tracked, float64 [4, 4] each, or None.
+        poses: ground truth of the frames tracked, float64 [4, 4] each, or None; one more where a frame could not be.
         failure: why the loop ended early: the system could not go on.
     """
 
@@ -172,6 +172,7 @@ class LiveLoop:
         """Tracks a frame; what need not be done before its pose is known is done then."""
         status = self.status
         known: list[float] = []
+        self.poses.append(item.frame.pose)
         pending = self.system.submit(frame, lambda pose: known.append(time.monotonic()), defer_mapping=True)
         latency_ms = 1e3 * (known[0] - item.complete_s)
         self._write_row(log)  # of the frame before, whose mapping has ended; the pose does not wait for it
@@ -181,7 +182,6 @@ class LiveLoop:
         dropped, self._next_index = frame.index - self._next_index, frame.index + 1
         self._row = _Row(status.report, {"latency_ms": latency_ms, "queue_ms": queue_ms, "dropped": dropped})
         self.previews.add(status.frames, item.frame)
-        self.poses.append(item.frame.pose)
         status.frames += 1
         self.observer.observe(status.report, item.frame)
 

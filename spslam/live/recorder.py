@@ -105,7 +105,7 @@ class FolderRecorder(contextlib.AbstractContextManager):
         name = f"{self.frames:06d}"
         color = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
         units = np.rint(frame.depth * np.float32(self._scale))
-        depth = np.where(units <= _MOST_UNITS, units, 0).astype(np.uint16)
+        depth = np.where((units > 0) & (units <= _MOST_UNITS), units, 0).astype(np.uint16)
         self._write_image("depth", f"{name}.png", depth, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
         self._write_image("color", f"{name}.jpg", color, _JPEG)
         if self._times is None:

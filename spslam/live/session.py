@@ -65,6 +65,19 @@ def run_live(
         KeyboardInterrupt: after a second Ctrl-C; results are then not written.
         Exception: what a source of the program's own raised, after the results of the frames before are written.
     """
+    with contextlib.ExitStack() as unused:
+        unused.callback(source.close)  # where something fails before `Capture` takes it over
+        return _run_on_device(request, source, progress, first_pose, observer, unused)
+
+
+def _run_on_device(
+    request: LiveRequest,
+    source: LiveSource,
+    progress: LiveProgress | None,
+    first_pose: np.ndarray | None,
+    observer: RunObserver | None,
+    unused: contextlib.ExitStack,
+) -> dict[str, Any]:
     device = resolve_device(request.config.device)
     with (
         library_threads_limited(),
@@ -73,17 +86,17 @@ def run_live(
         explained_failures(device),
     ):
         started = time.perf_counter()
-        system = SlamSystem(request.config, source.camera, first_pose, device)
-        warm_up(request.config, source.camera, device)
-        if device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(device)
-        folder = OutputFolder(Path(request.output_dir))
-        with contextlib.closing(system), folder.locked(), _removed_if_empty(folder):
-            _refuse_interrupted(folder)
-            folder.create(resume=False)
-            atomic_write(folder.config, dump_config(system.config, provenance(system.config, device)))
-            start_s = time.perf_counter() - started
-            return _run(request, source, system, folder, progress, observer, start_s)
+        with contextlib.closing(SlamSystem(request.config, source.camera, first_pose, device)) as system:
+            warm_up(request.config, source.camera, device)
+            if device.type == "cuda":
+                torch.cuda.reset_peak_memory_stats(device)
+            folder = OutputFolder(Path(request.output_dir))
+            with folder.locked(), _removed_if_empty(folder):
+                _refuse_interrupted(folder)
+                folder.create(resume=False)
+                atomic_write(folder.config, dump_config(system.config, provenance(system.config, device)))
+                clock = RunClock(start_s=time.perf_counter() - started)
+                return _run(request, source, system, folder, progress, observer, clock, unused)
 
 
 def _refuse_interrupted(folder: OutputFolder) -> None:
@@ -99,7 +112,8 @@ def _run(
     folder: OutputFolder,
     progress: LiveProgress | None,
     observer: RunObserver | None,
-    start_s: float,
+    clock: RunClock,
+    unused: contextlib.ExitStack,
 ) -> dict[str, Any]:
     recorder = None
     if request.record_dir is not None:
@@ -112,7 +126,8 @@ def _run(
             if observer is not None:
                 observer.begin(_observed(source, system), system.state)
             capture = stack.enter_context(Capture(source, FrameQueue(request.max_wait_s), recorder))
-            loop = LiveLoop(system, capture, folder, RunClock(start_s=start_s), progress, observer)
+            unused.pop_all()
+            loop = LiveLoop(system, capture, folder, clock, progress, observer)
             loop.run(interruption, request.seconds)
         metrics = _write(request, source, system, folder, loop)
     _raise_failure(loop, recorder, folder)
@@ -155,8 +170,8 @@ def _write(
 
 
 def _input(source: LiveSource, loop: LiveLoop, timestamps: np.ndarray) -> RunInput:
-    poses = np.full((len(loop.poses), 4, 4), np.nan)
-    for row, pose in enumerate(loop.poses):
+    poses = np.full((len(timestamps), 4, 4), np.nan)
+    for row, pose in enumerate(loop.poses[: len(timestamps)]):
         if pose is not None:
             poses[row] = pose
     known = np.isfinite(poses).all((1, 2))

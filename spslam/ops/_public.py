@@ -50,6 +50,15 @@ def public_op(*, name: str | None = None, as_given: tuple[str, ...] = ()) -> Cal
     return decorate
 
 
+def changed_in_place(*tensors: torch.Tensor | None) -> None:
+    """Tells autograd that an op has written to tensors: a gradient that needs what was there is then an error."""
+    if torch.compiler.is_compiling():  # what a compiled graph changes stands in the op's schema
+        return
+    for tensor in tensors:
+        if tensor is not None and not tensor.is_inference():
+            torch.autograd.graph.increment_version(tensor)
+
+
 def _is_lowered(value: object) -> bool:
     return isinstance(value, torch.Tensor) and value.dtype in _LOWERED
 

@@ -40,11 +40,9 @@ def vertices_around(points: torch.Tensor, voxel_size: float, band: float) -> tor
 
 def neighbor_ids(hash_table: HashTable, coords: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
     """Ids int32 [N, K] of coords int32 [N, 3] + offsets int32 [K, 3], -1 where absent."""
-    # Beyond twice the range nothing can be a neighbor, and sums stay within 32 bits.
-    near = coords.clamp(2 * VOXEL_COORD_MIN, 2 * VOXEL_COORD_MAX)[:, None]
-    steps = offsets.clamp(4 * VOXEL_COORD_MIN, 4 * VOXEL_COORD_MAX)
     rows, length = coords.shape[0], offsets.shape[0]
-    return voxel_hash_find(*hash_table, (near + steps).reshape(rows * length, 3)).view(rows, length)
+    sums = coords.long()[:, None] + offsets.long()  # which may need more than 32 bits
+    return voxel_hash_find(*hash_table, as_voxel_coords(sums.reshape(rows * length, 3))).view(rows, length)
 
 
 def nearest_vertices(

@@ -12,7 +12,7 @@ import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.earlier_frames import DepthKeyframes
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
@@ -38,7 +38,8 @@ class CaptureTiming(NamedTuple):
     @classmethod
     def unknown(cls, device: torch.device | str = "cpu") -> "CaptureTiming":
         """Nothing measured yet: all of one moment."""
-        return cls(torch.zeros(2, device=device), torch.zeros(2, 2, dtype=torch.float64, device=device))
+        seconds = torch.zeros(2, dtype=torch.float32, device=device)
+        return cls(seconds, torch.zeros(2, 2, dtype=torch.float64, device=device))
 
 
 @public_op()
@@ -97,6 +98,7 @@ def measure_capture_timing_(
     depth_keyframes.check(name, like=timing.seconds)
     check(depth_keyframes.timing is not None, name, "depth_keyframes", "have a timing", None)
     trusted.measure_capture_timing_(timing, pixels, pose, intrinsics, noise, depth_keyframes)
+    changed_in_place(timing.seconds, timing.state)
 
 
 @torch.library.register_fake("spslam::measure_capture_timing_")

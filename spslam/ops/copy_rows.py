@@ -6,7 +6,7 @@ import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 
 
 @public_op()
@@ -42,6 +42,7 @@ def copy_rows_(tables: Sequence[torch.Tensor], rows: Sequence[int], values: Sequ
         check_tensor(name, "values", value, table.shape[1:], table.dtype, like=table)
     if tables:  # without a tensor nothing says which device's kernel is meant
         trusted.copy_rows_(tables, rows, values)
+        changed_in_place(*tables)
 
 
 @torch.library.register_fake("spslam::copy_rows_")

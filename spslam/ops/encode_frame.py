@@ -7,7 +7,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.prior_fusion import ENCODER_PARAMETERS, FEATURES
 
 
@@ -152,7 +152,7 @@ def encode_frame_(
     check_tensor(name, "points", points, ["N", 3], torch.float32, like=volume.weights)
     check_tensor(name, "normals", normals, [points.shape[0], 3], torch.float32, like=points)
     check_tensor(name, "encoder_params", encoder_params, [ENCODER_PARAMETERS], torch.float32, like=points)
-    bounds = torch.empty(2, 3)
+    bounds = torch.empty(2, 3, dtype=torch.float32, device="cpu")
     tensors = [volume.hash_keys, volume.hash_values, volume.voxel_coords, volume.corner_ids, volume.embeddings]
     # The enums Scalar and Integer in csrc/bindings/prior_fusion.cpp.
     scalars = [fusion.voxel_size, fusion.min_pair_weight, fusion.min_weight, fusion.kappa, fusion.max_weight]
@@ -160,6 +160,7 @@ def encode_frame_(
     new_voxels = torch.ops.spslam.encode_frame_(
         [*tensors, volume.weights], points, normals, encoder_params, scalars, integers, bounds
     )
+    changed_in_place(volume.embeddings, volume.weights)
     return EncodedFrame(new_voxels, num_voxels + new_voxels <= max_voxels, bounds)
 
 

@@ -236,7 +236,7 @@ class VoxelHash(VoxelLookup):
         On an error the set is as before.
         """
         check_tensor("VoxelHash.build", "voxel_coords", voxel_coords, ["V", 3], INTEGERS, like=self.hash_keys)
-        voxel_coords = as_voxel_coords(voxel_coords)
+        voxel_coords = as_voxel_coords(voxel_coords).clone()  # they may be rows of the buffer that is cleared
         rows = voxel_coords.shape[0]
         self._check_limit(rows)
         table = new_voxel_hash(2 * max(self.capacity, _power_of_two(rows)), voxel_coords.device)

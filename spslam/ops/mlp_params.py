@@ -77,7 +77,8 @@ def mlp_init_params(
     for name, width in (("inputs", inputs), ("hidden", hidden), ("outputs", outputs)):
         check(1 <= width <= 2**20, "mlp_init_params", name, "be in [1, 2^20]", width)
     check_network("mlp_init_params", layers, hidden_activation, scale)
-    params = torch.empty(mlp_num_params(inputs, hidden, outputs, layers, bias))
+    count = mlp_num_params(inputs, hidden, outputs, layers, bias)
+    params = torch.empty(count, dtype=torch.float32, device="cpu")
     network = Network(hidden, outputs, layers, Activation.NONE, hidden_activation, scale, bias)
     for i, (weight, offset) in enumerate(split_params(network, inputs, params)):
         fan_in = weight.shape[1]

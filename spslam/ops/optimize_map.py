@@ -6,7 +6,7 @@ import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.launch_graph import LaunchGraph
 from spslam.ops.ray_sampling import RandomStream
 from spslam.ops.render_step import RenderOptions
@@ -208,7 +208,11 @@ def optimize_map_(
     last_stamp = first_stamp + iterations - 1
     check(first_stamp >= -(2**31) and last_stamp < 2**31, name, "first_stamp", "fit 32 bits", first_stamp)
     integers = [int(pixel_stream), num_pixels, iterations, fixed_frame, first_step, color_step, first_stamp]
-    return trusted.optimize_map_(scene, records, poses, frames, intrinsics, options, moments, integers, graph)
+    losses = trusted.optimize_map_(scene, records, poses, frames, intrinsics, options, moments, integers, graph)
+    params = (scene.embeddings, scene.texels, scene.geometry_params, scene.color_params, poses)
+    optimized = [param for one, param in zip(moments.all(), params, strict=True) if one is not None]
+    changed_in_place(*optimized, *moments.arguments()[0])
+    return losses
 
 
 def _gradient_dtype(device: torch.device) -> torch.dtype:

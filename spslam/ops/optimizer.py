@@ -4,7 +4,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import FLOATING, check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops._vmap import register_rows_vmap
 
 
@@ -72,6 +72,7 @@ def sparse_adam_(
         torch.ops.spslam.sparse_adam_(
             param, grad, exp_avg, exp_avg_sq, stamps, stamp, lr, betas[0], betas[1], eps, step
         )
+    changed_in_place(param, grad, exp_avg, exp_avg_sq)
 
 
 @public_op()

@@ -4,7 +4,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops._vmap import register_rows_vmap
 
 FEATURES = 8
@@ -161,6 +161,7 @@ def fuse_prior_(
     check_tensor(name, "feature_weights", feature_weights, [rows], torch.float32, like=embeddings)
     check(max_weight > 0, name, "max_weight", "be positive", max_weight)
     torch.ops.spslam.fuse_prior_(embeddings, weights, voxel_ids, features, feature_weights, max_weight)
+    changed_in_place(embeddings, weights)
 
 
 @public_op()

@@ -46,13 +46,14 @@ def philox_uniform(
         float32 [N] in [0, 1), multiples of 2^-24; bit-identical on every device. N = 0 gives an empty tensor.
 
     Raises:
-        ValueError: `count` negative.
+        ValueError: `count` negative, or `frame` or `iteration` out of range.
 
     Example:
         >>> torch.equal(philox_uniform(0, 0, 0, 0, 3), philox_uniform(0, 0, 0, 0, 5)[:3])
         True
     """
     check(count >= 0, "philox_uniform", "count", "be at least 0", count)
+    _check_key("philox_uniform", frame, iteration)
     out = torch.empty(count, dtype=torch.float32, device=device)
     torch.ops.spslam.philox_uniform(seed, stream, frame, iteration, out)
     return out
@@ -75,7 +76,7 @@ def sample_indices(
         N = 0 gives an empty tensor.
 
     Raises:
-        ValueError: `count` negative, or `upper` outside [1, 2^32].
+        ValueError: `count` negative, `upper` outside [1, 2^32], or `frame` or `iteration` out of range.
 
     Example:
         >>> drawn = sample_indices(0, RandomStream.EVALUATION, 0, 0, count=1000, upper=6)
@@ -84,9 +85,15 @@ def sample_indices(
     """
     check(count >= 0, "sample_indices", "count", "be at least 0", count)
     check(1 <= upper <= 2**32, "sample_indices", "upper", "be in [1, 2^32]", upper)
+    _check_key("sample_indices", frame, iteration)
     out = torch.empty(count, dtype=torch.int64, device=device)
     torch.ops.spslam.sample_indices(seed, stream, frame, iteration, upper, out)
     return out
+
+
+def _check_key(name: str, frame: int, iteration: int) -> None:
+    for argument, number in (("frame", frame), ("iteration", iteration)):
+        check(0 <= number < _COUNTER_RANGE, name, argument, "be in [0, 2^32 - 1]", number)
 
 
 @public_op()
@@ -137,6 +144,7 @@ def sample_along_rays(
     check(near >= 0, name, "near", "be at least 0", near)
     check(near <= far, name, "far", f"be at least near ({near})", far)
     check(truncation >= 0, name, "truncation", "be at least 0", truncation)
+    _check_key(name, frame, iteration)
     elements = depth.shape[0] * (num_uniform + num_surface)
     check(elements <= _COUNTER_RANGE, name, "depth", "have at most 2^32 / S rays", depth.shape[0])
     return torch.ops.spslam.sample_along_rays(

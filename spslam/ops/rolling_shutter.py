@@ -13,7 +13,7 @@ import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
 
@@ -76,6 +76,7 @@ def rectify_shutter_records_(
     check(height > 1, name, "height", "be above 1", height)
     check(width > 1, name, "width", "be above 1", width)
     trusted.rectify_shutter_records_(out, records, motion, intrinsics, height, width)
+    changed_in_place(out)
 
 
 @public_op()
@@ -125,6 +126,7 @@ def rectify_shutter_images_(
     check_intrinsics(name, intrinsics)
     check(unit > 0, name, "unit", "be positive", unit)
     trusted.rectify_shutter_images_(out_depth, out_intensity, depth, intensity, motion, intrinsics, unit)
+    changed_in_place(out_depth, out_intensity)
 
 
 @torch.library.register_fake("spslam::rectify_shutter_records_")

@@ -6,7 +6,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.depth_planes import DEFAULT_NOISE, check_noise
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
@@ -135,6 +135,7 @@ def add_seen_colors_(sums: torch.Tensor, colors: torch.Tensor, weights: torch.Te
     _check_seen(name, colors, weights, sums)
     check_tensor(name, "weights", weights, (len(sums),), torch.float32, like=sums)
     torch.ops.spslam.add_seen_colors_(sums, colors, weights)
+    changed_in_place(sums)
 
 
 @public_op(as_given=("sums",))
@@ -164,6 +165,7 @@ def add_color_detail_(sums: torch.Tensor, colors: torch.Tensor, weights: torch.T
     check(len(sums) <= len(colors), name, "sums", "have at most as many rows as colors", list(sums.shape))
     check_tensor(name, "ends", ends, (len(sums), 2), torch.int64, like=sums)
     torch.ops.spslam.add_color_detail_(sums, colors, weights, ends)
+    changed_in_place(sums)
 
 
 def _check_seen(name: str, colors: torch.Tensor, weights: torch.Tensor, like: torch.Tensor) -> None:

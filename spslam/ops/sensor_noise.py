@@ -6,7 +6,7 @@ import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
 from spslam.ops._checks import check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.earlier_frames import DepthKeyframes
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 
@@ -33,7 +33,7 @@ class SensorNoise(NamedTuple):
     @classmethod
     def unknown(cls, device: torch.device | str = "cpu") -> "SensorNoise":
         """Nothing measured yet: depth of 3 mm and 1.3 mm/m^2, intensity that says next to nothing."""
-        model = torch.tensor([9e-6, 1.69e-6, 1.0, 0.25], device=device)
+        model = torch.tensor([9e-6, 1.69e-6, 1.0, 0.25], dtype=torch.float32, device=device)
         return cls(model, torch.zeros(_COUNTS, dtype=torch.int32, device=device))
 
 
@@ -83,6 +83,7 @@ def measure_noise_(
     check_intrinsics(name, intrinsics)
     depth_keyframes.check(name, like=noise.model)
     trusted.measure_noise_(noise, pixels, pose, intrinsics, depth_keyframes)
+    changed_in_place(noise.model, noise.counts)
 
 
 @torch.library.register_fake("spslam::measure_noise_")

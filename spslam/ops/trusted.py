@@ -1,8 +1,9 @@
 """The ops that each frame of a run calls, without the checks of their arguments, which take as long as the calls.
 
 They are for callers whose arguments come from objects that are right by construction, as `spslam.slam` has them; the
-public op of the same name says what arguments must be, and calls these once it has checked them. The bindings still
-refuse what would have a kernel read or write where nothing is. Nothing is cast in an autocast region.
+public op of the same name, where there is one, says what arguments must be, and calls these once it has checked them.
+The bindings still refuse what would have a kernel read or write where nothing is. Nothing is cast in an autocast
+region, and autograd is not told of what is changed in place.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def track_gauss_newton(
     """See `spslam.ops.track_gauss_newton`.
 
     Returns:
-        float32 [50 + 6 iterations], so that the host reads all in one go: the pose that tracking started from, the pose
+        float32 [50 + 7 iterations], so that the host reads all in one go: the pose that tracking started from, the pose
         that it found, H and the statistics of each iteration.
     """
     return torch.ops.spslam.track_gauss_newton(

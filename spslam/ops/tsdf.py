@@ -9,7 +9,7 @@ import torch
 
 from spslam.ops import _library  # noqa: F401
 from spslam.ops._checks import check, check_count, check_tensor
-from spslam.ops._public import public_op
+from spslam.ops._public import changed_in_place, public_op
 from spslam.ops.depth_planes import DEFAULT_NOISE, PLANE_SIZE, check_noise
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
 from spslam.ops.voxel_hash import check_table
@@ -173,6 +173,7 @@ def tsdf_integrate_(
         list(noise),
         max_weight,
     )
+    changed_in_place(sdf, weights)
 
 
 @public_op()

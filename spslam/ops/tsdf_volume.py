@@ -1,6 +1,7 @@
 """The signed distance field on sparse blocks as an object that grows where surface is measured."""
 
 import itertools
+import math
 
 import torch
 
@@ -9,7 +10,7 @@ from spslam.ops._public import public_op
 from spslam.ops.depth_planes import DEFAULT_NOISE, PLANE_SIZE, measure_planes
 from spslam.ops.hash_table import VoxelHash
 from spslam.ops.marching_cubes import marching_cubes
-from spslam.ops.scene_view import Intrinsics
+from spslam.ops.scene_view import Intrinsics, check_intrinsics
 from spslam.ops.tsdf import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
@@ -73,8 +74,8 @@ class TsdfVolume:
         check(0 < near <= self.truncation, "TsdfVolume", "near_truncation", "be positive and at most truncation", near)
         self.near_truncation = near
         self.blocks = VoxelHash(device=device, max_voxels=max_blocks)
-        self._sdf = torch.zeros(0, BLOCK_VOXELS, device=device)
-        self._weights = torch.zeros(0, BLOCK_VOXELS, device=device)
+        self._sdf = torch.zeros(0, BLOCK_VOXELS, dtype=torch.float32, device=device)
+        self._weights = torch.zeros(0, BLOCK_VOXELS, dtype=torch.float32, device=device)
         self._colors = torch.zeros(0, BLOCK_VOXELS, COLOR_SIZE, dtype=torch.uint16, device=device)
 
     def __len__(self) -> int:
@@ -204,10 +205,13 @@ class TsdfVolume:
         Raises:
             TypeError, ValueError, VoxelLimitError: as `integrate`.
         """
-        reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics.fx
+        name = "TsdfVolume.make_room"
+        check_intrinsics(name, intrinsics)
+        check(0 < intrinsics[0] < math.inf, name, "intrinsics", "have a positive finite fx", intrinsics[0])
+        reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics[0]
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
         sizes = self.voxel_size, self.truncation, noise, step
-        touched = touched_blocks("TsdfVolume.make_room", planes, pose, intrinsics, *sizes)
+        touched = touched_blocks(name, planes, pose, intrinsics, *sizes)
         missing = (self.blocks.find(touched) < 0) & (touched[:, 0] != NO_BLOCK)
         # Not by the mask, for which torch would wake its threads.
         self.add_blocks(touched.index_select(0, missing.nonzero()[:, 0]))

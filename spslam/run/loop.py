@@ -98,6 +98,8 @@ class RunLoop:
         self._flush_reports(log, wait=True)
         self._update_clock(done)
         self.observer.finish()
+        if interruption.requested:  # while the map was completed, which has no checkpoint of its own
+            raise KeyboardInterrupt
 
     def _wait_while_paused(self, log: RunLog, interruption: Interruption) -> None:
         """Waits where the observer wants it; that time is not the run's."""

@@ -158,7 +158,7 @@ def write_segments(folder: OutputFolder, segments: Sequence[Trajectory]) -> dict
 
 
 def finish_results(run: RunOutput, source: RunInput, config: Config) -> None:
-    """Writes what comes last, from all other results: metrics.json with the verdict, previews, and the report.
+    """Writes what comes last, from all other results: previews, metrics.json with the verdict, and the report.
 
     Args:
         run: the results; the verdict is added to its metrics.
@@ -168,9 +168,9 @@ def finish_results(run: RunOutput, source: RunInput, config: Config) -> None:
     folder, camera = OutputFolder(run.folder.path), run.camera
     if camera is None:
         raise ValueError("finish_results: run must have a camera")
+    folder.write_previews(camera, source.previews, source.ground_truth)
     run.metrics["verdict"] = judge_run(run, config).level
     atomic_write(folder.metrics, json.dumps(run.metrics, indent=1) + "\n")
-    folder.write_previews(camera, source.previews, source.ground_truth)
     folder.write_report()
 
 

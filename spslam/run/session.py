@@ -85,6 +85,8 @@ def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any
         same = False
     if not same:
         raise OutputError(f"{folder.path}: holds a finished run of other options, data or frames; use another --output")
+    if not folder.report.is_file():  # killed just before the end: all that it is made of is there
+        folder.write_report()
     return metrics
 
 

@@ -1,5 +1,7 @@
 """Warm-up before the first frame: loading a CUDA kernel at its first use takes longer than running it."""
 
+import contextlib
+
 import numpy as np
 import torch
 
@@ -17,6 +19,8 @@ FRAMES = 4
 DEPTH_M = 2.0
 RELIEF_M = 0.1
 WAVES = 6  # across the image
+MOST_VOXELS = 2**22
+PIXELS_MB = 64
 
 
 def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameReport]:
@@ -34,30 +38,32 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
         The reports of the frames before. Loaded kernels and reserved memory are all that remains; results don't change.
     """
     shortened = _shortened(config)
-    system = SlamSystem(shortened, camera, device=device)
     uploader = Uploader(device) if device.type == "cuda" else None
     reports = []
     frames = [_wall_frame(camera, config, index) for index in range(FRAMES + (2 if uploader else 0))]
     if uploader:
         frames[-2] = _other_frame(frames[-2])
-    for frame in frames:
-        pixels = sample_frame(frame, camera, shortened)
-        sent = uploader.send(pixels) if uploader else pixels
-        reports.append(system.submit(PreparedFrame(frame.index, frame.timestamp, sent)).result())
-    system.finish()
-    system.close()
+    with contextlib.closing(SlamSystem(shortened, camera, device=device)) as system:
+        for frame in frames:
+            pixels = sample_frame(frame, camera, shortened)
+            sent = uploader.send(pixels) if uploader else pixels
+            reports.append(system.submit(PreparedFrame(frame.index, frame.timestamp, sent)).result())
+        system.finish()
     event_recorder(device)().wait()
     return reports[:FRAMES]
 
 
 def _shortened(config: Config) -> Config:
     """The configuration with few iterations, mapping after each frame, fewer frames per mapping call than exist, and
-    without the process that is the run's."""
+    without the process and the limits that are the run's."""
     mapping = config.mapping.model_copy(
         update={"every": 1, "iterations": 2, "first_iterations": 4, "frames": 2, "recent": 1, "covisible": 1}
     )
     run = config.run.model_copy(update={"graph_solver": "thread"})
-    return config.model_copy(update={"mapping": mapping, "run": run})
+    # Limits of the run's map: the wall may be larger than the run's scene.
+    scene = config.scene.model_copy(update={"max_voxels": max(config.scene.max_voxels, MOST_VOXELS)})
+    pixels = config.pixels.model_copy(update={"budget_mb": max(config.pixels.budget_mb, PIXELS_MB)})
+    return config.model_copy(update={"mapping": mapping, "run": run, "scene": scene, "pixels": pixels})
 
 
 def _wall_frame(camera: Camera, config: Config, index: int) -> RgbdFrame:

@@ -33,6 +33,11 @@ class FrameArrival:
         if device.type == "cuda" and uses_features(config):
             self._extractor = ThreadPoolExecutor(1, thread_name_prefix="spslam-features")
 
+    def close(self) -> None:
+        """Ends the thread; no frame can be prepared after it. May be called again."""
+        if self._extractor is not None:
+            self._extractor.shutdown(wait=False, cancel_futures=True)
+
     def prepare(self, frame: RgbdFrame, number: int, are_expected: bool) -> PreparedFrame:
         """A frame as `FramePipeline.submit` takes it, on the CPU.
 

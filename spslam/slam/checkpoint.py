@@ -238,6 +238,9 @@ def _checked_source(header: dict[str, Any], frames: int) -> dict[str, Any]:
     whole_number(clock, "frames")
     for name in ("wall_s", "decode_s"):
         finite_number(clock, name, low=0)
+    finite_number({"start_s": 0.0, **clock}, "start_s", low=0)
+    if clock.keys() - {"frames", "wall_s", "decode_s", "start_s"}:
+        raise ValueError("clock must contain frames, wall_s, decode_s and start_s alone")
     return source
 
 

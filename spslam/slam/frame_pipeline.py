@@ -311,6 +311,7 @@ class FramePipeline:
     ) -> None:
         """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
         state, number, copies = self.state, len(self.state.frames), RowCopies()
+        state.pixels.make_room()  # the one thing here that may fail: then nothing of the frame is stored
         state.frames.append(
             tracked.pose,
             frame.timestamp,

@@ -33,8 +33,8 @@ class FrameReport:
         tracking_iterations: of this frame; 0 for the first.
         fit: how well its pose fits; NaN where it was not tracked or a measure was not needed.
         error_probability: that its pose is wrong; NaN where it was not tracked.
-        recovered: whether its pose was tracked from an initial pose that projective ICP found.
-        relocalized: whether ICP found it against a stored frame that looks alike.
+        recovered: whether its pose was tracked from an initial pose that image features or projective ICP found.
+        relocalized: whether they found it against a stored frame that looks alike.
         mapping_iterations: of the joint optimization after this frame.
         voxels: allocated vertices.
         decode_ms: reading, decoding and sampling the frame, on a thread and ahead of need.

@@ -129,13 +129,15 @@ def archive_of(state: SlamState, recording: Recording | None, settings: Mapping[
     store, first = state.graph, state.frames.opened
     if store is None:
         raise ValueError("archive_of: state must have a keyframe graph")
-    own = store.rows[first:]
+    # Keyframes are left out where they show nothing new, those of the opened map too.
+    opened, own = store.rows[store.rows < first], store.rows[store.rows >= first]
     records = state.pixels.records[torch.from_numpy(own).to(state.scene.device), :RECORDS].cpu()
-    poses = state.frames.matrices()
-    recordings, rows = list(moved_recordings(store.opened, poses[:first])) if store.opened else [], own - first
+    poses, rows = state.frames.matrices(), own - first
+    recordings: list[Recording] = []
     if store.opened is not None:
-        records = same_length([*store.opened.records, *records])
-        rows = np.concatenate([store.opened.rows, own - first + store.opened.ends[-1]])
+        recordings += moved_recordings(store.opened, poses[:first])
+        records = same_length([*store.opened.records[torch.from_numpy(opened)], *records])
+        rows = np.concatenate([store.opened.rows[opened], rows + store.opened.ends[-1]])
     if recording is not None:
         recordings.append(recording)
     keyframes = [each.changed(frame=int(row)) for row, each in zip(rows, store.keyframes, strict=True)]

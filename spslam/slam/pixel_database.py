@@ -90,6 +90,14 @@ class PixelDatabase:
         """What so many frames of so many pixels take of the budget."""
         return frames * (pixels * RECORD_BYTES + self._bytes_beside)
 
+    def make_room(self) -> None:
+        """Makes room for a frame, so that `add` can't fail.
+
+        Raises:
+            SpslamError: the budget holds no further frame.
+        """
+        self._reserve(self.num_frames + 1)
+
     def add(self, records: torch.Tensor, copies: RowCopies | None = None) -> None:
         """Appends a frame.
 
@@ -98,7 +106,7 @@ class PixelDatabase:
                 repeated. On the database's device this waits for nothing.
             copies: the records are written when these are made; None writes them now.
         """
-        self._reserve(self.num_frames + 1)
+        self.make_room()
         newest = self.num_frames - 1
         if newest > 0 and newest % self.keyframe_every:
             self._has_pixels[newest] = False

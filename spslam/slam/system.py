@@ -68,6 +68,13 @@ class SlamSystem(FramePipeline):
         """The next frame as `submit` takes it; its images are checked already."""
         return self._arrival.prepare(frame, self.state.frames.processed, self.features.are_expected)
 
+    def close(self) -> None:
+        """Ends helper threads and processes; no frame can follow, unless after `reset`."""
+        if "_arrival" in vars(self):
+            self._arrival.close()
+            del self._arrival
+        super().close()
+
     @cached_property
     def _arrival(self) -> FrameArrival:
         return FrameArrival(self.config, self.camera, self.device)

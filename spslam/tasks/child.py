@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -63,7 +64,8 @@ class Child:
         finally:
             for stream in (process.stdin, process.stderr):
                 if stream:
-                    stream.close()
+                    with contextlib.suppress(BrokenPipeError):  # closing writes what is left of a call that nobody read
+                        stream.close()
         if code == 0:
             return "", False
         if code < 0:

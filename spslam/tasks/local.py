@@ -100,7 +100,11 @@ class LocalExecutor:
 
     def _watch(self, slot: int, key: str, child: Child) -> None:
         started = time.monotonic()
-        error, lost = child.wait()
+        try:
+            error, lost = child.wait()
+        except Exception as failure:  # whatever it is: `wait` would never return
+            child.kill()
+            error, lost = f"its process can't be waited for: {failure}", True
         with self._lock:
             self._running.pop(key, None)
         self._ends.put((slot, TaskEnd(key, error, lost, seconds=time.monotonic() - started)))

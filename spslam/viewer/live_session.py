@@ -108,9 +108,7 @@ class LiveSession:
         self._model.set_poses(snapshot.poses)
         scene = Scene(self._run.settings, self._run.seed)
         scene.load_state_dict({name: torch.from_numpy(array) for name, array in snapshot.tensors.items()})
-        count = len(snapshot.poses)
-        tracked = self._model.poses[:count][~self._model.lost[:count]]
-        made = self._mesh.update(scene, tracked)
+        made = self._mesh.update(scene, self._model.tracked_poses(len(snapshot.poses)))
         self._rendered = scene, Mesh(*self._mesh.merged())
         for sink in self._sinks:
             sink.show_mesh(made)

@@ -71,6 +71,11 @@ class RunModel:
         """float64 [F]: a field of `Row` for all frames."""
         return self._columns[name][: self._count]
 
+    def tracked_poses(self, count: int) -> np.ndarray:
+        """float64 [n, 4, 4], a copy: poses of the first `count` frames, as far as they have come and are not lost."""
+        with self.lock:
+            return self.poses[:count][~self.lost[:count]]
+
     def update(self, update: Update) -> None:
         """Adds frames. Those that were never sent repeat the last pose."""
         with self.lock:

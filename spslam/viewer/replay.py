@@ -69,7 +69,7 @@ class Replay(contextlib.AbstractContextManager):
     def __init__(self, run: RunOutput, options: ViewerOptions):
         """Use `open_replay`."""
         self._run, self._source = run, FrameSource(run)
-        self._model = _model(run, self._source.indices)
+        self._model = _model(run)
         mesh = run.mesh()
         self._rendered: tuple[Scene, Mesh] | None = None
         if mesh is not None and run.folder.map.is_file() and run.camera is not None:
@@ -160,7 +160,7 @@ def open_replay(output: Path, options: ViewerOptions) -> Replay:
     return Replay(run, options)
 
 
-def _model(run: RunOutput, indices: np.ndarray) -> RunModel:
+def _model(run: RunOutput) -> RunModel:
     """The frames of the run; the log adds what the trajectory does not know."""
     trajectory = run.trajectory
     camera = run.camera or _ANY_CAMERA

@@ -191,3 +191,13 @@ def test_depth_where_a_lens_leaves_no_color_is_missing(depth_camera, view):
     middle = slice(geometry.camera.height // 3, 2 * geometry.camera.height // 3)
     across = slice(geometry.camera.width // 3, 2 * geometry.camera.width // 3)
     np.testing.assert_array_equal(kept[middle, across], plain[middle, across])
+
+
+def test_points_just_before_the_color_camera_are_off_its_image():
+    """Their columns are beyond 32 bits."""
+    color_from_depth = extrinsics((0.0, 0.0, -0.5))
+    depth = np.full((DEPTH.height, DEPTH.width), 2.0, np.float32)
+    depth[::2, ::3] = np.nextafter(np.float32(0.5), np.float32(1))
+    color = np.zeros((COLOR.height, COLOR.width, 3), np.uint8)
+    _, kept = ColorToDepth(COLOR, DEPTH, color_from_depth)(color, depth)
+    assert not kept[::2, ::3][:, :10].any() and (kept > 1).any()

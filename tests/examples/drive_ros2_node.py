@@ -18,6 +18,7 @@ from spslam.datasets.generated import GeneratedDataset
 
 ROOT, MESH, FRAMES = Path(__file__).parents[2], sys.argv[1], 12
 TIMEOUT_S = 60
+COLOR_LATER_NS = 5_000_000  # color is taken after depth, whose stamp poses have
 
 
 def load_example():
@@ -28,16 +29,18 @@ def load_example():
     return module
 
 
-def stamp(message, number):
-    message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000, 33_333_333 * number + 7
+def stamp(message, number, later_ns=0):
+    message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000, 33_333_333 * number + 7 + later_ns
     message.header.frame_id = "camera_color_optical_frame"
     return message
 
 
-def image(array, encoding, number):
+def image(array, encoding, number, later_ns=0):
     step = array.strides[0]
     height, width = array.shape[:2]
-    return stamp(Image(height=height, width=width, encoding=encoding, step=step, data=array.tobytes()), number)
+    return stamp(
+        Image(height=height, width=width, encoding=encoding, step=step, data=array.tobytes()), number, later_ns
+    )
 
 
 def main():
@@ -73,9 +76,9 @@ def main():
     spin_until(send_info)
     for number in range(FRAMES + 1):
         frame = room[max(number - 1, 0)]
-        color = image(np.ascontiguousarray(frame.color[..., ::-1]), "bgr8", number)
+        color = image(np.ascontiguousarray(frame.color[..., ::-1]), "bgr8", number, COLOR_LATER_NS)
         if number == 0:  # of no use, and said
-            color = image(frame.color[..., 0].copy(), "mono8", number)
+            color = image(frame.color[..., 0].copy(), "mono8", number, COLOR_LATER_NS)
         publishers["depth"].publish(image(np.rint(1000 * frame.depth).astype("<u2"), "16UC1", number))
         publishers["color"].publish(color)
         # One after the other, so that the test does not depend on the machine.

@@ -53,7 +53,7 @@ def test_frames_become_poses_path_points_and_transforms(tmp_path, kind):
     room = GeneratedDataset(300, 160, 120)
     true = np.linalg.inv(room.poses()[0]) @ room.poses()[:12]
     np.testing.assert_allclose(came["poses"], true[:, :3, 3], atol=0.01)
-    # The stamp is the image's to the nanosecond: TF is asked for exactly that.
+    # The stamp is the depth image's to the nanosecond: TF is asked for exactly that.
     assert came["stamp"] == [1_700_000_000, 33_333_333 * 12 + 7]
     assert came["frames"] == ["map", "camera_color_optical_frame", "camera_color_optical_frame"]
     np.testing.assert_allclose(came["tf"][0], came["poses"][-1][0])

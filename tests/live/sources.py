@@ -19,20 +19,22 @@ class RoomCamera(LiveSource):
         pause_s: between them.
         fault: raised after the last.
         change: may modify a frame, or replace it by what is to be yielded.
+        has_poses: whether frames come with their true poses.
     """
 
     name = "test camera"
 
-    def __init__(self, count=6, pause_s=0.0, fault=None, change=None):
+    def __init__(self, count=6, pause_s=0.0, fault=None, change=None, has_poses=False):
         self.recorded = Recorded(count)
         self.camera = self.recorded.camera
         self.count, self.pause_s, self.fault, self.change, self.closed = count, pause_s, fault, change, 0
+        self.has_poses = has_poses
 
     def frames(self):
         for index in range(self.count):
             time.sleep(self.pause_s)
             frame = self.recorded[index]
-            frame.pose = None
+            frame.pose = frame.pose if self.has_poses else None
             yield self.change(frame) if self.change else frame
         if self.fault is not None:
             raise self.fault

@@ -136,10 +136,40 @@ def test_without_a_frame_nothing_is_left_behind(tmp_path, camera, kind, message)
     assert camera.closed == 1
 
 
-def test_a_limit_that_is_reached_leaves_the_results(tmp_path):
-    with pytest.raises(SpslamError, match=r"max_voxels.*; the results of [1-9]\d* frames are in"):
-        run_live(request(tmp_path, "scene.max_voxels=16200", "mapping.every=1"), RoomCamera(20, pause_s=0.02))
-    assert len(RunOutput.read(tmp_path / "out").trajectory) >= 1
+@pytest.mark.parametrize("has_poses", [False, True])
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        (["scene.max_voxels=16200", "mapping.every=1"], "max_voxels"),
+        (["pixels.budget_mb=0.01", "pixels.per_frame=200"], "pixels.budget_mb"),
+    ],
+)
+def test_a_limit_that_is_reached_leaves_the_results(tmp_path, has_poses, limits, message):
+    camera = RoomCamera(20, pause_s=0.02, has_poses=has_poses)
+    with pytest.raises(SpslamError, match=message + r".*; the results of [1-9]\d* frames are in"):
+        run_live(request(tmp_path, *limits), camera)
+    output = RunOutput.read(tmp_path / "out")
+    assert 1 <= len(output.trajectory) < 20
+    assert not output.trajectory.lost.any()
+    assert (output.ground_truth is not None) == has_poses
+    np.testing.assert_allclose(np.linalg.norm(output.trajectory.poses[:, :3, :3], axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("where", ["before the folder", "in the folder"])
+def test_a_source_is_closed_where_the_run_can_not_begin(tmp_path, monkeypatch, where):
+    camera, asked = RoomCamera(3), request(tmp_path)
+    if where == "in the folder":
+        asked.output_dir.mkdir()
+        (asked.output_dir / "notes.txt").touch()
+    else:
+
+        def fail(*_):
+            raise SpslamError("no memory")
+
+        monkeypatch.setattr(session, "warm_up", fail)
+    with pytest.raises(SpslamError):
+        run_live(asked, camera)
+    assert camera.closed == 1
 
 
 def test_a_recording_that_fails_is_said_after_the_results(tmp_path, monkeypatch):

@@ -52,10 +52,10 @@ def test_observer_is_told_of_every_frame_with_its_images(tmp_path):
 def test_observing_is_not_part_of_the_latency(tmp_path):
     class Slow(RunObserver):
         def observe(self, report, frame=None):
-            time.sleep(0.3)
+            time.sleep(1.5)
 
-    metrics = run_live(request(tmp_path), RoomCamera(3, pause_s=0.5), observer=Slow())
-    assert metrics["latency_p50_ms"] < 300
+    metrics = run_live(request(tmp_path), RoomCamera(3, pause_s=2.0), observer=Slow())
+    assert metrics["latency_p50_ms"] < 1500
 
 
 def test_viewer_is_sent_frames_and_images(tmp_path, monkeypatch):

@@ -110,3 +110,13 @@ def test_a_frame_that_a_kill_interrupted_is_left_out(tmp_path, missing):
         (folder / kind / "000003.jpg").unlink()
     dataset = opened(folder)
     assert [dataset[i].timestamp for i in range(len(dataset))] == pytest.approx([0, 1 / 30, 2 / 30])
+
+
+def test_depth_that_is_not_above_0_is_unknown(tmp_path):
+    frame = plain_frame()
+    frame.depth[0, :4] = -1.0, -np.inf, np.nan, np.inf
+    with FolderRecorder(tmp_path, Recorded(1).camera) as recorder:
+        recorder.offer(frame)
+    (recorded,) = opened(tmp_path)
+    assert recorded.depth[0, :4].tolist() == [0, 0, 0, 0]
+    assert recorded.depth[0, 4] == 1

@@ -357,3 +357,16 @@ def test_errors_of_rectification():
     row = torch.zeros(1, 5, dtype=torch.uint16), torch.zeros(1, 5, dtype=torch.uint8)
     with pytest.raises(ValueError, match="at least two rows and columns"):
         ops.rectify_shutter_images_(*row, *row, motion, CAMERA, unit=UNIT)
+
+
+def test_what_would_lie_behind_the_camera_has_no_depth(device):
+    """A pixel 1 mm away, read by a camera that moves by centimeters until the middle row is read."""
+    depth = torch.full((8, 8), 1, dtype=torch.uint16, device=device)
+    poses = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0, 0.1]], device=device)
+    motion = ops.ShutterMotion(poses[0], poses[1], 0.1, torch.tensor([0.1], device=device))
+    moved = torch.zeros_like(depth), torch.zeros(8, 8, dtype=torch.uint8, device=device)
+    ops.rectify_shutter_images_(
+        *moved, depth, torch.zeros_like(moved[1]), motion, ops.Intrinsics(8, 8, 3.5, 3.5), unit=1e-3
+    )
+    rows = moved[0].cpu().int()[:, 0].tolist()
+    assert rows[:4] == [0] * 4 and max(rows) < 100

@@ -75,6 +75,10 @@ def test_neighbors_at_offsets(device, generator):
     far = torch.tensor([[2**31 - 1, 0, 0], [-(2**31), 5, 5]], device=device)
     assert cells.neighbors(far, torch.tensor([[1, 0, 0], [2**31 - 1, 0, 0]], device=device)).lt(0).all()
     assert cells.neighbors(coords.view(5, 10, 3), offsets).shape == (5, 10, 5)
+    # Beyond the range and back into it.
+    steps = torch.tensor([[-(2**21), 0, 0], [2**30, 0, 0], [-(2**31) + 1, 0, 0]], device=device)
+    around = cells.voxel_coords[:3].long() - steps
+    assert cells.neighbors(around, steps).diagonal().tolist() == [0, 1, 2]
     assert cells.neighbors(coords[:0], offsets).shape == (0, 5)
 
 
@@ -183,3 +187,11 @@ def test_wrong_argument_is_named(call, error, message):
     cells.insert(cube(0, 2))
     with pytest.raises(error, match=f"^VoxelHash.{message}"):
         call(cells)
+
+
+def test_a_set_is_built_of_its_own_rows(device, generator):
+    cells = filled(generator, device)
+    coords = cells.voxel_coords.clone()
+    cells.build(cells.voxel_coords[3:])
+    assert torch.equal(cells.voxel_coords, coords[3:])
+    assert is_consistent(cells)

@@ -134,3 +134,17 @@ def test_docstring_examples_run():
     import spslam.ops.ray_sampling as module
 
     assert doctest.testmod(module).failed == 0
+
+
+@pytest.mark.parametrize("number", [-1, 2**32])
+def test_keys_out_of_range_are_named(number):
+    calls = [
+        lambda frame, iteration: ops.philox_uniform(0, 0, frame, iteration, 2),
+        lambda frame, iteration: ops.sample_indices(0, 0, frame, iteration, 2, 6),
+        lambda frame, iteration: ops.sample_along_rays(torch.ones(2), 2, 1, 0.0, 1.0, 0.1, 0, 0, frame, iteration),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match=r": frame must be in \[0, 2\^32 - 1\]"):
+            call(number, 0)
+        with pytest.raises(ValueError, match=r": iteration must be in \[0, 2\^32 - 1\]"):
+            call(0, number)

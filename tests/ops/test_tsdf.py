@@ -1,5 +1,7 @@
 """The signed distance blocks against plain NumPy, and against surfaces that are known exactly."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -373,3 +375,12 @@ def test_noise_does_not_move_a_surface(device):
     vertices, _ = volume.extract()
     # A weight that fell from the surface on would move it by 0.24 deviations.
     assert abs(vertices[:, 2].mean().item() - 1) < 0.1 * deviation
+
+
+@pytest.mark.parametrize("focal", [0.0, math.nan, math.inf])
+def test_intrinsics_that_can_not_be_are_named(focal):
+    volume, pose = ops.TsdfVolume(0.05), torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
+    with pytest.raises(ValueError, match=r"TsdfVolume.make_room: intrinsics must have a positive finite fx"):
+        volume.integrate(torch.full((8, 8), 2.0), pose, (focal, 8.0, 3.5, 3.5))
+    volume.integrate(torch.full((8, 8), 2.0), pose, (8.0, 8.0, 3.5, 3.5))
+    assert len(volume)

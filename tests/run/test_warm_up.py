@@ -26,3 +26,8 @@ def test_results_do_not_depend_on_warm_up(monkeypatch, tmp_path, device):
     warm_up(settings("seed=5"), Recorded(1).camera, device)
     run_on(monkeypatch, Recorded(6), tmp_path / "two", *options)
     assert results(tmp_path / "one") == results(tmp_path / "two")
+
+
+def test_limits_of_the_run_are_not_those_of_the_warm_up(device):
+    config = settings("scene.max_voxels=1000", "pixels.per_frame=2000", "pixels.budget_mb=0.05")
+    assert len(warm_up(config, Recorded(1).camera, device)) == FRAMES

@@ -157,6 +157,8 @@ def test_fewer_moments_than_texels_are_refused(load):
         (lambda header: header["source"].update(next="2"), "next must be a whole number from 2 to .*, got '2'"),
         (lambda header: header["source"].update(next=6), "frames must be a whole number from 6 to .*, got 5"),
         (lambda header: header["source"]["clock"].update(wall_s=float("nan")), "wall_s must be a finite number"),
+        (lambda header: header["source"]["clock"].update(start_s="1"), "start_s must be a finite number"),
+        (lambda header: header["source"]["clock"].update(other=1), "clock must contain frames, wall_s, decode_s and"),
         (lambda header: header.update(steps=-1), "steps must be a whole number from 0 to 536870912, got -1"),
         (lambda header: header.update(stamp=2**31), "stamp must be a whole number from 0 to 536870912"),
         (lambda header: header.update(unmapped=1), "unmapped must be true or false, got 1"),

@@ -13,7 +13,9 @@ import pytest
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
 from spslam.run import loop as run_loop
+from spslam.run.output_folder import OutputFolder
 from spslam.run.sequence import RunRequest, run_sequence
+from spslam.slam.system import SlamSystem
 from tests.cli.command import ROOT
 from tests.system.sequences import FAST_SETTINGS, Recorded, results, run_on, settings, write_room
 
@@ -243,3 +245,35 @@ def test_damaged_checkpoint_is_one_line(monkeypatch, interrupted, size):
 )
 def test_checkpoint_interval_is_at_least_a_tenth_of_the_frames(every, last_saved, done, due):
     assert run_loop._is_checkpoint_due(every, last_saved, done) == due
+
+
+def test_a_report_that_a_kill_left_out_is_written(monkeypatch, tmp_path):
+    """Without a checkpoint only metrics.json says that a run is finished."""
+    output = tmp_path / "out"
+    monkeypatch.setattr(OutputFolder, "write_report", lambda folder: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        run_on(monkeypatch, Recorded(3), output, "run.previews=2")
+    monkeypatch.undo()
+    left = {path.name: path.read_bytes() for path in output.rglob("*") if path.is_file()}
+    assert {"metrics.json", "camera.json", "frame-000000.png"} <= left.keys() and "report.html" not in left
+    run_on(monkeypatch, Recorded(3), output, "run.previews=2", resume=True)
+    assert (output / "report.html").is_file()
+    assert all((path.read_bytes() == left[path.name]) for path in output.rglob("*") if path.name in left)
+
+
+def test_ctrl_c_while_the_map_is_completed_ends_the_run(monkeypatch, tmp_path):
+    finish = SlamSystem.finish
+
+    def interrupted(system):
+        os.kill(os.getpid(), signal.SIGINT)
+        finish(system)
+
+    monkeypatch.setattr(SlamSystem, "finish", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_on(monkeypatch, Recorded(4), tmp_path / "out")
+    monkeypatch.setattr(SlamSystem, "finish", finish)
+    assert frames_logged(tmp_path / "out") == list(range(4))
+    assert not (tmp_path / "out" / "metrics.json").exists()
+    run_on(monkeypatch, Recorded(4), tmp_path / "out", resume=True)
+    run_on(monkeypatch, Recorded(4), tmp_path / "whole")
+    assert results(tmp_path / "out") == results(tmp_path / "whole")

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from spslam.tasks import local, machine
+from spslam.tasks import child, local, machine
 from spslam.tasks.local import LocalExecutor
 from spslam.tasks.schedule import RETRIES, read_attempts, run_tasks
 from tests.tasks.examples import task, wait_for
@@ -111,3 +111,29 @@ def test_memory_that_is_free_is_that_of_machine_and_container(tmp_path, monkeypa
         (tmp_path / "cgroups" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "cgroups" / name).write_text(f"{content}\n")
     assert machine.free_memory_mb() == free_mb
+
+
+def test_a_process_that_dies_before_it_reads_its_call_is_an_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(child, "MODULE", "spslam.no_such_module")
+    begin = child.Child.__init__
+
+    def ended(self, *arguments):
+        begin(self, *arguments)
+        self._process.wait()
+
+    monkeypatch.setattr(child.Child, "__init__", ended)
+    with LocalExecutor(1, 1) as executor:
+        executor.start(task(tmp_path, "gone", padding="x" * 2**20))
+        end = executor.wait()
+    assert "No module named spslam.no_such_module" in end.error
+
+
+def test_a_process_that_can_not_be_waited_for_is_lost(tmp_path, monkeypatch):
+    def fail(self):
+        raise OSError("no pipe")
+
+    monkeypatch.setattr(local.Child, "wait", fail)
+    with LocalExecutor(1, 1) as executor:
+        executor.start(task(tmp_path, "gone", seconds=600))
+        end = executor.wait()
+    assert end.lost and "no pipe" in end.error

@@ -187,3 +187,10 @@ def test_loops_of_a_log_that_may_hold_anything():
     refused = {**accepted, "accepted": False}
     lines = [{}, {"loops": None}, {"loops": [accepted, refused, 3, {"source": "x"}]}, {"loops": 5}]
     assert closed_loops(lines) == [(9, 2)]
+
+
+def test_poses_of_tracked_frames_are_as_many_as_have_come():
+    made = model(6)
+    made.update(Update(6, [row(6)._replace(lost=True), row(7)], straight(6, 2)))
+    np.testing.assert_allclose(made.tracked_poses(7)[:, 0, 3], made.poses[:6, 0, 3])
+    assert len(made.tracked_poses(100)) == 7

@@ -94,7 +94,7 @@ class Shader:
         u = u * self._scale[0].take(face) + self._offset[0].take(face)
         v = v * self._scale[1].take(face) + self._offset[1].take(face)
         image = self._atlas.sample(self._texture.take(face), u, v, texels)
-        light *= self._stain(points, face)
+        light *= self._stain(points)
         tint = self._color.take(face, axis=0)
         tint *= light[..., None]
         return cv2.multiply(image, tint, dtype=cv2.CV_8U)
@@ -136,7 +136,7 @@ class Shader:
         normal_light = across * (np.cos(angle) * _LIGHT[0] + np.sin(angle) * _LIGHT[1]) + up * _LIGHT[2]
         light[where] = _AMBIENT + _DIRECT * normal_light
 
-    def _stain(self, points: np.ndarray, face: np.ndarray) -> np.ndarray:
+    def _stain(self, points: np.ndarray) -> np.ndarray:
         scale = np.float32(1 / _STAINS_PERIOD_M)
         u = (points[0] + np.float32(_STAINS_SLANT) * points[1]) * scale
         v = (points[2] + np.float32(_STAINS_SLANT) * points[0] + np.float32(0.9) * points[1]) * scale

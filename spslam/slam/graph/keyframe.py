@@ -14,7 +14,7 @@ from spslam.camera import Camera
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.image_features import ImageFeatures, features_of_images
-from spslam.slam.pixels import FramePixels
+from spslam.slam.pixels import FramePixels, unpack_points
 
 MAX_COLUMNS = 320  # of a keyframe's images
 THUMBNAIL_COLUMNS = 40
@@ -68,10 +68,7 @@ class KeyframeCamera:
 
     def points(self, records: torch.Tensor) -> torch.Tensor:
         """Surface points float32 [P, 3] of a keyframe's packed records int32 [P, 3], in its axes, m."""
-        k = self.camera
-        u, v = (records[:, 0] & 0xFFFF).float(), (records[:, 0] >> 16).float()
-        z = records[:, 1].contiguous().view(torch.float32)
-        return torch.stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z], 1)
+        return unpack_points(records, self.camera)
 
 
 @dataclass(frozen=True, eq=False)

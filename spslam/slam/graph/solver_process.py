@@ -44,7 +44,7 @@ class SolverProcess:
         self._config, self._pool = config, pool
         self._helper: HelperProcess | None = SOLVERS.take()
         self._known: list[Keyframe] = []  # that the process has
-        self._is_solving = False
+        self._is_solving = self._gives_way = False
         self._here: GraphSolver | None = None
 
     def prepare(self) -> None:
@@ -64,13 +64,14 @@ class SolverProcess:
         """Lets the process wait for all others, where the system can."""
         if self._helper is not None:
             give_way(self._helper.process.pid)
+            self._gives_way = True
 
     def close(self) -> None:
         """Leaves the process to the next run, or ends it where it still solves something. May be called again."""
         helper, self._helper = self._helper, None
         if helper is None:
             return
-        if self._is_solving:
+        if self._is_solving or self._gives_way:  # a priority can't be raised again
             helper.end()
         else:
             SOLVERS.give_back(helper)

@@ -4,9 +4,10 @@ A logistic model, fitted to correct poses and to wrong ones to which tracking co
 
     ln odds = intercept + sum of factor * measure
 
-over the mean robust weight, log10(min_eigenvalue), ln(1 + prediction error), the free-space violation and the shortfall
-of the brightness correlation below the minimum of correct poses. docs/tracking-failure.md explains the terms and how
-well they separate correct from wrong poses; the constants and their origin are in configs/models/pose_confidence.yaml.
+over the mean robust weight, log10(min_eigenvalue), ln(1 + prediction error), the free-space violation and the
+shortfalls of the brightness correlation and of the share of agreeing image features below the minima of correct poses.
+docs/tracking-failure.md explains the terms and how well they separate correct from wrong poses; the constants and their
+origin are in configs/models/pose_confidence.yaml.
 """
 
 import math
@@ -26,14 +27,14 @@ class PoseConfidenceModel:
     Attributes:
         intercept: ln odds of an error where all measures are 0.
         per_mean_robust_weight, per_log10_min_eigenvalue, per_prediction_error, per_free_space_violation,
-            per_missing_correlation: factors of the measures.
+            per_missing_correlation, per_missing_feature_share: factors of the measures.
         score_kernel_m: width of the robust kernel that the first two are measured by, m.
         prediction_error_scale_cm, prediction_error_scale_deg: what counts as 1 in ln(1 + distance + angle).
         eigenvalue_floor, firm_eigenvalue, weak_eigenvalue_factor: how small eigenvalues count.
         max_free_space_violation: larger ones count as this.
         unknown_prediction_error, unknown_free_space_violation: used where the measure is NaN.
         expected_map_coverage: map coverage below which the mean robust weight is scaled up.
-        min_brightness_correlation: minimum of correct poses.
+        min_brightness_correlation, min_feature_share: minima of correct poses.
         max_occluded_share: above it the frame is occluded.
         min_feature_inliers: with as many the pose is known without the motion model.
         min_holding_inliers, min_holding_share: with as many the pose is held where surface leaves it free.

@@ -183,3 +183,12 @@ def test_the_process_ends_with_the_one_that_started_it():
     while stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z":
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def test_a_process_that_gave_way_is_not_left_to_the_next_run(world):
+    solver = SolverProcess(world[0])
+    process = solver._helper.process
+    solver.give_way()
+    solver.close()
+    assert process.wait(60) is not None
+    assert SOLVERS.waiting is None or SOLVERS.waiting.process is not process
