@@ -90,6 +90,8 @@ def resolve_config_path(path: str | os.PathLike) -> Path:
     shipped = given.stem if given.suffix in (".yaml", ".yml") else given.name
     if given.parent in (Path(), Path("configs")) and shipped in config_names():
         return _config_dir() / f"{shipped}.yaml"
+    if given.parent not in (Path(), Path("configs")) and given.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{given}: no such configuration, file or folder")
     near = difflib.get_close_matches(shipped, config_names(), n=1)
     hint = f"did you mean {near[0]}?" if near else f"shipped are {', '.join(config_names())}"
     raise ConfigError(f"{given}: no such configuration; {hint}")

@@ -72,15 +72,21 @@ def read_bytes(path: Path, max_bytes: int, error: type[SpslamError]) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int, error: type[SpslamError]) -> str:
-    """The content of a UTF-8 file of at most `max_bytes` bytes; raises as `read_bytes`, and where it is no text."""
+    """The content of a UTF-8 file of at most `max_bytes` bytes; a mark of the byte order at its start is left out.
+
+    Raises:
+        SpslamError: of class `error`: as `read_bytes`, or it is no text.
+    """
     try:
-        return read_bytes(path, max_bytes, error).decode("utf-8")
+        return read_bytes(path, max_bytes, error).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise error(f"{path}: must be a text file") from None
 
 
 def read_lines(path: Path, error: type[SpslamError], max_bytes: int = MAX_TEXT_BYTES) -> Iterator[str]:
     """The lines of a UTF-8 file one at a time, without their ends, so that memory follows the longest line only.
+
+    A mark of the byte order at the start, which editors on Windows write, is left out.
 
     Args:
         path: the file.
@@ -92,7 +98,7 @@ def read_lines(path: Path, error: type[SpslamError], max_bytes: int = MAX_TEXT_B
     """
     with open_regular(path, error) as file:
         _checked_size(path, file, max_bytes, error)
-        text, number = io.TextIOWrapper(file, encoding="utf-8"), 0
+        text, number = io.TextIOWrapper(file, encoding="utf-8-sig"), 0
         try:
             while line := text.readline(MAX_LINE_CHARACTERS + 1):
                 number += 1

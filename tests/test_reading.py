@@ -16,6 +16,14 @@ def test_a_file_is_read_whole(tmp_path):
     assert list(read_lines(path, DatasetError)) == ["one", "", "two"]
 
 
+def test_a_mark_of_the_byte_order_is_left_out(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("one\ntwo\n", encoding="utf-8-sig")
+    assert path.read_bytes().startswith(b"\xef\xbb\xbf")
+    assert read_text(path, 100, DatasetError) == "one\ntwo\n"
+    assert list(read_lines(path, DatasetError)) == ["one", "two"]
+
+
 def test_what_is_no_regular_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()

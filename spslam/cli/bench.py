@@ -142,5 +142,6 @@ def _print_progress(done: int, total: int, outcome: Any) -> None:
         figures = record["figures"]
         shown = [f"ATE {figures['ate_rmse_cm']:.2f} cm"] if "ate_rmse_cm" in figures else []
         shown += [f"{figures['fps']:.1f} frames/s", f"{record['seconds']:.0f} s"]
+        shown += ["of an earlier call, whose record is in the output folder"] if outcome.earlier else []
         text = ", ".join(shown)
     print(f"[{done}/{total}] {outcome.key}: {text}", file=sys.stderr, flush=True)

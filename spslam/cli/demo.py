@@ -40,9 +40,11 @@ def execute(args: argparse.Namespace) -> None:
     config = load_config("demo", overrides=overrides(args))
 
     from spslam.run.device import resolve_device
+    from spslam.run.output_folder import OutputFolder
 
     resolve_device(config.device)
-    _remove_earlier_demo(RunFolder(args.output))
+    with OutputFolder(args.output).locked():  # a demo that is running would lose its files
+        _remove_earlier_demo(RunFolder(args.output))
     frames = None if args.frames is None else slice(0, args.frames, 1)
     command = f"{command_name()} run demo" + ("" if frames is None else f" --frames 0:{args.frames}")
     run(replace(make_request(config, args.output, frames), command=args.command_line), args.quiet, command)

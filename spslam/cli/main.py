@@ -10,7 +10,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 
-from spslam.cli.parser import Parser
+from spslam.cli.parser import Parser, UsageError
 from spslam.errors import SpslamError
 from spslam.loading import collector_paused
 
@@ -68,12 +68,30 @@ def _run(arguments: list[str]) -> None:
     command = next((argument for argument in arguments if not argument.startswith("-")), None)
     with collector_paused():
         parser = _build_parser(command)
-    args = parser.parse_args(arguments)
+    args = parser.parse_args(_joined(arguments))
     if args.command is None:
         parser.print_help()
         return
     args.command_line = shlex.join(["spslam", *arguments])
     _module(args.command).execute(args)
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """The arguments, with `--frames -5:` as one: argparse takes what begins with a minus for an option.
+
+    Raises:
+        UsageError: the empty text where a path is expected, as an unset shell variable leaves it.
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        before = joined[-1] if joined else ""
+        if before == "--frames" and argument.startswith("-") and ":" in argument:
+            joined[-1] = f"{before}={argument}"
+            continue
+        if before in ("--data", "--output") and argument == "":
+            raise UsageError(f"{before} must be a path, got the empty text (an unset variable of the shell?)")
+        joined.append(argument)
+    return joined
 
 
 def _build_parser(command: str | None) -> Parser:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,17 @@ def execute(args: argparse.Namespace) -> None:
     if not args.quiet:
         if was_finished:
             print("this run had finished before; nothing was left to do")
+            if not args.no_mesh and not RunFolder(output).mesh.exists() and RunFolder(output).map.exists():
+                print(f"it has no mesh; spslam mesh {output} makes one")
         print_summary(metrics, output)
+        if metrics.get("skipped_frames"):
+            print(f"skipped first: {_first_skipped(RunFolder(output))}")
+
+
+def _first_skipped(folder: RunFolder) -> str:
+    """Why the first frame that could not be read was left out."""
+    with folder.skipped.open(encoding="utf-8") as lines:
+        return f"{json.loads(next(lines))['error']}; all are in {folder.skipped}"
 
 
 def make_request(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
+from spslam.datasets.findings import Finding
 from spslam.datasets.frame_arrays import UNNUMBERED, checked_arrays, checked_offset
 from spslam.errors import DatasetError
 
@@ -106,6 +107,9 @@ class RgbdDataset(ABC):
             do not expect it.
         is_random_access: whether each frame is read by itself, so that several processes may share the frames; frames
             of a video, or of a bag, are read best in order.
+        doubts: what opening the recording found doubtful, which a run says as well as a check of the data.
+        remarks: what a check of the data says besides, as it may be meant so.
+        scale_remedy: how the scale of depth is set for this kind of data.
     """
 
     name: str
@@ -114,6 +118,9 @@ class RgbdDataset(ABC):
     border_px: int = 0
     is_registered: bool = True
     is_random_access: bool = False
+    doubts: Sequence[Finding] = ()
+    remarks: Sequence[str] = ()
+    scale_remedy: str = "correct the scale of depth (units per meter)"
 
     @abstractmethod
     def __len__(self) -> int:
@@ -232,6 +239,7 @@ class Subset(RgbdDataset):
         self.border_px = dataset.border_px
         self.is_registered = dataset.is_registered
         self.is_random_access = dataset.is_random_access
+        self.doubts, self.remarks, self.scale_remedy = dataset.doubts, dataset.remarks, dataset.scale_remedy
 
     def __len__(self) -> int:
         return len(self._indices)

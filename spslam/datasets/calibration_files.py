@@ -20,6 +20,7 @@ from spslam.datasets.recording import Calibration
 from spslam.datasets.registration import is_same_view
 from spslam.datasets.text import camera_from_matrix, checked_pose, read_intrinsics_matrix, read_json, read_pose
 from spslam.errors import DatasetError, brief
+from spslam.reading import MAX_JSON_BYTES, read_text
 
 INTRINSICS_FILES = (
     "intrinsics.txt",
@@ -104,8 +105,8 @@ def read_calibration(folder: Path, color_size: Size, depth_size: Size | None) ->
     else:
         color = _read_entry(path, values, color_size)
         depth, scale = None, color.scale
-    own = next((folder / name for name in DEPTH_INTRINSICS_FILES if (folder / name).is_file()), None)
-    if own is not None:
+    if any((folder / name).is_file() for name in DEPTH_INTRINSICS_FILES):
+        own = find_intrinsics(folder, DEPTH_INTRINSICS_FILES)
         if depth is not None:
             raise DatasetError(f"{own}: the depth camera must be in one file, but is in {path.name} too")
         depth = _read_entry(own, read_json(own) if own.suffix == ".json" else {}, depth_size)
@@ -124,11 +125,16 @@ def read_calibration(folder: Path, color_size: Size, depth_size: Size | None) ->
 
 
 def find_intrinsics(folder: Path, names: tuple[str, ...]) -> Path:
-    """The first of some files that is there; raises DatasetError where none is."""
-    for name in names:
-        if (folder / name).is_file():
-            return folder / name
-    raise DatasetError(f"{folder}: must contain the intrinsics in one of {', '.join(names)}, got none")
+    """The one of some files that is there; raises DatasetError where none is, or several that are not all alike."""
+    present = [folder / name for name in names if (folder / name).is_file()]
+    if not present:
+        raise DatasetError(f"{folder}: must contain the intrinsics in one of {', '.join(names)}, got none")
+    if len({read_text(path, MAX_JSON_BYTES, DatasetError) for path in present}) > 1:
+        raise DatasetError(
+            f"{folder}: must contain the intrinsics in one file, got {' and '.join(path.name for path in present)}; "
+            "remove or rename those that do not hold"
+        )
+    return present[0]
 
 
 def lens_model(name: Any, source: str) -> LensModel:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,10 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
+from spslam.datasets.findings import Finding
 from spslam.datasets.images import read_color, read_depth, resized_color
 from spslam.datasets.lens import Rectification
 from spslam.datasets.registration import ColorToDepth
-from spslam.datasets.text import read_pose, read_pose_table
 from spslam.errors import DatasetError
 
 _MAX_NUMBER = 2**63 - 1
@@ -54,6 +54,7 @@ class FileDataset(RgbdDataset):
         registration: brings the color image, which another camera took, to the depth camera's view.
         is_registered: see `RgbdDataset`.
         is_random_access: see `RgbdDataset`.
+        doubts: see `RgbdDataset`.
     """
 
     name: str
@@ -69,6 +70,7 @@ class FileDataset(RgbdDataset):
     border_px: int = 0
     is_registered: bool = True
     is_random_access: bool = True
+    doubts: Sequence[Finding] = ()
 
     def __post_init__(self) -> None:
         if self.gt_poses is not None and not np.isfinite(self.gt_poses).any():
@@ -179,53 +181,3 @@ def paired(color: Path | None, depth: Path | None, timestamp: float) -> FramePat
         kind, present = ("color", depth) if color is None else ("depth", color)
         fault = f"{present}: the {kind} image of this frame is missing"
     return FramePaths(color or depth, depth or color, timestamp, fault)  # type: ignore[arg-type]
-
-
-def attach_pose_table(frames: Mapping[int, FramePaths], table_path: Path) -> tuple[list[FramePaths], np.ndarray | None]:
-    """Gives frames the poses of a table.
-
-    Args:
-        frames: by number.
-        table_path: row `number` is the pose of that frame, see `spslam.datasets.text.read_pose_table`.
-
-    Returns:
-        The frames in order, those whose pose is no rigid motion with a fault; and float64 [F, 4, 4], NaN for frames
-        beyond the table, or None where there is no table.
-
-    Raises:
-        DatasetError: the table can't be read.
-    """
-    if not table_path.is_file():
-        return list(frames.values()), None
-    table, faults = read_pose_table(table_path)
-    numbers = np.array(list(frames), dtype=np.int64)
-    poses = np.full((len(frames), 4, 4), np.nan)
-    known = numbers < len(table)
-    poses[known] = table[numbers[known]]
-    attached = [replace(frame, fault=frame.fault or faults.get(number)) for number, frame in frames.items()]
-    return attached, poses
-
-
-def attach_poses(
-    frames: Mapping[int, FramePaths], pose_path: Callable[[int], Path]
-) -> tuple[list[FramePaths], np.ndarray]:
-    """Gives frames the poses of a file each.
-
-    Args:
-        frames: by number.
-        pose_path: the file of a number.
-
-    Returns:
-        The frames in order, those whose pose file is malformed with a fault; and float64 [F, 4, 4], NaN where the file
-        is missing or says that the pose is unknown.
-    """
-    poses = np.full((len(frames), 4, 4), np.nan)
-    attached = []
-    for row, (number, frame) in enumerate(frames.items()):
-        path = pose_path(number)
-        try:
-            poses[row] = read_pose(path) if path.is_file() else np.nan
-        except DatasetError as error:
-            frame = replace(frame, fault=frame.fault or str(error))
-        attached.append(frame)
-    return attached, poses

@@ -6,13 +6,13 @@ differ, by natural order if there are as many of each. Cameras are read from the
 Depth is a 16-bit PNG or TIFF, or floating-point TIFF or npy, with `depth_scale` units per meter: if nothing says
 otherwise 1000 for integers and 1 for floating point. `confidence/`, 8-bit images of the names of the depth images, is
 heeded if it is there. Poses aren't needed; `poses.txt`, with 16 numbers per frame (4x4 color camera to world, OpenCV
-axes), is read if it is there, and so is `times.txt`, one time (s) per frame.
+axes; NaN where unknown), is read if it is there, and so is `times.txt`, one time (s) per frame.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,17 +20,18 @@ import numpy as np
 
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.calibration_files import read_calibration
-from spslam.datasets.files import FileDataset, FramePaths, attach_pose_table, paired, require_folder
-from spslam.datasets.image_files import ColorFiles, DepthFiles, first_depth_size
-from spslam.datasets.images import DEPTH_SCALE_RULE, first_size, is_depth_scale, read_depth
+from spslam.datasets.files import FileDataset, FramePaths, paired, require_folder
+from spslam.datasets.image_files import ColorFiles, DepthFiles, usual_depth_size
+from spslam.datasets.images import DEPTH_SCALE_RULE, is_depth_scale, read_depth, usual_size
 from spslam.datasets.recording import Calibration, Recording, View
+from spslam.datasets.reference_poses import table_poses
 from spslam.datasets.text import read_numbers
 from spslam.errors import DatasetError
 
 COLOR_FOLDERS = ("color", "rgb", "image", "images")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
-CONFIDENCE_FOLDER, TIMES_FILE = "confidence", "times.txt"
+CONFIDENCE_FOLDER, TIMES_FILE, POSES_FILE = "confidence", "times.txt", "poses.txt"
 FRAMES_PER_SECOND = 30.0
 # The median depth of an indoor recording; outside it the scale is wrong, not the room.
 PLAUSIBLE_MEDIAN_M = (0.1, 20.0)
@@ -52,24 +53,29 @@ def open_folder(
 
     Raises:
         DatasetError: a missing folder or intrinsics, intrinsics of another shape or image size, a camera that is not
-            fully described, images that can't be paired, times that don't ascend, or a depth scale that puts the median
-            depth outside 0.1 to 20 m.
+            fully described, images that can't be paired, times that don't ascend, another count of times or poses than
+            of frames, or a depth scale that puts the median depth outside 0.1 to 20 m.
     """
     colors = list_images(_color_folder(require_folder(folder)), COLOR_SUFFIXES)
     depths = list_images(folder / "depth", DEPTH_SUFFIXES)
-    frames = with_times(_pair(folder, colors, depths), folder / TIMES_FILE)
-    size, depth_size = first_size(colors), first_depth_size(depths)
+    found = _pair(folder, colors, depths)
+    frames = with_times(found, folder / TIMES_FILE)
+    (size, odd_colors), (depth_size, odd_depths) = usual_size(colors), usual_depth_size(depths)
+    frames = _with_faults(frames, odd_colors | odd_depths)
     calibration, stored_scale = read_calibration(folder, size, depth_size)
     scale = stored_scale if depth_scale is None else depth_scale
     if scale is not None and not is_depth_scale(scale):
         raise DatasetError(f"{folder}: depth_scale must be {DEPTH_SCALE_RULE}, got {scale}")
     check_scale([frame.depth for frame in frames if frame.fault is None], scale)
-    frames, poses = attach_pose_table(dict(enumerate(frames)), folder / "poses.txt")
+    # A recording that was killed may have the pose of a last frame whose time it has not.
+    reference = table_poses(range(len(frames)), folder / POSES_FILE, (len(frames), len(found)))
     confidence = _confidence_files(folder / CONFIDENCE_FOLDER, frames) if min_confidence > 0 else None
     name = f"folder/{folder.name}"
     if confidence is None and _is_one_camera(calibration):
-        return FileDataset(name, calibration.color.camera, frames, poses, scale)
-    return file_recording(name, frames, calibration, poses, scale, confidence, min_confidence, view)
+        return FileDataset(name, calibration.color.camera, frames, reference.poses, scale, doubts=reference.doubts)
+    dataset = file_recording(name, frames, calibration, reference.poses, scale, confidence, min_confidence, view)
+    dataset.doubts = reference.doubts
+    return dataset
 
 
 def file_recording(
@@ -130,6 +136,13 @@ def with_times(frames: list[FramePaths], path: Path) -> list[FramePaths]:
     return [replace(frame, timestamp=float(time)) for frame, time in zip(frames, times, strict=True)]
 
 
+def _with_faults(frames: list[FramePaths], faults: Mapping[Path, str]) -> list[FramePaths]:
+    """Frames with what is wrong with their images; those that have a fault keep it."""
+    if not faults:
+        return frames
+    return [replace(frame, fault=frame.fault or faults.get(frame.color) or faults.get(frame.depth)) for frame in frames]
+
+
 def _counts_from_zero(frames: Sequence[FramePaths]) -> bool:
     """Whether frames are named 000000, 000001, ..., so that a name tells its row in a file of all frames."""
     return all(frame.depth.stem == f"{number:06d}" for number, frame in enumerate(frames))
@@ -146,24 +159,43 @@ def _confidence_files(folder: Path, frames: Sequence[FramePaths]) -> list[Path |
     if not folder.is_dir():
         return None
     found = {path.stem: path for path in list_images(folder, (".png",))}
-    return [found.get(frame.depth.stem) for frame in frames]
+    maps = [found.get(frame.depth.stem) for frame in frames]
+    if not any(maps):
+        raise DatasetError(
+            f"{folder}: maps must have the names of the depth images, got {next(iter(found.values())).name} beside "
+            f"{frames[0].depth.name}; rename them, or set dataset.min_confidence=0 to do without"
+        )
+    return maps
 
 
 def _color_folder(folder: Path) -> Path:
-    for name in COLOR_FOLDERS:
-        if (folder / name).is_dir():
-            return folder / name
-    raise DatasetError(f"{folder}: must contain a folder color (or rgb, image, images) beside depth, got none")
+    present = [name for name in COLOR_FOLDERS if (folder / name).is_dir()]
+    if not present:
+        raise DatasetError(f"{folder}: must contain a folder color (or rgb, image, images) beside depth, got none")
+    filled = [name for name in present if _images(folder / name, COLOR_SUFFIXES)]
+    if len(filled) > 1:
+        raise DatasetError(
+            f"{folder}: must contain one folder of color images, got {' and '.join(filled)}; rename or move the other"
+        )
+    return folder / (filled or present)[0]
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The images of a folder in natural order; raises DatasetError where there are none."""
-    paths = [
-        path for path in require_folder(folder).iterdir() if path.suffix.lower() in suffixes and path.name[0] != "."
-    ]
+    """The images of a folder in natural order; raises DatasetError where there are none, or two of one name."""
+    paths = _images(require_folder(folder), suffixes)
     if not paths:
         raise DatasetError(f"{folder}: must contain images ({', '.join(suffixes)}), got none")
-    return sorted(paths, key=lambda path: _natural_order(path.name))
+    ordered = sorted(paths, key=lambda path: _natural_order(path.name))
+    found: dict[str, Path] = {}
+    for path in ordered:
+        other = found.setdefault(path.stem, path)
+        if other is not path:
+            raise DatasetError(f"{path}: must be the only image of its name, got {other.name} as well; remove one")
+    return ordered
+
+
+def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    return [path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.name[0] != "."]
 
 
 def _natural_order(name: str) -> list[tuple[int, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,14 +10,15 @@ from pathlib import Path
 from spslam.datasets.arkitscenes import COLOR_FOLDERS as ARKITSCENES_FOLDERS
 from spslam.datasets.arkitscenes import DEPTH_FOLDER as ARKITSCENES_DEPTH
 from spslam.datasets.calibration_files import INTRINSICS_FILES
-from spslam.datasets.folder import COLOR_FOLDERS
+from spslam.datasets.folder import COLOR_FOLDERS, POSES_FILE, TIMES_FILE
 from spslam.datasets.icl_nuim import ASSOCIATIONS_FILE
-from spslam.datasets.open3d_recording import find_folder
+from spslam.datasets.open3d_recording import find_folder, trajectory_file
 from spslam.datasets.record3d import METADATA_FILES
 from spslam.datasets.rosbag.bag import BAG_SUFFIXES, METADATA_FILE, Bag
 from spslam.datasets.rosbag.realsense import is_realsense
 from spslam.datasets.scannetpp import POSES_FILE as SCANNETPP_FILE
 from spslam.datasets.stray_scanner import ODOMETRY_FILE
+from spslam.datasets.tum import names_of
 from spslam.datasets.video import VIDEO_SUFFIXES
 from spslam.datasets.video_recording import find_video
 from spslam.errors import DatasetError
@@ -25,6 +27,8 @@ from spslam.errors import DatasetError
 RECORDING_SUFFIXES = (*BAG_SUFFIXES, ".r3d", ".sens", *VIDEO_SUFFIXES)
 # Of formats whose depth is 16-bit millimeters by default; only these names are looked for, at one level.
 _OPEN3D_INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
+# As a word: not in "bonnet" or "carbonn".
+_BONN = re.compile(r"(?<![a-z])bonn(?![a-z])")
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,7 @@ def _has_bag(path: Path) -> bool:
 
 
 def _is_bonn(path: Path) -> bool:
-    return _has("rgb.txt", "depth.txt")(path) and "bonn" in path.resolve().name.lower()
+    return _has("rgb.txt", "depth.txt")(path) and any(_BONN.search(name.lower()) for name in names_of(path))
 
 
 def _is_record3d(path: Path) -> bool:
@@ -123,10 +127,11 @@ def _is_scannet(path: Path) -> bool:
 def _is_open3d(path: Path) -> bool:
     if not (path / "depth").is_dir():
         return find_folder(path, ("*-color",)) is not None and find_folder(path, ("*-depth*",)) is not None
+    if _is_folder(path) and any((path / name).is_file() for name in (POSES_FILE, TIMES_FILE)):
+        return False  # no recorder of Open3D writes these, and as its recording they would not be read
     has_color = any((path / name).is_dir() for name in COLOR_FOLDERS)
-    has_log = next(path.glob("*.log"), None) is not None or (path.parent / f"{path.name}_trajectory.log").is_file()
     named = any((path / name).is_file() for name in _OPEN3D_INTRINSICS)
-    return has_color and (has_log or named)
+    return has_color and (named or trajectory_file(path) is not None)
 
 
 def _is_video(path: Path) -> bool:

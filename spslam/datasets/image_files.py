@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spslam.datasets.images import Size, read_color, read_confidence, read_depth
+from spslam.datasets.images import Size, read_color, read_confidence, read_depth, usual_size
 from spslam.datasets.recording import ImageStream
 from spslam.errors import DatasetError
 
@@ -77,6 +77,14 @@ class DepthFiles(ImageStream):
 
     def describe(self, number: int) -> str:
         return str(self.paths[number])
+
+
+def usual_depth_size(paths: Sequence[Path]) -> tuple[Size | None, dict[Path, str]]:
+    """As `usual_size` of depth images; None where none can be read."""
+    try:
+        return usual_size(paths, lambda path: read_depth(path, 1.0))
+    except DatasetError:
+        return None, {}
 
 
 def first_depth_size(paths: Sequence[Path]) -> Size | None:

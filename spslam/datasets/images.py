@@ -30,6 +30,9 @@ _DEPTH_TYPES = (np.uint16, np.float32, np.float64)
 _LEAST_UNITS, _MOST_UNITS = 1e-3, 1e9
 DEPTH_SCALE_RULE = f"a number from {_LEAST_UNITS:g} to {_MOST_UNITS:g}"
 
+# Where a recording is looked at for the size of its images, as shares of its length, and how many alike are enough.
+_LOOKED_AT, _ENOUGH_ALIKE = (0.0, 0.5, 1.0, 0.25, 0.75), 3
+
 Size = tuple[int, int]
 
 
@@ -192,6 +195,34 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], np.ndarray] = read_
         else:
             return width, height
     raise first_error or DatasetError("first_size: paths must not be empty, got none")
+
+
+def usual_size(paths: Sequence[Path], read: Callable[[Path], np.ndarray] = read_color) -> tuple[Size, dict[Path, str]]:
+    """The size of most images, by a few that are spread over the recording, so that an odd one is told from the others.
+
+    Args:
+        paths: the images in order.
+        read: reads one of them.
+
+    Returns:
+        (width, height), of sizes that are as frequent the first one's; and what is wrong with images of another one.
+
+    Raises:
+        DatasetError: as `first_size`.
+    """
+    sizes: dict[Path, Size] = {}
+    for number in dict.fromkeys(round(share * (len(paths) - 1)) for share in _LOOKED_AT):
+        if len(sizes) >= _ENOUGH_ALIKE and len(set(sizes.values())) == 1:
+            break
+        try:
+            height, width = read(paths[number]).shape[:2]
+        except DatasetError:
+            continue
+        sizes[paths[number]] = width, height
+    found = list(sizes.values())
+    usual = max(found, key=found.count) if found else first_size(paths, read)
+    rule = f"must be as large as most images of the recording, {_text(usual)}"
+    return usual, {path: f"{path}: {rule}, got {_text(size)}" for path, size in sizes.items() if size != usual}
 
 
 def resized_color(color: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.frozen_depth import frozen_frames
-from spslam.datasets.plausibility import Finding, Judgment, check_stretch, folded
+from spslam.datasets.plausibility import Finding, Judgment, check_stretch, folded, with_whole
 from spslam.datasets.reprojection import (
     Agreement,
     DepthPair,
@@ -88,7 +88,7 @@ class Inspection:
         frames_per_second: from the median step between timestamps; NaN where unknown.
         depth: None where no frame has depth.
         poses: None where none is known.
-        findings: what a look at a few stretches says of intrinsics, scale, pairing and order.
+        findings: what a look at a few stretches says of intrinsics, scale, pairing and order, and what opening said.
         focal_error: share by which the focal length looks too large by how color moves against depth, and its standard
             deviation; None where that can't be told.
         color_offset: from depth images to their color images, as stamps say: mean and standard deviation, s; None where
@@ -135,7 +135,8 @@ def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> 
         poses,
     )
     judgments = _judge_stretches(dataset, frames)
-    found.findings = folded(finding for judgment in judgments for finding in judgment.findings)
+    of_stretches = folded(finding for judgment in judgments for finding in judgment.findings)
+    found.findings = with_whole(dataset, of_stretches)
     found.focal_error = _focal_error(judgments)
     if any(offsets):
         found.color_offset = float(np.mean(offsets)), float(np.std(offsets))
@@ -146,6 +147,7 @@ def inspect_dataset(dataset: RgbdDataset, frames: int = 40, pairs: int = 12) -> 
         *_frozen_problems(frozen, found.findings),
         *_pose_problems(found, problem),
         *_time_problems(dataset.timestamps(), found.findings),
+        *dataset.remarks,
     ]
     return found
 

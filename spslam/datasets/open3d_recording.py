@@ -24,7 +24,8 @@ from spslam.datasets.image_files import first_depth_size
 from spslam.datasets.images import first_size
 from spslam.datasets.lens import Lens
 from spslam.datasets.recording import Calibration, Recording, View
-from spslam.datasets.text import checked_poses, read_numbers
+from spslam.datasets.reference_poses import ReferencePoses
+from spslam.datasets.text import checked_poses, motion_fault, read_numbers
 from spslam.errors import DatasetError
 
 _COLOR_FOLDERS, _DEPTH_FOLDERS = ("color", "rgb", "image", "*-color"), ("depth", "*-depth*")
@@ -58,8 +59,10 @@ def open_open3d(folder: Path, depth_scale: float | None = None, view: View = "de
         calibration = Calibration.of_one_view(Lens(_PRIMESENSE.resized(*size)), depth_size or size)
     scale = depth_scale or scale
     check_scale([frame.depth for frame in paths if frame.fault is None], scale)
-    poses = _poses(folder, list(frames))
-    return file_recording(f"open3d/{folder.name}", paths, calibration, poses, scale, None, 0, view)
+    reference = _reference_poses(folder, len(frames))
+    dataset = file_recording(f"open3d/{folder.name}", paths, calibration, reference.poses, scale, None, 0, view)
+    dataset.doubts = reference.doubts
+    return dataset
 
 
 def find_folder(folder: Path, patterns: tuple[str, ...]) -> Path | None:
@@ -102,31 +105,36 @@ def _numbered(folder: Path) -> dict[int, tuple[Path, int | None]]:
     found: dict[int, tuple[Path, int | None]] = {}
     for path in sorted(folder.iterdir()):
         match = _IMAGE.fullmatch(path.name)
-        if match is not None:
-            found.setdefault(int(match[1]), (path, None if match[2] is None else int(match[2])))
+        if match is None:
+            continue
+        other, _ = found.setdefault(int(match[1]), (path, None if match[2] is None else int(match[2])))
+        if other is not path:
+            raise DatasetError(f"{path}: must be the only image of its number, got {other.name} as well; remove one")
     return found
 
 
-def _poses(folder: Path, numbers: list[int]) -> np.ndarray | None:
-    path = _trajectory_file(folder)
+def _reference_poses(folder: Path, frames: int) -> ReferencePoses:
+    path = trajectory_file(folder)
     if path is None:
-        return None
+        return ReferencePoses()
     values = read_numbers(path)
     if not values.size or values.size % _NUMBERS_PER_POSE:
         raise DatasetError(
             f"{path}: must have three whole numbers and a 4x4 matrix per pose, got {values.size} numbers"
         )
     rows = values.reshape(-1, _NUMBERS_PER_POSE)
-    stored, _ = checked_poses(rows[:, 3:].reshape(-1, 4, 4))
-    poses = np.full((len(numbers), 4, 4), np.nan)
+    stored, is_motion = checked_poses(rows[:, 3:].reshape(-1, 4, 4))
+    poses = np.full((frames, 4, 4), np.nan)
     # The first number counts the frames from 0, whatever the first image is called.
     places = rows[:, 0]
-    known = np.isfinite(places) & (places >= 0) & (places < len(numbers))
+    known = np.isfinite(places) & (places >= 0) & (places < frames)
     poses[places[known].astype(np.int64)] = stored[known]
-    return poses
+    damaged = [motion_fault(f"{path}, pose {row}", rows[row, 3:]) for row in np.flatnonzero(~is_motion)]
+    return ReferencePoses.of(poses, damaged, str(path))
 
 
-def _trajectory_file(folder: Path) -> Path | None:
+def trajectory_file(folder: Path) -> Path | None:
+    """The file of a recording's poses; None where there is none."""
     patterns = ("trajectory.log", "*_trajectory.log", "*-traj.txt", "scene/trajectory.log")
     for place, names in ((folder, patterns), (folder.parent, (f"{folder.name}_trajectory.log",))):
         for name in names:

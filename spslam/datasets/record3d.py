@@ -183,7 +183,7 @@ def _frame_names(archive: _Archive) -> tuple[list[str], list[str], np.ndarray]:
 
 def _parse(content: bytes, source: str) -> dict[str, Any]:
     try:
-        return parse_json(content.decode("utf-8"), source, DatasetError)
+        return parse_json(content.decode("utf-8-sig"), source, DatasetError)
     except UnicodeDecodeError:
         raise DatasetError(f"{source}: must be a text file") from None
 

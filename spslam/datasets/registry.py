@@ -42,6 +42,7 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
         raise DatasetError(f"dataset.type must be one of {', '.join(dataset_types())}, got {config.type}")
     dataset.depth_range = (_option(config, "min_depth_m", 0.0), _option(config, "max_depth_m", float("inf")))
     dataset.border_px = _option(config, "border_px", 0)
+    dataset.scale_remedy = _SCALE_REMEDIES.get(config.type, _FIXED_SCALE.format(config.type))
     stride = _option(config, "stride", 1)
     return dataset if stride == 1 else Subset(dataset, step=stride)
 
@@ -159,6 +160,22 @@ _OPENERS: dict[str, _Opener] = {
     "icl_nuim": _open_with("icl_nuim", "open_icl_nuim"),
 }
 _RENDERED: dict[str, Callable[[Any], RgbdDataset]] = {"generated": _open_generated, "places": _open_places}
+
+
+_SET_SCALE = "set dataset.depth_scale (units per meter)"
+_SET_SCALE_OR_FILE = "set dataset.depth_scale (units per meter), or depth_scale in the JSON file of the intrinsics"
+_TUM_SCALE = (
+    "convert the depth images to 5000 units per meter, as this layout has it, or lay them out as a folder recording, "
+    "which has dataset.depth_scale"
+)
+# Of kinds whose depth has a unit that can be set or changed; that of the others is their format's.
+_SCALE_REMEDIES = {
+    **dict.fromkeys(("folder", "video", "open3d"), _SET_SCALE_OR_FILE),
+    **dict.fromkeys(("rosbag", "realsense"), _SET_SCALE),
+    **dict.fromkeys(("tum", "bonn", "icl_nuim"), _TUM_SCALE),
+    "replica": "correct camera.scale (units per meter) in cam_params.json",
+}
+_FIXED_SCALE = "convert the depth images to the unit that the format has ({})"
 
 
 def _given(config: Any, names: Sequence[str]) -> dict[str, Any]:

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, attach_pose_table, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import DEPTH_SCALE_RULE, first_size, is_depth_scale
+from spslam.datasets.reference_poses import table_poses
 from spslam.datasets.text import camera_from_matrix, read_json
 from spslam.errors import DatasetError, brief
 
@@ -36,8 +37,10 @@ def open_replica(folder: Path) -> FileDataset:
     if not colors:
         raise DatasetError(f"{folder}: must contain results/frame000000.jpg and so on, got none")
     camera, units_per_meter = _read_camera(_find_camera_file(folder), *first_size(colors.values()))
-    frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "traj.txt")
-    return FileDataset(f"replica/{folder.name}", camera, frames, poses, units_per_meter)
+    frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
+    reference = table_poses(list(frames), folder / "traj.txt")
+    name, doubts = f"replica/{folder.name}", reference.doubts
+    return FileDataset(name, camera, list(frames.values()), reference.poses, units_per_meter, doubts=doubts)
 
 
 def _find_camera_file(folder: Path) -> Path:

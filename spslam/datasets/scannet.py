@@ -15,8 +15,9 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdDataset, RgbdFrame
-from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import depth_in_meters, first_size, read_depth, resized_color
+from spslam.datasets.reference_poses import ReferencePoses, file_poses
 from spslam.datasets.sens import SensFile
 from spslam.datasets.text import camera_from_matrix, checked_poses, motion_fault, read_intrinsics_matrix
 from spslam.errors import DatasetError
@@ -117,9 +118,11 @@ class SensDataset(RgbdDataset):
     def _read_poses(self, stored: np.ndarray) -> np.ndarray:
         ordered = stored[self._order]
         poses, is_motion = checked_poses(ordered.reshape(-1, 4, 4))
-        for row in np.flatnonzero(~is_motion):
-            name = f"{self._file.describe(self._order[row])}, pose"
-            self._faults.setdefault(int(row), motion_fault(name, ordered[row]))
+        damaged = [
+            motion_fault(f"{self._file.describe(self._order[row])}, pose", ordered[row])
+            for row in np.flatnonzero(~is_motion)
+        ]
+        self.doubts = ReferencePoses.of(poses, damaged, f"the poses in {self._file.path}").doubts
         return poses
 
     def _stand_in_for_the_rest(self, announced: int) -> None:
@@ -152,8 +155,9 @@ def _open_exported(folder: Path, name: str) -> FileDataset:
     size = first_size(depths.values(), lambda path: read_depth(path, 1000.0))
     camera = _find_camera(folder, size, list(colors.values()))
     paired = pair_numbered(colors, depths, FRAMES_PER_SECOND)
-    frames, poses = attach_poses(paired, lambda number: folder / "pose" / f"{number}.txt")
-    return FileDataset(name, camera, frames, poses, units_per_meter=1000.0, resize_color=True)
+    reference = file_poses(list(paired), lambda number: folder / "pose" / f"{number}.txt")
+    frames, doubts = list(paired.values()), reference.doubts
+    return FileDataset(name, camera, frames, reference.poses, units_per_meter=1000.0, resize_color=True, doubts=doubts)
 
 
 def _find_camera(folder: Path, size: tuple[int, int], colors: list[Path]) -> Camera:

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, attach_poses, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import first_size
+from spslam.datasets.reference_poses import file_poses
 from spslam.datasets.registration import ColorToDepth
 from spslam.datasets.text import read_intrinsics_matrix, read_rows
 from spslam.errors import DatasetError
@@ -69,20 +70,19 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None, registere
             + _hint(sequence_folder)
         )
     camera = _find_camera(sequence_folder, list(colors.values()))
-    frames, poses = attach_poses(
-        pair_numbered(colors, depths, FRAMES_PER_SECOND),
-        lambda number: sequence_folder / f"frame-{number:06d}.pose.txt",
-    )
+    frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
+    reference = file_poses(list(frames), lambda number: sequence_folder / f"frame-{number:06d}.pose.txt")
     registration = None if _is_registered(camera, registered) else _registration(camera)
     return FileDataset(
         f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}",
         camera,
-        frames,
-        poses,
+        list(frames.values()),
+        reference.poses,
         units_per_meter=1000.0,
         invalid_depth=(65535,),
         registration=registration,
         is_registered=registration is not None,  # what is taken as one camera's need not be
+        doubts=reference.doubts,
     )
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.files import FileDataset, attach_pose_table, find_numbered, pair_numbered, require_folder
+from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
 from spslam.datasets.images import first_size
+from spslam.datasets.reference_poses import table_poses
 from spslam.datasets.text import camera_from_matrix, read_numbers
 from spslam.errors import DatasetError
 
@@ -40,10 +41,11 @@ def open_synthetic_rgbd(folder: Path, depth_variant: str | None = None) -> FileD
     if not colors:
         raise DatasetError(f"{folder}: must contain images/img0.png (or jpg) and so on, got none")
     camera = _read_camera(folder / "focal.txt", *first_size(colors.values()))
-    frames, poses = attach_pose_table(pair_numbered(colors, depths, FRAMES_PER_SECOND), folder / "poses.txt")
-    if poses is not None:
-        poses = poses @ _OPENCV_FROM_OPENGL
-    return FileDataset(f"synthetic_rgbd/{folder.name}", camera, frames, poses, units_per_meter=1000.0)
+    frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
+    reference = table_poses(list(frames), folder / "poses.txt")
+    poses = None if reference.poses is None else reference.poses @ _OPENCV_FROM_OPENGL
+    name, doubts = f"synthetic_rgbd/{folder.name}", reference.doubts
+    return FileDataset(name, camera, list(frames.values()), poses, units_per_meter=1000.0, doubts=doubts)
 
 
 def _depth_folder(folder: Path, variant: str | None) -> Path:

@@ -17,6 +17,8 @@ from spslam.reading import MAX_JSON_BYTES, parse_json, read_lines, read_text
 # 7-Scenes' rotations are off by up to about 1e-3; a matrix this far from a rotation is no pose at all.
 ROTATION_TOLERANCE = 0.1
 _LAST_ROW_TOLERANCE = 1e-6
+# Of a table of poses: lines of 4 come in fours.
+_POSE_COLUMNS = (4, 12, 16)
 # No camera's focal length lies outside; with any, ratios of two cameras would overflow.
 _FOCAL_RANGE_PX = (0.1, 1e6)
 
@@ -32,13 +34,18 @@ def read_numbers(path: Path) -> np.ndarray:
     """
     numbers = array("d")
     for line in read_lines(path, DatasetError):
-        if line.lstrip().startswith("#"):
-            continue
-        try:
-            numbers.extend(map(float, line.replace(",", " ").split()))
-        except ValueError as error:
-            raise DatasetError(f"{path}: must contain numbers only: {brief(str(error))}") from None
+        numbers.extend(_parsed(line, path))
     return np.array(numbers, dtype=np.float64)
+
+
+def _parsed(line: str, path: Path) -> list[float]:
+    """The numbers of a line, none of a comment."""
+    if line.lstrip().startswith("#"):
+        return []
+    try:
+        return [float(word) for word in line.replace(",", " ").split()]
+    except ValueError as error:
+        raise DatasetError(f"{path}: must contain numbers only: {brief(str(error))}") from None
 
 
 def read_rows(path: Path, columns: int) -> Iterator[list[str]]:
@@ -104,22 +111,40 @@ def read_pose(path: Path) -> np.ndarray:
 
 
 def read_pose_table(path: Path) -> tuple[np.ndarray, dict[int, str]]:
-    """Poses of a file with 16 numbers each, row by row.
+    """Poses of a file: a row of 16 numbers each (4x4, row by row), or of 12 (3x4), or four lines of 4.
 
     Returns:
         float64 [F, 4, 4], NaN where the file has a non-finite number or no rigid motion; and what is wrong with the
         latter, by number.
 
     Raises:
-        DatasetError: no such file, or the count of its numbers is no multiple of 16.
+        DatasetError: no such file, not a text file, something else than numbers in it, or rows of another length.
     """
-    numbers = read_numbers(path)
-    if numbers.size % 16:
-        raise DatasetError(f"{path}: must have 16 numbers per pose, got {numbers.size} numbers")
-    poses, is_motion = checked_poses(numbers.reshape(-1, 4, 4))
-    rows = numbers.reshape(-1, 16)
+    numbers, columns, lines = array("d"), 0, 0
+    for number, line in enumerate(read_lines(path, DatasetError), start=1):
+        row = _parsed(line, path)
+        if not row:
+            continue
+        columns, lines = columns or len(row), lines + 1
+        # Rows of other files, such as TUM's trajectories of 8 numbers, would make up matrices where they are joined.
+        if len(row) not in _POSE_COLUMNS or len(row) != columns:
+            raise DatasetError(f"{path}: {_pose_rule(len(row))}, got {len(row)} numbers in line {number}")
+        numbers.extend(row)
+    if columns == 4 and lines % 4:
+        raise DatasetError(f"{path}: {_pose_rule(4)}, got {lines} lines of 4 numbers")
+    size = 12 if columns == 12 else 16
+    stored = np.tile(np.eye(4), (len(numbers) // size, 1, 1))
+    rows = stored.reshape(len(stored), 16)
+    rows[:, :size] = np.array(numbers, dtype=np.float64).reshape(-1, size)
+    poses, is_motion = checked_poses(stored)
     faults = {int(i): motion_fault(f"{path}, pose {i}", rows[i]) for i in np.flatnonzero(~is_motion)}
     return poses, faults
+
+
+def _pose_rule(columns: int) -> str:
+    """What a table of poses must hold; names the format that a row of another length looks like."""
+    rule = "must have 16 numbers per pose (4x4, row by row, as one row or four lines; or 12, without the last row)"
+    return rule + (", not a time, a position and a quaternion" if columns == 8 else "")
 
 
 def checked_pose(numbers: np.ndarray, name: str) -> np.ndarray:

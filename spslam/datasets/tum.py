@@ -15,6 +15,7 @@ half and below in the upper one; edges of color as it was taken lie beside those
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,13 +26,14 @@ from spslam.camera import Camera
 from spslam.datasets.base import MAX_FRAMES
 from spslam.datasets.clock import capture_offsets, capture_times
 from spslam.datasets.files import FileDataset, FramePaths, require_folder
+from spslam.datasets.findings import Finding
 from spslam.datasets.images import first_size
 from spslam.datasets.lens import Lens, Rectification
-from spslam.datasets.pairing import associate, interpolate_trajectory, sorted_trajectory
+from spslam.datasets.pairing import associate
+from spslam.datasets.reference_poses import trajectory_poses
 from spslam.datasets.text import camera_from_matrix, read_numbers, read_rows
 from spslam.errors import DatasetError, brief
 from spslam.geometry import orthonormalize, pose_from
-from spslam.trajectory import Trajectory
 
 UNITS_PER_METER = 5000.0
 # Further apart, color and depth show different views (the sensor's rate is 30 Hz).
@@ -39,6 +41,9 @@ MAX_PAIR_DIFFERENCE_S = 0.02
 # Motion capture runs at 100 Hz or more; across a longer gap between two of its poses nothing is made up.
 MAX_GROUND_TRUTH_GAP_S = 0.1
 CALIBRATION_FILE = "calibration.txt"
+_UNKNOWN = "default"
+# A stream drops an image now and then; of more, a check of the data says how many.
+_USUAL_UNPAIRED = 0.1
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,16 @@ _CALIBRATIONS = {
         (542.822841, 542.57687, 315.59352, 237.756098), (0.039903, -0.099343, -0.00073, -0.000144, 0.0)
     ),
     # What the authors advise where the camera isn't known: ROS's default, no distortion.
-    "default": _Calibration((525.0, 525.0, 319.5, 239.5), (0.0, 0.0, 0.0, 0.0, 0.0)),
+    _UNKNOWN: _Calibration((525.0, 525.0, 319.5, 239.5), (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
+
+
+_DEFAULT_CAMERA = Finding(
+    "default camera",
+    "the camera is not known: neither is there calibration.txt nor has the folder's name freiburg1, 2 or 3 (fr1, ...) "
+    "in it, so that of ROS is taken, with a focal length of 525 px at 640x480 and no distortion",
+    f"write {CALIBRATION_FILE} with fx fy cx cy (px), and up to five distortion coefficients",
+)
 
 
 # The rotation between Bonn's axes and the camera's, and from the markers on the camera to the camera: T_ros and T_m of
@@ -121,7 +134,7 @@ def open_tum(folder: Path, calibration: str | None = None) -> FileDataset:
     if not len(pairs):
         raise DatasetError(
             f"{folder}: must have color and depth images within {MAX_PAIR_DIFFERENCE_S} s of each other, got none "
-            f"({len(colors)} in rgb.txt, {len(depths)} in depth.txt)"
+            f"({len(colors)} in rgb.txt, {len(depths)} in depth.txt); time stamps must be in seconds, of one clock"
         )
     taken = (capture_times(_times(stream))[pairs[:, i]] for i, stream in enumerate((colors, depths)))
     offsets = capture_offsets(_times(colors)[pairs[:, 0]], *taken)
@@ -129,15 +142,24 @@ def open_tum(folder: Path, calibration: str | None = None) -> FileDataset:
         FramePaths(folder / colors[c][1], folder / depths[d][1], colors[c][0], offsets=own)
         for (c, d), own in zip(pairs, offsets, strict=True)
     ]
-    camera, distortion = _find_calibration(folder, calibration, *first_size(frame.color for frame in frames))
-    return FileDataset(
+    size = first_size(frame.color for frame in frames)
+    found = _read_calibration(folder / CALIBRATION_FILE, *size)
+    name = calibration or _camera_name(folder)
+    camera, distortion = found or _known_calibration(name, *size)
+    times = np.array([frame.timestamp for frame in frames])
+    reference = trajectory_poses(folder / "groundtruth.txt", times, MAX_GROUND_TRUTH_GAP_S)
+    is_guessed = found is None and name == _UNKNOWN
+    dataset = FileDataset(
         f"tum/{folder.name}",
         camera,
         frames,
-        _interpolated_ground_truth(folder / "groundtruth.txt", np.array([frame.timestamp for frame in frames])),
+        reference.poses,
         UNITS_PER_METER,
         undistortion=Rectification.of(Lens(camera, "brown", distortion)) if any(distortion) else None,
+        doubts=(*((_DEFAULT_CAMERA,) if is_guessed else ()), *reference.doubts),
     )
+    dataset.remarks = _unpaired(len(colors), len(pairs))
+    return dataset
 
 
 def _read_list(path: Path) -> list[tuple[float, str]]:
@@ -161,29 +183,44 @@ def _times(entries: list[tuple[float, str]]) -> np.ndarray:
     return np.array([timestamp for timestamp, _ in entries])
 
 
-def _find_calibration(folder: Path, name: str | None, width: int, height: int) -> tuple[Camera, tuple[float, ...]]:
-    path = folder / CALIBRATION_FILE
-    if path.is_file():
-        numbers = read_numbers(path)
-        if not 4 <= numbers.size <= 9:
-            raise DatasetError(
-                f"{path}: must contain fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
-            )
-        if not np.isfinite(numbers).all():
-            raise DatasetError(f"{path}: must contain finite numbers, got {numbers.tolist()}")
-        fx, fy, cx, cy = numbers[:4]
-        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        return camera_from_matrix(matrix, width, height, str(path)), tuple(
-            np.r_[numbers[4:], np.zeros(9 - numbers.size)]
-        )
-    named = re.search(r"(?:freiburg|fr)([123])(?!\d)", folder.resolve().name)
-    calibration = _CALIBRATIONS[name or (f"freiburg{named.group(1)}" if named else "default")]
+def names_of(folder: Path) -> tuple[str, ...]:
+    """The names that a folder may be known by: its own, and that of a link to it."""
+    return folder.resolve().name, Path(os.path.abspath(folder)).name
+
+
+def _unpaired(colors: int, pairs: int) -> tuple[str, ...]:
+    missing = colors - pairs
+    if missing <= _USUAL_UNPAIRED * colors:
+        return ()
+    return (f"depth: {missing} of {colors} color images have no depth image within {MAX_PAIR_DIFFERENCE_S} s",)
+
+
+def _camera_name(folder: Path) -> str:
+    """Whose camera it is by the folder's name."""
+    for name in names_of(folder):
+        named = re.search(r"(?:freiburg|fr)([123])(?!\d)", name)
+        if named:
+            return f"freiburg{named.group(1)}"
+    return _UNKNOWN
+
+
+def _known_calibration(name: str, width: int, height: int) -> tuple[Camera, tuple[float, ...]]:
+    calibration = _CALIBRATIONS[name]
     return Camera(640, 480, *calibration.intrinsics).resized(width, height), calibration.distortion
 
 
-def _interpolated_ground_truth(path: Path, times: np.ndarray) -> np.ndarray | None:
+def _read_calibration(path: Path, width: int, height: int) -> tuple[Camera, tuple[float, ...]] | None:
+    """The camera of a file and its distortion; None where there is no such file."""
     if not path.is_file():
         return None
-    ground_truth = Trajectory.load_tum(path, skip_unknown=True)
-    ordered = sorted_trajectory(ground_truth.timestamps, ground_truth.poses)
-    return interpolate_trajectory(ordered, times, MAX_GROUND_TRUTH_GAP_S)
+    numbers = read_numbers(path)
+    if not 4 <= numbers.size <= 9:
+        raise DatasetError(
+            f"{path}: must contain fx fy cx cy and up to five distortion coefficients, got {numbers.size}"
+        )
+    if not np.isfinite(numbers).all():
+        raise DatasetError(f"{path}: must contain finite numbers, got {numbers.tolist()}")
+    fx, fy, cx, cy = numbers[:4]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    distortion = tuple(np.r_[numbers[4:], np.zeros(9 - numbers.size)])
+    return camera_from_matrix(matrix, width, height, str(path)), distortion

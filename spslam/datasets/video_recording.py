@@ -13,12 +13,13 @@ import numpy as np
 
 from spslam.datasets.calibration_files import read_calibration
 from spslam.datasets.files import require_folder
-from spslam.datasets.folder import DEPTH_SUFFIXES, TIMES_FILE, check_scale, list_images
+from spslam.datasets.folder import DEPTH_SUFFIXES, POSES_FILE, TIMES_FILE, check_scale, list_images
 from spslam.datasets.image_files import DepthFiles, first_depth_size
 from spslam.datasets.images import DEPTH_SCALE_RULE, is_depth_scale
 from spslam.datasets.pairing import pair_by_time
 from spslam.datasets.recording import Recording, View
-from spslam.datasets.text import read_numbers, read_pose_table
+from spslam.datasets.reference_poses import table_poses
+from spslam.datasets.text import read_numbers
 from spslam.datasets.video import VIDEO_SUFFIXES, VideoStream
 from spslam.errors import DatasetError
 
@@ -37,8 +38,8 @@ def open_video_recording(
         view: see `Recording`.
 
     Raises:
-        DatasetError: a missing folder or video, several videos, cameras that are not fully described, or counts that
-            differ without times.
+        DatasetError: a missing folder or video, several videos, cameras that are not fully described, counts that
+            differ without times, or another count of poses than of depth images.
     """
     path = find_video(require_folder(folder))
     if path is None:
@@ -56,9 +57,11 @@ def open_video_recording(
         raise DatasetError(f"{folder}: depth_scale must be {DEPTH_SCALE_RULE}, got {scale}")
     check_scale(depths, scale)
     pairs, seconds = _pairs(folder, video, len(depths), tolerance_s)
-    poses, faults = _poses(folder / "poses.txt", pairs)
+    reference = table_poses(pairs[:, 1].tolist(), folder / POSES_FILE, (len(depths),))
     stream = DepthFiles(depths, seconds, size, scale)
-    return Recording(f"video/{folder.name}", video, stream, pairs, calibration, poses, view=view, faults=faults)
+    dataset = Recording(f"video/{folder.name}", video, stream, pairs, calibration, reference.poses, view=view)
+    dataset.doubts = reference.doubts
+    return dataset
 
 
 def find_video(folder: Path) -> Path | None:
@@ -82,13 +85,3 @@ def _pairs(folder: Path, video: VideoStream, depths: int, tolerance_s: float) ->
             f"{TIMES_FILE}, with one time (s) per depth image, pairs them by time"
         )
     return np.repeat(np.arange(depths)[:, None], 2, axis=1), video.times()
-
-
-def _poses(path: Path, pairs: np.ndarray) -> tuple[np.ndarray | None, dict[int, str]]:
-    if not path.is_file():
-        return None, {}
-    table, faults = read_pose_table(path)
-    poses = np.full((len(pairs), 4, 4), np.nan)
-    known = pairs[:, 1] < len(table)
-    poses[known] = table[pairs[known, 1]]
-    return poses, {row: faults[int(number)] for row, number in enumerate(pairs[:, 1]) if int(number) in faults}

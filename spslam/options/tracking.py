@@ -31,7 +31,7 @@ class TrackingOptions(Section):
         "iterations for each of the first frames", "iterations", needs=(need(above("tracking.first_frames", 0)),), ge=1
     )
     first_frames: int = option("how many frames get `first_iterations`", "frames", ge=0)
-    pixels: int = option("M_t, pixels drawn anew in each iteration", "px", ge=16)
+    pixels: int = option("M_t, pixels drawn anew in each iteration", "px", ge=16, le=2**20)
     rotation_rate: float = option("learning rate of the quaternion", needs=(_ADAM,), ge=0)
     translation_rate: float = option("learning rate of the translation", "m", needs=(_ADAM,), ge=0)
     kernel_start_m: float = option(

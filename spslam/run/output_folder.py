@@ -5,6 +5,7 @@ import errno
 import fcntl
 import json
 import os
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -131,6 +132,7 @@ class OutputFolder(RunFolder):
             for earlier in self.files():
                 if earlier != self.config:
                     earlier.unlink(missing_ok=True)
+            shutil.rmtree(self.previews, ignore_errors=True)
 
     @contextlib.contextmanager
     def _being_emptied(self) -> Iterator[None]:
@@ -148,8 +150,11 @@ class OutputFolder(RunFolder):
             temporary.unlink(missing_ok=True)
 
     def read_log(self) -> list[dict[str, Any]]:
-        """The lines of the log."""
-        return [json.loads(line) for line in self.log.read_text(encoding="utf-8").splitlines()]
+        """The lines of the log; raises OutputError where one is damaged."""
+        try:
+            return [json.loads(line) for line in self.log.read_text(encoding="utf-8").splitlines()]
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{self.log}: damaged ({error}); run again into another --output") from None
 
     def truncate_log(self, frames: int, position: int) -> None:
         """Drops what an interrupted run logged after its last checkpoint.
@@ -157,8 +162,17 @@ class OutputFolder(RunFolder):
         Args:
             frames: number of frames processed before the checkpoint.
             position: in the dataset, of the first frame after the checkpoint.
+
+        Raises:
+            OutputError: it has fewer lines than frames were processed.
         """
-        atomic_write(self.log, "".join(_complete_lines(self.log)[:frames]))
+        lines = _complete_lines(self.log)
+        if len(lines) < frames:
+            raise OutputError(
+                f"{self.log}: must have a line for each of the {frames} frames of the checkpoint, got {len(lines)}; "
+                "run again into another --output"
+            )
+        atomic_write(self.log, "".join(lines[:frames]))
         if self.skipped.exists():
             kept = [line for line in _complete_lines(self.skipped) if json.loads(line)["position"] < position]
             atomic_write(self.skipped, "".join(kept))

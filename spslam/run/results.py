@@ -106,7 +106,9 @@ def write_results(
     trajectory, log = system.trajectory(), folder.read_log()
     lost = trajectory.lost
     if lost.all():
-        raise DatasetError(_not_found(source.name, request.map) if request.map else _nothing_known(source.name, config))
+        raise DatasetError(
+            _not_found(source.name, request.map) if request.map else _nothing_known(source.name, config, log)
+        )
     trajectory.save_tum(folder.trajectory)
     system.state.scene.save(folder.map)
     written = Trajectory.load_tum(folder.trajectory)
@@ -195,8 +197,15 @@ def _not_found(name: str, folder: Path) -> str:
     )
 
 
-def _nothing_known(name: str, config: Config) -> str:
+def _nothing_known(name: str, config: Config, log: Sequence[Mapping[str, Any]]) -> str:
     depth = config.dataset
+    known = max((line.get("valid_depth_share") or 0.0 for line in log), default=0.0)
+    if known >= config.tracking.min_valid_depth_share:
+        return (
+            f"{name}: all frames are lost although up to {100 * known:.0f} % of their pixels have depth: none gave a "
+            "surface to begin a map with; images must not be tiny, and scene.voxel_size_m "
+            f"({config.scene.voxel_size_m:g} m) must suit the distance between their pixels"
+        )
     return (
         f"{name}: all frames are lost: none shows a surface between dataset.min_depth_m "
         f"({depth.min_depth_m:g} m) and dataset.max_depth_m ({depth.max_depth_m:g} m) in at least "

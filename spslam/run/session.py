@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spslam.config import dump_config, load_config
+from spslam.config import Config, dump_config, load_config
 from spslam.datasets.base import RgbdDataset
-from spslam.errors import ConfigError, OutputError
+from spslam.errors import ConfigError, DatasetError, OutputError
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
 from spslam.run.output_folder import OutputFolder
 from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest
 from spslam.run_folder import RunFolder
-from spslam.slam.checkpoint import fingerprint, load_checkpoint
+from spslam.slam.checkpoint import fingerprint, load_checkpoint, read_source
 from spslam.slam.system import SlamSystem
 
 
@@ -56,16 +56,56 @@ def open_session(
         OutputError: the folder can't be used, or its checkpoint belongs to another run.
     """
     folder, identity = OutputFolder(Path(request.output_dir)), identity_of(dataset, request)
+    config = dump_config(_with_absolute_path(system.config), provenance(system.config, system.device))
     if request.resume and folder.checkpoint.exists():
+        _check_data(folder, identity)  # first, as states of other cameras can't be restored
         saved = load_checkpoint(folder.checkpoint, system.state, system.config)
-        if saved["data"] != identity:
-            raise OutputError(f"{folder.path}: belongs to a run over other data or frames; use another --output")
         folder.remove_temporaries()
         folder.truncate_log(system.state.frames.processed, saved["next"])
+        if _options_of(folder) != system.config:  # options that don't change the result so far may be others now
+            atomic_write(folder.config, config)
         return RunSession(folder, identity, len(dataset), saved["next"], RunClock(**saved["clock"]), warnings)
+    if request.resume and folder.trajectory.exists() and not _has_options(folder, request.config):
+        raise OutputError(f"{folder.path}: holds results of a run with other options or data; use another --output")
     folder.create(request.resume)
-    atomic_write(folder.config, dump_config(system.config, provenance(system.config, system.device)))
+    atomic_write(folder.config, config)
     return RunSession(folder, identity, len(dataset), 0, RunClock(), warnings)
+
+
+def _check_data(folder: OutputFolder, identity: dict[str, Any]) -> None:
+    """Raises OutputError where the checkpoint is of other data, frames or another camera."""
+    saved = read_source(folder.checkpoint).get("data")
+    if isinstance(saved, dict) and saved != identity:
+        changed = [name.replace("_", " ") for name in identity | saved if saved.get(name) != identity.get(name)]
+        raise OutputError(
+            f"{folder.path}: belongs to a run over other data or frames ({', '.join(changed)} changed); "
+            "use another --output"
+        )
+
+
+def _options_of(folder: OutputFolder) -> Config | None:
+    """The options in the folder's config.yaml; None where they can't be read."""
+    try:
+        return load_config(folder.config)
+    except ConfigError:
+        return None
+
+
+def _has_options(folder: OutputFolder, config: Config) -> bool:
+    """Whether the run in a folder had the same data and options that decide its result."""
+    earlier = _options_of(folder)
+    same_data = earlier is not None and _path_of(earlier) == _path_of(config)
+    return earlier is not None and same_data and fingerprint(earlier) == fingerprint(config)
+
+
+def _path_of(config: Config) -> str | None:
+    path = config.dataset.path
+    return None if path is None else str(Path(path).resolve())
+
+
+def _with_absolute_path(config: Config) -> Config:
+    """The options as they hold in any working directory."""
+    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"path": _path_of(config)})})
 
 
 def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any] | None:
@@ -98,7 +138,18 @@ def identity_of(dataset: RgbdDataset, request: RunRequest) -> dict[str, Any]:
         "folder": str(Path(request.data_dir).resolve()) if request.data_dir else "",
         "frames": len(dataset),
         "timestamps": hashlib.sha256(dataset.timestamps().tobytes()).hexdigest()[:16],
+        "camera": list(vars(dataset.camera).values()),
+        "first_frame": _content(dataset),
     }
+
+
+def _content(dataset: RgbdDataset) -> str:
+    """Identifies the images of the first frame, and by them the scale of depth; empty where they can't be read."""
+    try:
+        frame = dataset[0]
+    except DatasetError:
+        return ""
+    return hashlib.sha256(frame.depth.tobytes() + frame.color.tobytes()).hexdigest()[:16]
 
 
 def _digest(path: Path) -> str:

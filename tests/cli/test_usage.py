@@ -181,3 +181,17 @@ def test_reader_that_goes_away_is_no_error():
     shell = f"{sys.executable} -m spslam run --help | head -c 1"
     result = subprocess.run(["bash", "-c", shell], cwd=ROOT, capture_output=True, text=True)
     assert result.stderr == ""
+
+
+def test_frames_from_the_end_and_empty_paths(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("spslam.cli.run.execute", lambda args: asked.append(args.frames))
+    for words in (["--frames", "-5:"], ["--frames=-5:"], ["--frames", "-9:-2"]):
+        assert spslam("run", "demo", *words, cwd=tmp_path).returncode == 0
+    assert asked == [slice(-5, None), slice(-5, None), slice(-9, -2)]
+    assert_refused(spslam("run", "tum", "--data", "", cwd=tmp_path), "--data must be a path, got the empty text")
+    assert_refused(spslam("run", "demo", "--output", "", cwd=tmp_path), "--output must be a path, got the empty text")
+
+
+def test_a_mistyped_path_is_no_configuration(tmp_path):
+    assert_refused(spslam("run", "data/tum_fr", cwd=tmp_path), "data/tum_fr: no such configuration, file or folder")

@@ -12,9 +12,11 @@ from tests.datasets.layouts import (
     CAMERA_MATRIX,
     HEIGHT,
     WIDTH,
+    color_image,
     depth_meters,
     matrix_text,
     poses,
+    write_color,
     write_depth,
     write_folder,
 )
@@ -148,13 +150,86 @@ def test_floating_point_depth_is_in_meters(tmp_path):
 
 def test_poses_are_read_if_there(tmp_path):
     folder = write_folder(tmp_path, count=3)
-    (folder / "poses.txt").write_text("".join(matrix_text(pose) for pose in poses(2)))
+    unknown = np.full((4, 4), np.nan)
+    (folder / "poses.txt").write_text("".join(matrix_text(pose) for pose in (*poses(2), unknown)))
     dataset = open_folder(folder)
     np.testing.assert_allclose(dataset[1].pose, poses(2)[1], atol=1e-8)
     assert dataset[2].pose is None
-    (folder / "poses.txt").write_text("".join(matrix_text(pose) for pose in poses(5)))
-    assert dataset[1].pose is not None
-    assert len(open_folder(folder).poses()) == 3
+    for row_size in (12, 16):
+        rows = (" ".join(f"{value:.9e}" for value in pose.ravel()[:row_size]) for pose in poses(3))
+        (folder / "poses.txt").write_text("\n".join(rows))
+        np.testing.assert_allclose(open_folder(folder).poses(), poses(3), atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_another_count_of_poses_than_of_frames_is_refused(tmp_path, count):
+    folder = write_folder(tmp_path, count=3)
+    (folder / "poses.txt").write_text("".join(matrix_text(pose) for pose in poses(count)))
+    with pytest.raises(DatasetError, match=f"poses.txt: must have one pose for each of 3 frames, got {count}; 16 time"):
+        open_folder(folder)
+
+
+def test_the_pose_of_a_frame_that_a_kill_interrupted_is_left_out(tmp_path):
+    folder = write_folder(tmp_path, count=3)
+    for image in folder.glob("*/*"):
+        image.rename(image.with_stem(f"{int(image.stem):06d}"))
+    (folder / "times.txt").write_text("0\n0.1\n")
+    for count in (2, 3):
+        (folder / "poses.txt").write_text("".join(matrix_text(pose) for pose in poses(count)))
+        np.testing.assert_allclose(open_folder(folder).poses(), poses(2), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("# time tx ty tz qx qy qz qw\n0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n", "got 8 numbers in line 2"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n1 0 0 0 0 1 0\n", "got 7 numbers in line 2"),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0\n", "got 5 lines of 4 numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0\n", "got 4 numbers in line 2"),
+    ],
+)
+def test_poses_in_other_columns_are_refused(tmp_path, text, words):
+    folder = write_folder(tmp_path, count=1)
+    (folder / "poses.txt").write_text(text)
+    with pytest.raises(DatasetError, match=f"poses.txt: must have 16 numbers per pose .*{words}"):
+        open_folder(folder)
+
+
+def test_files_that_contradict_each_other_are_refused(tmp_path):
+    folder = write_folder(tmp_path)
+    values = {"fx": 30, "fy": 31, "cx": 15.5, "cy": 11.5, "depth_scale": 5000}
+    (folder / "intrinsics.json").write_text(json.dumps(values))
+    with pytest.raises(DatasetError, match="the intrinsics in one file, got intrinsics.txt and intrinsics.json; remov"):
+        open_folder(folder)
+    (folder / "intrinsics.json").unlink()
+    shutil.copy(folder / "intrinsics.txt", folder / "camera-intrinsics.txt")  # says the same
+    assert len(open_folder(folder)) == 3
+    (folder / "rgb").mkdir()
+    assert len(open_folder(folder)) == 3
+    shutil.copy(folder / "color" / "0.jpg", folder / "rgb" / "0.jpg")
+    with pytest.raises(DatasetError, match="must contain one folder of color images, got color and rgb; rename or mov"):
+        open_folder(folder)
+    shutil.rmtree(folder / "rgb")
+    write_color(folder / "color" / "1.png", color_image(1))
+    with pytest.raises(DatasetError, match=r"color/1.png: must be the only image of its name, got 1.jpg as well"):
+        open_folder(folder)
+
+
+@pytest.mark.parametrize("kind", ["color", "depth"])
+def test_one_odd_image_is_named_and_not_the_intrinsics(tmp_path, kind):
+    folder = write_folder(tmp_path, count=4)
+    (folder / "intrinsics.txt").unlink()
+    values = {"fx": 30, "fy": 31, "cx": 15.5, "cy": 11.5, "width": WIDTH, "height": HEIGHT}
+    (folder / "intrinsics.json").write_text(json.dumps(values))
+    if kind == "color":
+        write_color(folder / "color" / "0.jpg", color_image(0)[::2, ::2])
+    else:
+        write_depth(folder / "depth" / "0.png", depth_meters(0)[::2, ::2])
+    dataset = open_folder(folder)
+    assert dataset.camera == CAMERA
+    with pytest.raises(DatasetError, match=rf"{kind}/0.\w+: must be as large as most images .*, 32x24, got 16x12"):
+        dataset[0]
+    assert dataset[3].depth.any()
 
 
 def test_wrong_layouts(tmp_path):

@@ -1,6 +1,7 @@
 """Folders whose cameras differ: distortion, sizes, places, confidence and times, against exact frames."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -126,6 +127,16 @@ def test_confidence_is_heeded(tmp_path):
         cv2.imwrite(str(folder / "confidence" / f"{i}.png"), confidence)
     shares = [[(open_folder(folder, None, least)[i].depth > 0).mean() for i in range(3)] for least in range(3)]
     assert shares == [[1, 1, 1], [19 / 24, 19 / 24, 1], [19 * 22 / 768, 19 * 22 / 768, 1]]
+    shutil.copytree(folder / "confidence", tmp_path / "maps")
+    for confidence in (folder / "confidence").iterdir():
+        confidence.rename(confidence.with_stem(f"conf_{confidence.stem}"))
+    with pytest.raises(
+        DatasetError, match=r"confidence: maps must have the names .*, got conf_0.png beside 0.png; ren"
+    ):
+        open_folder(folder, min_confidence=1)
+    assert open_folder(folder)[0].depth.any()
+    shutil.rmtree(folder / "confidence")
+    shutil.move(tmp_path / "maps", folder / "confidence")
     cv2.imwrite(str(folder / "confidence" / "1.png"), np.zeros((12, 16), np.uint8))
     dataset = open_folder(folder, None, 1)
     with pytest.raises(DatasetError, match="confidence/1.png: must be as large as the sequence's first image, 32x24"):

@@ -2,16 +2,20 @@
 
 import tracemalloc
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from spslam.camera import Camera
 from spslam.cli.check_data import _rows
-from spslam.datasets import thinning
+from spslam.datasets import open_dataset, registry, thinning
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.clock import CaptureOffsets
+from spslam.datasets.findings import Finding
 from spslam.datasets.inspection import inspect_dataset
+from spslam.datasets.plausibility import check_first_frames
+from spslam.datasets.plausibility.streams import unit_findings
 from spslam.datasets.replica import open_replica
 from spslam.datasets.seven_scenes import open_seven_scenes
 from spslam.datasets.synthetic_rgbd import open_synthetic_rgbd
@@ -196,6 +200,59 @@ def test_jumps_and_gaps_are_reported():
     room = BoxRoom()
     room.given_poses[20:, 0, 3] += 1
     assert any("1 jumps over 30 cm or 20 deg after frame 19" in problem for problem in inspect_dataset(room).problems)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1e3, "frames are 33.3 s apart by their time stamps: these look like milliseconds, not seconds; multiply the"),
+        (1e6, "these look like microseconds"),
+        (1e9, "these look like nanoseconds, not seconds; multiply the time stamps by 1e-09"),
+        (1 / 60, "frames are 0.000556 s apart by their time stamps: these look like minutes"),
+    ],
+)
+def test_another_unit_of_the_time_stamps_is_named(factor, words):
+    room = BoxRoom()
+    room.times = room.times * factor
+    (problem,) = inspect_dataset(room).problems
+    assert words in problem
+    assert [str(finding) for finding in check_first_frames(room)] == [problem]
+
+
+def test_frames_far_apart_that_share_little_may_be_seldom():
+    steps = np.arange(20) * 30.0
+    assert unit_findings(steps, has_overlap=False) == []
+    assert unit_findings(steps, has_overlap=True)
+    assert unit_findings(np.arange(20) * 4.0, has_overlap=True) == []
+    assert unit_findings(np.zeros(20), has_overlap=True) == unit_findings(np.zeros(1), has_overlap=True) == []
+
+
+def test_doubts_and_remarks_of_opening_are_said():
+    room = BoxRoom()
+    room.doubts, room.remarks = (Finding("camera", "the camera is guessed", "write it down"),), ("some are missing",)
+    assert inspect_dataset(room).problems == ["the camera is guessed; write it down", "some are missing"]
+    assert check_first_frames(room) == check_first_frames(Subset(room, 1)) == list(room.doubts)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("folder", "set dataset.depth_scale (units per meter), or depth_scale in the JSON file"),
+        ("rosbag", "set dataset.depth_scale (units per meter)"),
+        ("tum", "convert the depth images to 5000 units per meter"),
+        ("replica", "correct camera.scale (units per meter) in cam_params.json"),
+        ("7scenes", "convert the depth images to the unit that the format has (7scenes)"),
+    ],
+)
+def test_the_scale_is_set_as_the_format_has_it(monkeypatch, kind, words):
+    room = BoxRoom()
+    room.scale = 1000
+    monkeypatch.setitem(registry._OPENERS, kind, lambda config, path: room)
+    dataset = open_dataset(SimpleNamespace(type=kind, path="x"))
+    (problem,) = inspect_dataset(dataset).problems[:1]
+    assert f"the depth scale looks wrong; {words}" in problem
+    assert problem.endswith(": depth 0.001 times as large would fit")
+    assert ("dataset.depth_scale (units" in problem) == ("depth_scale" in words)
 
 
 def test_one_frame_is_enough_to_look_at():

@@ -19,6 +19,7 @@ from tests.datasets.cameras import extrinsics, path, render
 from tests.datasets.layouts import (
     color_image,
     depth_meters,
+    matrix_text,
     poses,
     truncate,
     write_folder,
@@ -135,6 +136,19 @@ def test_redwoods_names_and_its_camera(tmp_path):
     np.testing.assert_allclose(dataset[2].depth, depth_meters(2), atol=2e-4)
 
 
+def test_a_pose_of_open3d_that_is_no_motion_is_unknown(tmp_path):
+    recording = write.write_open3d(tmp_path / "mine", COUNT)
+    lines = (recording / "trajectory.log").read_text().splitlines()
+    lines[6] = "9 9 9 9"  # of the second pose
+    (recording / "trajectory.log").write_text("\n".join(lines))
+    dataset = open_path(recording)
+    assert [frame.pose is None for frame in dataset] == [False, True, False, False, False]
+    assert "trajectory.log, pose 1: must be a rotation and a translation" in str(dataset.doubts[0])
+    shutil.copy(min((recording / "color").iterdir()), recording / "color" / "0.png")
+    with pytest.raises(DatasetError, match="must be the only image of its number, got .* as well; remove one"):
+        open_path(recording)
+
+
 def test_a_video_is_paired_by_time_where_counts_differ(tmp_path):
     recording = write.write_video_recording(tmp_path / "mine", 6)
     for number in (0, 3):
@@ -144,6 +158,9 @@ def test_a_video_is_paired_by_time_where_counts_differ(tmp_path):
     ):
         open_path(recording)
     (recording / "times.txt").write_text("\n".join(str(i / 30 + 0.004) for i in (1, 2, 4, 5)))
+    with pytest.raises(DatasetError, match="poses.txt: must have one pose for each of 4 frames, got 6"):
+        open_path(recording)
+    (recording / "poses.txt").write_text("".join(matrix_text(poses(6)[i]) for i in (1, 2, 4, 5)))
     dataset = open_path(recording)
     assert len(dataset) == 4
     np.testing.assert_allclose(dataset[2].depth, depth_meters(4), atol=1e-6)

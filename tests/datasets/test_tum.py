@@ -1,9 +1,13 @@
+import re
+
 import cv2
 import numpy as np
 import pytest
 
 from spslam.camera import Camera
-from spslam.datasets.tum import associate, interpolate_trajectory, open_tum
+from spslam.datasets.inspection import inspect_dataset
+from spslam.datasets.pairing import associate, interpolate_trajectory
+from spslam.datasets.tum import open_tum
 from spslam.errors import DatasetError
 from spslam.geometry import interpolate_pose
 from spslam.trajectory import Trajectory
@@ -116,6 +120,65 @@ def test_truth_is_optional_and_nothing_is_made_up(tmp_path):
     assert known == [True, True, False, False, False, False, False, False, True, True, True, False]
     (folder / "groundtruth.txt").unlink()
     assert open_tum(folder).poses() is None
+
+
+def shifted(lines, seconds):
+    for line in lines:
+        time, rest = line.split(" ", 1)
+        yield f"{float(time) + seconds:.4f} {rest}"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda lines: [], "groundtruth.txt holds no pose; write poses, or remove it"),
+        (
+            lambda lines: shifted(lines, 500),
+            r"groundtruth.txt covers 1499.95 to 1500.34 s, the frames 1000 to",
+        ),
+        (lambda lines: shifted(lines, -500), r"groundtruth.txt covers 499.95 to 500.34 s, the frames 1000 to"),
+        (
+            lambda lines: lines[3::20],
+            r"groundtruth.txt are 0.2 s apart, and none is interpolated between poses over",
+        ),
+        (lambda lines: lines[2:3] + lines[35:36], r"groundtruth.txt are 0.33 s apart"),
+    ],
+)
+def test_truth_that_covers_no_frame_is_a_doubt(tmp_path, change, words):
+    folder = write_tum(tmp_path / "fr1", count=4)
+    lines = (folder / "groundtruth.txt").read_text().splitlines()[1:]
+    (folder / "groundtruth.txt").write_text("\n".join(change(lines)))
+    dataset = open_tum(folder)
+    assert dataset.poses() is None
+    (doubt,) = dataset.doubts
+    assert re.search(words, str(doubt)), str(doubt)
+
+
+def test_a_camera_that_is_guessed_is_a_doubt(tmp_path):
+    folder = write_tum(tmp_path / "mine")
+    (doubt,) = open_tum(folder).doubts
+    assert "ROS is taken, with a focal length of 525 px at 640x480" in str(doubt)
+    assert "write calibration.txt with fx fy cx cy" in str(doubt)
+    (folder / "calibration.txt").write_text("30 31 15 11\n")
+    assert open_tum(folder).doubts == ()
+    (folder / "calibration.txt").unlink()
+    (tmp_path / "freiburg2_mine").symlink_to(folder)
+    linked = open_tum(tmp_path / "freiburg2_mine")
+    assert linked.doubts == ()
+    assert linked.camera.fx == pytest.approx(520.9 * WIDTH / 640)
+    assert open_tum(write_tum(tmp_path / "fr3")).doubts == ()
+
+
+def test_how_many_color_images_have_no_depth_is_said(tmp_path):
+    folder = write_tum(tmp_path / "fr1", count=20)
+    assert open_tum(folder).remarks == ()
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join([lines[0], *lines[1::2]]))
+    expected = "depth: 10 of 20 color images have no depth image within 0.02 s"
+    assert open_tum(folder).remarks == (expected,)
+    assert inspect_dataset(open_tum(folder)).problems[-1] == expected
+    (folder / "depth.txt").write_text("\n".join(lines[:-1]))
+    assert open_tum(folder).remarks == ()  # as happens in any recording
 
 
 @pytest.mark.parametrize(

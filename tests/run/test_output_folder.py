@@ -3,14 +3,17 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from spslam.config import load_config
 from spslam.errors import DatasetError, OutputError
 from spslam.run.output_folder import OutputFolder, RunLog
 from tests.cli.command import ROOT
 from tests.system.sequences import Recorded, run_on
+from tests.system.test_resume import interrupt
 
 # Holds the lock of a folder until its standard input ends.
 HOLDER = """
@@ -101,3 +104,51 @@ def test_a_log_that_cannot_be_written_is_named():
     log = RunLog(Path("/dev/full"))
     with pytest.raises(OutputError, match="/dev/full: can't be written: No space left on device"), log:
         log.append({"frame": 0})
+
+
+def test_another_camera_or_scale_of_depth_is_other_data(monkeypatch, tmp_path):
+    whole = Recorded(6)
+    interrupt(monkeypatch, tmp_path / "out", 5, "run.checkpoint_every=2", dataset=whole)
+
+    def half(frame):
+        frame.depth = 0.5 * frame.depth
+
+    with pytest.raises(OutputError, match=r"belongs to a run over other data or frames \(first frame changed\)"):
+        run_on(monkeypatch, Recorded(6, half), tmp_path / "out", "run.checkpoint_every=2", resume=True)
+    other = Recorded(6)
+    other.camera = replace(other.camera, fx=other.camera.fx + 1)
+    with pytest.raises(OutputError, match=r"belongs to a run over other data or frames \(camera changed\)"):
+        run_on(monkeypatch, other, tmp_path / "out", "run.checkpoint_every=2", resume=True)
+    run_on(monkeypatch, whole, tmp_path / "out", "run.checkpoint_every=2", resume=True)
+
+
+def test_results_of_another_run_are_not_started_over(monkeypatch, tmp_path):
+    output = tmp_path / "out"
+    run_on(monkeypatch, Recorded(3), output, "run.previews=2")
+    for name in ("metrics.json", "report.html"):  # as after a kill near the end
+        (output / name).unlink()
+    with pytest.raises(OutputError, match="holds results of a run with other options or data"):
+        run_on(monkeypatch, Recorded(3), output, "tracking.iterations=5", resume=True)
+    assert (output / "trajectory.txt").is_file()
+    run_on(monkeypatch, Recorded(4), output, "run.previews=0", resume=True)
+    assert not (output / "previews" / "frame-000000.png").exists()
+
+
+@pytest.mark.parametrize("change", ["shorter", "damaged"])
+def test_a_log_that_does_not_fit_its_checkpoint_is_named(monkeypatch, tmp_path, change):
+    output = tmp_path / "out"
+    interrupt(monkeypatch, output, 5, "run.checkpoint_every=2", dataset=Recorded(6))
+    lines = (output / "log.jsonl").read_text().splitlines(keepends=True)
+    lines = lines[:1] if change == "shorter" else ["{broken\n", *lines[1:]]
+    (output / "log.jsonl").write_text("".join(lines))
+    message = r"log.jsonl: must have a line for each of the \d frames" if change == "shorter" else "log.jsonl: damaged"
+    with pytest.raises(OutputError, match=message):
+        run_on(monkeypatch, Recorded(6), output, "run.checkpoint_every=2", resume=True)
+
+
+def test_options_of_outputs_may_change_when_a_run_is_resumed(monkeypatch, tmp_path):
+    output = tmp_path / "out"
+    interrupt(monkeypatch, output, 5, "run.checkpoint_every=2", dataset=Recorded(6))
+    (output / "config.yaml").unlink()
+    run_on(monkeypatch, Recorded(6), output, "run.checkpoint_every=2", "mesh.resolution_m=0.05", resume=True)
+    assert load_config(output / "config.yaml").mesh.resolution_m == 0.05

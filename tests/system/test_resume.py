@@ -220,7 +220,7 @@ def test_settings_that_do_not_affect_the_result_may_change(monkeypatch, interrup
 
 
 def test_resuming_with_other_frames_is_refused(monkeypatch, interrupted):
-    with pytest.raises(OutputError, match="belongs to a run over other data or frames; use another --output"):
+    with pytest.raises(OutputError, match=r"belongs to a run over other data or frames \(.*\); use another --output"):
         run_on(monkeypatch, Recorded(20), interrupted, resume=True, frames=slice(2, 10))
 
 

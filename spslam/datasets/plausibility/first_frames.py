@@ -12,14 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.findings import Finding, folded
 from spslam.datasets.plausibility.edges import match_edges
-from spslam.datasets.plausibility.findings import Finding, folded
 from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flows
 from spslam.datasets.plausibility.intrinsics import LensEstimate, center_findings, estimate_lens, lens_finding
 from spslam.datasets.plausibility.lens import Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
 from spslam.datasets.plausibility.pose_check import pose_findings
-from spslam.datasets.plausibility.streams import depth_findings, order_findings, repetition_findings, time_findings
+from spslam.datasets.plausibility.streams import (
+    depth_findings,
+    order_findings,
+    repetition_findings,
+    time_findings,
+    unit_findings,
+)
 from spslam.datasets.plausibility.support import PREFERRED, depth_prefers, is_supported
 from spslam.datasets.plausibility.tracks import Followed, Segment, Tracks, follow
 from spslam.datasets.plausibility.views import SECONDS_BETWEEN_VIEWS, Stretch, View, read_views, stretch_of, view_stride
@@ -33,6 +39,7 @@ _FRAMES_PER_FURTHER_VIEW = 20
 _LEAST_POINTS = 30
 # Steps from view to view that nothing could follow.
 _MANY_BROKEN, _LEAST_STEPS = 0.5, 8
+_BROKEN = "steps"
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,18 @@ def check_first_frames(dataset: RgbdDataset) -> list[Finding]:
         dataset: of a run.
     """
     further = max(0, len(dataset) - 10 * _VIEWS_AT_A_TIME) // _FRAMES_PER_FURTHER_VIEW
-    return check_stretch(dataset, 0, min(_MOST_VIEWS, _VIEWS_AT_A_TIME + further)).findings
+    return with_whole(dataset, check_stretch(dataset, 0, min(_MOST_VIEWS, _VIEWS_AT_A_TIME + further)).findings)
+
+
+def with_whole(dataset: RgbdDataset, findings: Sequence[Finding]) -> list[Finding]:
+    """Findings of stretches, and what is known of the recording as a whole.
+
+    Args:
+        dataset: the recording.
+        findings: of its stretches.
+    """
+    has_overlap = all(finding.kind != _BROKEN for finding in findings)
+    return folded([*findings, *dataset.doubts, *unit_findings(dataset.timestamps(), has_overlap)])
 
 
 def check_stretch(dataset: RgbdDataset, start: int, most_views: int = _MOST_VIEWS) -> Judgment:
@@ -96,7 +114,8 @@ def judge(dataset: RgbdDataset, views: Sequence[View], followed: Followed | None
     """
     stretch = stretch_of(dataset, views)
     is_whole = views[-1].index - views[0].index > 0.8 * len(dataset)
-    findings = [*depth_findings(stretch, dataset.depth_range), *repetition_findings(stretch, is_whole)]
+    findings = depth_findings(stretch, dataset.depth_range, dataset.scale_remedy)
+    findings += repetition_findings(stretch, is_whole)
     findings += center_findings(stretch.camera)
     has_depth = any(view.known_share > 0 for view in views)
     if not has_depth or any(finding.certain for finding in findings):
@@ -108,7 +127,7 @@ def judge(dataset: RgbdDataset, views: Sequence[View], followed: Followed | None
     estimate = estimate_lens(points, lens, [_seconds(views, segment) for segment in segments])
     findings += _broken_findings(tracks)
     if estimate is not None:
-        findings += _geometry_findings(stretch, segments, points, estimate, dataset.is_registered)
+        findings += _geometry_findings(stretch, segments, points, estimate, dataset)
     return Judgment(folded(findings), estimate is not None and estimate.is_settled, estimate)
 
 
@@ -128,9 +147,9 @@ def require_sound(findings: Sequence[Finding], name: str) -> None:
 
 
 def _geometry_findings(
-    stretch: Stretch, segments: list[Segment], points: list[Points], estimate: LensEstimate, is_registered: bool
+    stretch: Stretch, segments: list[Segment], points: list[Points], estimate: LensEstimate, dataset: RgbdDataset
 ) -> list[Finding]:
-    lens = estimate.lens
+    lens, is_registered = estimate.lens, dataset.is_registered
     edges = match_edges(stretch.views) if is_registered else None
     findings: list[Finding] = []
     finding = lens_finding(estimate, supported=True, preferred=True)
@@ -143,7 +162,7 @@ def _geometry_findings(
     if finding is not None and (is_registered or finding.certain) and not any(found.certain for found in findings):
         findings.append(finding)
     if not any(found.certain for found in findings):
-        findings += pose_findings(stretch, segments, fit_flows(points, lens), lens, is_registered)
+        findings += pose_findings(stretch, segments, fit_flows(points, lens), lens, dataset)
     return findings
 
 
@@ -169,4 +188,4 @@ def _broken_findings(tracks: Tracks) -> list[Finding]:
     if tracks.steps < _LEAST_STEPS or tracks.broken < _MANY_BROKEN * tracks.steps:
         return []
     text = f"{tracks.broken} of {tracks.steps} views have too little in common with the one before"
-    return [Finding("steps", text, "check the order of the frames; record more slowly, or at a higher rate")]
+    return [Finding(_BROKEN, text, "check the order of the frames; record more slowly, or at a higher rate")]

@@ -16,8 +16,8 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.clock import LATE_S
+from spslam.datasets.findings import Finding
 from spslam.datasets.plausibility import lens as number
-from spslam.datasets.plausibility.findings import Finding
 from spslam.datasets.plausibility.flow_fit import PRIOR, FlowFit, Points, fit_flows
 from spslam.datasets.plausibility.lens import Lens
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from spslam.datasets.findings import Finding
 from spslam.datasets.plausibility.edges import SAME_PLACE, TURNS, EdgeMatch
-from spslam.datasets.plausibility.findings import Finding
 from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flows
 from spslam.datasets.plausibility.lens import Lens
 from spslam.datasets.plausibility.tracks import Segment

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from spslam.datasets.plausibility.findings import Finding
+from spslam.datasets.base import RgbdDataset
+from spslam.datasets.findings import Finding
 from spslam.datasets.plausibility.flow_fit import FlowFit
 from spslam.datasets.plausibility.lens import Lens
 from spslam.datasets.plausibility.tracks import Segment
@@ -26,7 +27,7 @@ _MODEL_ERROR, _UNREGISTERED_ERROR = 0.008, 0.06
 
 
 def pose_findings(
-    stretch: Stretch, segments: Sequence[Segment], fits: Sequence[FlowFit], lens: Lens, is_registered: bool = True
+    stretch: Stretch, segments: Sequence[Segment], fits: Sequence[FlowFit], lens: Lens, dataset: RgbdDataset
 ) -> list[Finding]:
     """What speaks against the poses, or against depth.
 
@@ -35,7 +36,7 @@ def pose_findings(
         segments: pairs of views.
         fits: the motion of each by optical flow.
         lens: as the recording says.
-        is_registered: whether depth is registered to color.
+        dataset: what all is of: whether depth is registered to color, and how its scale is set.
     """
     if stretch.poses is None:
         return []
@@ -54,7 +55,7 @@ def pose_findings(
         if given > _AGREES:
             explained = min(shares.values()) < _EXPLAINED * given
             return [_convention(shares)] if explained or given > _DISAGREES else []
-    return _scale_findings(stretch.poses, pairs, lens, is_registered)
+    return _scale_findings(stretch.poses, pairs, lens, dataset)
 
 
 def _disagreement(
@@ -91,7 +92,7 @@ def _convention(shares: dict[str, float]) -> Finding:
 
 
 def _scale_findings(
-    poses: np.ndarray, pairs: Sequence[tuple[Segment, FlowFit]], lens: Lens, is_registered: bool
+    poses: np.ndarray, pairs: Sequence[tuple[Segment, FlowFit]], lens: Lens, dataset: RgbdDataset
 ) -> list[Finding]:
     """Translations by the poses against those by images and depth, whose unit is that of depth."""
     logs, errors = [], []
@@ -109,14 +110,12 @@ def _scale_findings(
     weights = 1 / np.square(errors)
     mean = float(np.average(logs, weights=weights))
     spread = float(np.sum(weights * np.square(np.array(logs) - mean))) / (len(logs) - 1)
-    sigma = float(
-        np.hypot(np.sqrt(max(spread, 1.0) / weights.sum()), _MODEL_ERROR if is_registered else _UNREGISTERED_ERROR)
-    )
+    model_error = _MODEL_ERROR if dataset.is_registered else _UNREGISTERED_ERROR
+    sigma = float(np.hypot(np.sqrt(max(spread, 1.0) / weights.sum()), model_error))
     if abs(mean) < _MATTERS or abs(mean) < _CERTAIN_SIGMAS * sigma:
         return []
     text = f"depth and ground-truth poses disagree: depth {np.exp(mean):.3g} times as large would fit (+- {sigma:.0%})"
-    remedy = "correct the depth scale (dataset.depth_scale of folder data, units per meter), or the unit of the poses"
-    return [Finding("scale", text, remedy, certain=True)]
+    return [Finding("scale", text, f"{dataset.scale_remedy}, or correct the unit of the poses", certain=True)]
 
 
 def _conjugated(*signs: float) -> Callable[[np.ndarray], np.ndarray]:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from spslam.datasets.findings import Finding
 from spslam.datasets.folder import PLAUSIBLE_MEDIAN_M
 from spslam.datasets.frozen_depth import has_moved
-from spslam.datasets.plausibility.findings import Finding
 from spslam.datasets.plausibility.views import Stretch, View
 
 # Beyond it the depth scale may be wrong; beyond `PLAUSIBLE_MEDIAN_M` it is.
@@ -36,6 +36,10 @@ _DEPTH_MOVED = 0.02
 _CELLS = (16, 12)
 # A color image whose brightness varies by less shows nothing.
 _BLANK_LEVELS = 3.0
+# No camera takes frames faster, and a hand-held one that takes them more slowly shows other things each time.
+_STEPS_S = (0.001, 5.0)
+_USUAL_STEP_S = 1 / 30
+_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9), ("minutes", 60.0), ("hours", 3600.0))
 # A view fits better after an earlier one: correlation distances of thumbnails.
 _MUCH_NEARER, _FAR_STEPS = 0.5, 1.5
 _THUMBNAIL = (32, 24)
@@ -46,12 +50,13 @@ _LEAST_ASTRAY = 5
 _AS_ANY_TWO, _LONG_STEP = 0.7, 0.1
 
 
-def depth_findings(stretch: Stretch, depth_range: tuple[float, float]) -> list[Finding]:
+def depth_findings(stretch: Stretch, depth_range: tuple[float, float], scale_remedy: str) -> list[Finding]:
     """What is wrong with the values of depth.
 
     Args:
         stretch: the views.
         depth_range: of the dataset, m.
+        scale_remedy: of the dataset.
     """
     known = stretch.known_depth()
     if not len(known):
@@ -61,7 +66,7 @@ def depth_findings(stretch: Stretch, depth_range: tuple[float, float]) -> list[F
         text = f"median depth of {median:.3g} m: the depth scale looks wrong"
         # A hand before the lens is near, too, but not in all views.
         certain = median > PLAUSIBLE_MEDIAN_M[1] or _share_of(stretch.views, _is_too_near) > _NEARLY_ALL
-        return [Finding("scale", text, _scale_remedy(median), certain)]
+        return [Finding("scale", text, scale_remedy + _fitting_scales(median), certain)]
     if far - near < _ONE_VALUE_SPAN * median:
         return [Finding("depth", f"all depth is the same, {median:.3g} m", _CONVERT, len(known) >= _LEAST_PIXELS)]
     findings = _value_findings(stretch.views, far - near)
@@ -71,11 +76,11 @@ def depth_findings(stretch: Stretch, depth_range: tuple[float, float]) -> list[F
             f"{1 - inside:.0%} of the depth lies outside dataset.min_depth_m ({depth_range[0]:g} m) to "
             f"dataset.max_depth_m ({depth_range[1]:g} m), median {median:.3g} m"
         )
-        remedy = "if the place is that deep, set them; else " + _scale_remedy(median)
+        remedy = f"if the place is that deep, set them; else {scale_remedy}{_fitting_scales(median)}"
         findings.append(Finding("scale", text, remedy, inside < _FEW_IN_RANGE))
     elif not _UNUSUAL_MEDIAN_M[0] <= median <= _UNUSUAL_MEDIAN_M[1]:
         text = f"median depth of {median:.3g} m is unusual indoors: the depth scale may be wrong"
-        findings.append(Finding("scale", text, _scale_remedy(median)))
+        findings.append(Finding("scale", text, scale_remedy + _fitting_scales(median)))
     return findings
 
 
@@ -92,11 +97,10 @@ def _is_noise(depth: np.ndarray) -> bool:
     return _jump_share(depth) > _MANY_JUMPS
 
 
-def _scale_remedy(median_m: float) -> str:
+def _fitting_scales(median_m: float) -> str:
     low, high = _LIKELY_MEDIAN_M
     fitting = [scale for scale in _SCALES if low <= median_m * scale <= high]
-    named = f": depth {' or '.join(f'{scale:g}' for scale in fitting)} times as large would fit" if fitting else ""
-    return f"set the depth scale (dataset.depth_scale of folder data, units per meter){named}"
+    return f": depth {' or '.join(f'{scale:g}' for scale in fitting)} times as large would fit" if fitting else ""
 
 
 _CONVERT = "check what the depth images hold: 16-bit or floating-point depth along the optical axis is needed"
@@ -258,3 +262,20 @@ def time_findings(timestamps: np.ndarray) -> list[Finding]:
         return []
     text = f"{wrong} of {len(steps)} time stamps do not ascend, the first after frame {int(np.argmin(steps > 0))}"
     return [Finding("times", text, "sort the frames by time, or correct the time stamps")]
+
+
+def unit_findings(timestamps: np.ndarray, has_overlap: bool) -> list[Finding]:
+    """Time stamps in another unit than seconds, by their median step.
+
+    Args:
+        timestamps: of all frames, s.
+        has_overlap: whether frames show what those before them do; frames of a camera that moves on for long do not.
+    """
+    steps = np.diff(timestamps)
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    step = float(np.median(steps)) if len(steps) else _USUAL_STEP_S
+    if _STEPS_S[0] <= step and (step <= _STEPS_S[1] or not has_overlap):
+        return []
+    unit, seconds = min(_UNITS, key=lambda named: abs(np.log(step) + np.log(named[1] / _USUAL_STEP_S)))
+    text = f"frames are {step:.3g} s apart by their time stamps: these look like {unit}, not seconds"
+    return [Finding("time unit", text, f"multiply the time stamps by {seconds:g}")]

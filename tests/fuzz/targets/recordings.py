@@ -92,8 +92,8 @@ class Layout(Format):
 
     def write(self, random: Random, folder: Path) -> None:
         files = dict(self._files)
-        if self._options.type == "folder" and random.random() < 0.7:
-            del files["intrinsics.txt"]
+        if self._options.type == "folder":  # both would be refused before anything else is read
+            del files["intrinsics.txt" if random.random() < 0.7 else "intrinsics.json"]
         for _ in range(random.choice((1, 1, 1, 2, 3))):
             self._spoil(random, files)
         for name, content in files.items():
