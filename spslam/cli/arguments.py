@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
+
+from annotated_types import Le
 
 from spslam.cli.parser import UsageError
 from spslam.config import config_names
 from spslam.errors import OutputError
-from spslam.options import PRESETS
+from spslam.options import PRESETS, MeshOptions
 from spslam.run.request import parse_frames
+from spslam.run_folder import RunFolder, is_merged
 
 
 def frame_range(text: str) -> slice:
@@ -31,6 +35,15 @@ def at_least_one(text: str) -> int:
 def positive_meters(text: str) -> float:
     """A length above 0."""
     return _positive(text, "a length in meters")
+
+
+def mesh_resolution(text: str) -> float:
+    """A length within the range of the option mesh.resolution_m."""
+    value = positive_meters(text)
+    for limit in MeshOptions.model_fields["resolution_m"].metadata:
+        if isinstance(limit, Le) and isinstance(limit.le, (int, float)) and value > limit.le:
+            raise argparse.ArgumentTypeError(f"must be a length of at most {limit.le} m, got {text!r}")
+    return value
 
 
 def positive_seconds(text: str) -> float:
@@ -135,7 +148,7 @@ def overrides(args: argparse.Namespace) -> list[str | tuple[str, Any]]:
         if getattr(args, option, None) is not None:
             changes.append((option, getattr(args, option)))
     if getattr(args, "data", None) is not None:
-        changes.append(("dataset.path", str(args.data.resolve())))
+        changes.append(("dataset.path", os.path.abspath(args.data)))  # a link's own name may tell the camera
     return changes
 
 
@@ -146,6 +159,8 @@ def require_run_file(path: Path) -> Path:
         raise OutputError(f"{output}: no such folder")
     if not output.is_dir():
         raise OutputError(f"{output}: must be the output folder of a run, got a file")
+    if path == RunFolder(output).trajectory and is_merged(RunFolder(output)):
+        raise OutputError(f"{output}: is a merged map, which has no trajectory of its own; give one of the merged runs")
     if not path.is_file():
         raise OutputError(f"{output}: must be the output folder of a finished run, but has no {path.name}")
     return path

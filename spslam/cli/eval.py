@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> None:
     require_run_file(RunFolder(args.output).trajectory)
 
-    from spslam.evaluation.finished_run import add_metrics, trajectory_figures
+    from spslam.evaluation.finished_run import SCALE_KEYS, SURFACE_KEYS, VIEW_KEYS, add_metrics, trajectory_figures
     from spslam.evaluation.html_report import write_report
     from spslam.evaluation.run_output import RunOutput
 
@@ -42,19 +42,26 @@ def execute(args: argparse.Namespace) -> None:
             f"{args.output}: there are no ground-truth poses to compare with; "
             "--gt-mesh evaluates the mesh, --views rendered views of the map"
         )
+    doubts: list[str] = []
     if args.gt_mesh is not None or args.views:
-        figures |= _map_figures(run, args.gt_mesh, args.views)
-    metrics = add_metrics(run, figures)
+        of_map, doubts = _map_figures(run, args.gt_mesh, args.views)
+        figures |= of_map
+    measured = ((args.scale, SCALE_KEYS), (args.gt_mesh is not None, SURFACE_KEYS), (args.views, VIEW_KEYS))
+    metrics = add_metrics(run, figures, {key for asked, keys in measured if asked for key in keys})
     write_report(args.output)
     print_summary(metrics, args.output)
+    for line in doubts:
+        print(f"! {line}")
 
 
-def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> dict[str, float]:
+def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> tuple[dict[str, float], list[str]]:
+    """Figures of mesh and views, and in words what is missing of the run's data."""
     from spslam.datasets import open_dataset
     from spslam.evaluation.finished_run import surface_figures, view_figures
+    from spslam.evaluation.run_data import data_of_run
     from spslam.evaluation.surface import Surface, TriangleSurface
 
-    dataset = open_dataset(load_config(require_run_file(run.folder.config)).dataset)
+    dataset, doubts = data_of_run(run, open_dataset(load_config(require_run_file(run.folder.config)).dataset))
     ground_truth: Surface | None
     if str(gt_mesh) != GENERATED:
         ground_truth = None if gt_mesh is None else TriangleSurface.load(gt_mesh)
@@ -63,4 +70,6 @@ def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> dict[str, float
     else:
         ground_truth = dataset.surface
     figures = {} if ground_truth is None else surface_figures(run, dataset, ground_truth)
-    return {**figures, **view_figures(run, dataset)} if views else figures
+    if views:
+        figures = {**figures, **view_figures(run, dataset)}
+    return figures, [*doubts, *dataset.unreadable_in_words()]

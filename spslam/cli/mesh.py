@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spslam.cli.arguments import add_device, add_run_folder, positive_meters, require_run_file
+from spslam.cli.arguments import add_device, add_run_folder, mesh_resolution, positive_meters, require_run_file
 from spslam.config import Config, load_config
 from spslam.errors import DatasetError, OutputError
+from spslam.io import writing
 from spslam.run_folder import MESH_FORMATS, TEXTURED_FORMATS, RunFolder, is_merged
 
 if TYPE_CHECKING:
     import torch
 
     from spslam.datasets.base import RgbdDataset
+    from spslam.evaluation.run_data import RunData
     from spslam.evaluation.run_output import RunOutput
     from spslam.meshing import TriangleMesh
     from spslam.options import MeshOptions
@@ -33,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resolution",
         metavar="M",
-        type=positive_meters,
+        type=mesh_resolution,
         help="edge length of a voxel or marching-cubes cell in meters; the run's mesh.resolution_m if not given",
     )
     parser.add_argument(
@@ -69,7 +73,7 @@ def execute(args: argparse.Namespace) -> None:
     from spslam.run.device import explained_failures, resolve_device
 
     device = resolve_device(args.device or config.device)
-    with explained_failures(device):
+    with explained_failures(device, "choose a larger --resolution"):
         if is_merged(folder):
             _execute_merged(args, folder, config, file_format, device)
         else:
@@ -79,7 +83,6 @@ def execute(args: argparse.Namespace) -> None:
 def _execute_run(
     args: argparse.Namespace, folder: RunFolder, config: Config, file_format: str, device: torch.device
 ) -> None:
-    from spslam.evaluation.finished_run import add_metrics
     from spslam.evaluation.run_output import RunOutput
     from spslam.run.mesh import MeshJob, measured_noise, write_mesh
     from spslam.scene import Scene
@@ -91,10 +94,69 @@ def _execute_run(
     scene, noise = Scene.load(folder.map, device), measured_noise(run.metrics)
     job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args))
     path = folder.mesh_as(file_format)
-    mesh, figures = write_mesh(path, job, dataset)
-    if path == folder.mesh:
-        add_metrics(run, figures)
+    mesh, figures = _replace_mesh(path, lambda place: write_mesh(place, job, dataset))
     _print_mesh(path, mesh, figures)
+    for line in () if dataset is None else dataset.unreadable_in_words():
+        print(f"! {line}")
+    if path == folder.mesh:
+        _replace_figures(run, figures)
+
+
+def _replace_mesh(path: Path, write: Callable[[Path], Any]) -> Any:
+    """What `write` returns, the mesh first, when it has written it.
+
+    What was made before stays until then, and where there is no surface.
+
+    Raises:
+        OutputError: the mesh has no surface, or can't be written.
+    """
+    if path.suffix != ".ply":  # no other format takes a mesh without faces: writing it is refused
+        results = write(path)
+        _remove_old_textures(path, results[1])
+        return results
+    # As `atomic_write` names them, so that what a killed command leaves is known.
+    place = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        results = write(place)
+        if not len(results[0].faces):
+            raise OutputError(
+                f"{path}: no surface at a resolution of {results[1]['mesh_resolution_m']:g} m, so no mesh was written; "
+                "choose a smaller --resolution, or a run whose map has surface"
+            )
+        with writing(path):
+            os.replace(place, path)
+    except OutputError as error:
+        raise OutputError(str(error).replace(str(place), str(path))) from None
+    finally:
+        place.unlink(missing_ok=True)
+    return results
+
+
+def _remove_old_textures(path: Path, figures: dict[str, Any]) -> None:
+    """Removes the materials and images of an OBJ before this one, which it does not name."""
+    if path.suffix != ".obj":
+        return
+    pages = figures["texture_size"][0] if "texture_size" in figures else 0
+    named = {"mesh.mtl", *(f"mesh-{page}.png" for page in range(pages))} if pages else set()
+    for old in RunFolder(path.parent).texture_files():
+        if old.name not in named:
+            with writing(old):
+                old.unlink()
+
+
+def _replace_figures(run: RunOutput, figures: dict[str, Any]) -> None:
+    """Writes metrics and report of a run with the figures of its new mesh, and without those of the mesh before."""
+    from spslam.evaluation.finished_run import MESH_KEYS, SURFACE_KEYS, VIEW_KEYS, add_metrics
+    from spslam.evaluation.html_report import write_report
+
+    add_metrics(run, figures, SURFACE_KEYS | VIEW_KEYS | MESH_KEYS)
+    if run.folder.report.is_file():
+        write_report(run.folder.path)
+    groups = (("--gt-mesh PLY", SURFACE_KEYS), ("--views", VIEW_KEYS))
+    asked = [words for words, keys in groups if keys & run.metrics.keys()]
+    if asked:
+        again = f"spslam eval {run.folder.path} {' '.join(asked)}"
+        print(f"! the figures of the mesh before were removed; `{again}` measures this one")
 
 
 def _mesh_options(args: argparse.Namespace, options: MeshOptions, source: str) -> MeshOptions:
@@ -131,8 +193,12 @@ def _file_format(args: argparse.Namespace) -> str:
 
 
 def _texture(args: argparse.Namespace) -> TextureWish | None:
+    """What `--texture` and `--texel` ask for; raises SpslamError for a size of texels that no texture has."""
+    from spslam.meshing.texture.texturing import check_texel
     from spslam.run.mesh import TextureWish
 
+    if args.texel is not None:
+        check_texel(args.texel)
     return TextureWish(args.texel) if args.texture else None
 
 
@@ -145,7 +211,8 @@ def _execute_merged(
 
     archive = KeyframeArchive.load(require_run_file(folder.keyframes))
     path, options = folder.mesh_as(file_format), _mesh_options(args, config.mesh, config.mesh.source)
-    mesh, figures, missing = write_map_mesh(path, Scene.load(folder.map, device), archive, options, _texture(args))
+    scene, texture = Scene.load(folder.map, device), _texture(args)
+    mesh, figures, missing = _replace_mesh(path, lambda place: write_map_mesh(place, scene, archive, options, texture))
     for line in missing:
         print(f"! {line}")
     _print_mesh(path, mesh, figures)
@@ -182,7 +249,17 @@ def _earlier(folder: RunFolder) -> list[EarlierFrames]:
     return earlier
 
 
-def _open_again(run: RunOutput, config: Config, for_texture: bool) -> RgbdDataset:
+def _open_again(run: RunOutput, config: Config, for_texture: bool) -> RunData:
+    """The data of a run; says what is missing of it."""
+    from spslam.evaluation.run_data import data_of_run
+
+    dataset, missing = data_of_run(run, _opened_again(run, config, for_texture))
+    for line in missing:
+        print(f"! {line}")
+    return dataset
+
+
+def _opened_again(run: RunOutput, config: Config, for_texture: bool) -> RgbdDataset:
     from spslam.datasets import open_dataset
 
     try:

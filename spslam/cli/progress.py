@@ -110,6 +110,8 @@ def summarize(metrics: Mapping[str, Any], output: Path) -> list[tuple[str, str]]
         ("latency", "latency_p50_ms", "{:.0f} ms"),
         ("latency p99", "latency_p99_ms", "{:.0f} ms"),
         ("ATE RMSE", "ate_rmse_cm", "{:.2f} cm"),
+        ("ATE, scaled", "ate_scaled_rmse_cm", "{:.2f} cm"),
+        ("scale", "ate_scale", "{:.4f}"),
         ("RPE", "rpe_cm", "{:.2f} cm/frame"),
         ("accuracy", "accuracy_cm", "{:.2f} cm"),
         ("completeness", "completeness_cm", "{:.2f} cm"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,14 @@ _CULLING_FRAMES = 100
 # Number of novel views for depth L1 and of frames for PSNR and SSIM, and the image width of the novel views.
 NOVEL_VIEWS, COLOR_VIEWS = 32, 16
 _NOVEL_WIDTH_PX = 160
+# Keys of metrics.json by what measures them: one that is measured anew, or no longer true, goes with all of its group.
+SCALE_KEYS = frozenset({"ate_scaled_rmse_cm", "ate_scaled_median_cm", "ate_scaled_max_cm", "ate_scale"})
+SURFACE_KEYS = frozenset(
+    {"accuracy_cm", "completeness_cm", "accuracy_5cm", "completeness_5cm", "accuracy_1cm", "completeness_1cm"}
+    | {"f1_5cm", "f1_1cm", "depth_l1_cm", "depth_l1_coverage"}
+)
+VIEW_KEYS = frozenset({"psnr_db", "ssim", "view_coverage"})
+MESH_KEYS = frozenset({"mesh_source", "mesh_resolution_m", "mesh_frames", "mesh_mb", "mesh_color_frames", "mesh_s"})
 
 
 def trajectory_figures(run: RunOutput, with_scale: bool = False) -> dict[str, float]:
@@ -134,9 +143,22 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
     return figures | ({} if np.isnan(similarities).all() else {"ssim": float(np.nanmean(similarities))})
 
 
-def add_metrics(run: RunOutput, figures: dict[str, Any]) -> dict[str, Any]:
-    """Adds metrics to metrics.json and returns all of them."""
-    metrics = {**run.metrics, **figures}
+def add_metrics(run: RunOutput, figures: dict[str, Any], replaced: Iterable[str] = ()) -> dict[str, Any]:
+    """Adds metrics to metrics.json.
+
+    Args:
+        run: the run.
+        figures: metrics by their names.
+        replaced: names of metrics that are removed where `figures` has none of the name, as `SURFACE_KEYS`.
+
+    Returns:
+        All metrics.
+
+    Raises:
+        OutputError: metrics.json can't be written.
+    """
+    gone = set(replaced) - figures.keys()
+    metrics = {key: value for key, value in {**run.metrics, **figures}.items() if key not in gone}
     atomic_write(run.folder.metrics, json.dumps(metrics, indent=1) + "\n")
     return metrics
 

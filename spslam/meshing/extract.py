@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
@@ -16,6 +18,8 @@ from spslam.scene import Scene
 CHUNK_POINTS = 1 << 19
 # Of the field, near the surface: 5 GB, a hundred times what a floor of a building needs at 2 cm.
 MAX_SAMPLES = 1 << 29
+# Blocks near a surface for each of those that a plane passes through, as `near_surface` keeps some on both sides.
+_NEAR_BLOCKS = 3
 # The learned field is not an exact distance. Where its gradient exceeds this bound, surface could be missed.
 MAX_SLOPE = 1.5
 MIN_SUPPORT = 0.1
@@ -54,7 +58,7 @@ def extract_surface(
 
     Raises:
         ValueError: a size that is not positive, or `cell_coords` of another dtype or shape or with repeated rows.
-        SpslamError: more than `MAX_SAMPLES` samples would be needed.
+        SpslamError: more than `MAX_SAMPLES` samples would be needed; it names a resolution that fits.
     """
     for name, value in {"cell_size_m": cell_size_m, "resolution_m": resolution_m, "max_slope": max_slope}.items():
         if not value > 0:
@@ -64,24 +68,38 @@ def extract_surface(
     if cell_coords.dtype != torch.int32 or cell_coords.dim() != 2 or cell_coords.shape[1] != 3:
         actual = f"{cell_coords.dtype} {list(cell_coords.shape)}"
         raise ValueError(f"extract_surface: cell_coords must be int32 [M, 3], got {actual}")
-    blocks, per_block = cubes_per_cell(cell_size_m, resolution_m)
-    block_size_m = cell_size_m / blocks
     coords = near_surface(cell_coords, cell_size_m, sdf, max_slope, chunk_points)
-    _check_samples(max(len(coords), 1) * blocks**3, cell_size_m, resolution_m)
+    least_m = _least_resolution_m(max(len(coords), 1), cell_size_m)
+    if cell_size_m / resolution_m > MAX_SAMPLES:  # beyond numbers that can be counted with
+        raise _too_fine(resolution_m, least_m)
+    blocks, per_block = cubes_per_cell(cell_size_m, resolution_m)
+    # All parts of one cell are sampled at once.
+    if max(len(coords), 1) * blocks**3 > MAX_SAMPLES or blocks**3 > CHUNK_POINTS:
+        raise _too_fine(resolution_m, least_m)
+    block_size_m = cell_size_m / blocks
     if blocks > 1:
         coords = near_surface_parts(coords, blocks, block_size_m, sdf, max_slope, chunk_points)
-    _check_samples(len(coords) * (per_block + 1) ** 3, cell_size_m, resolution_m)
+    samples = len(coords) * (per_block + 1) ** 3
+    if samples > MAX_SAMPLES:
+        raise _too_fine(resolution_m, max(least_m, 1.1 * resolution_m * math.sqrt(samples / MAX_SAMPLES)))
     values = sample_blocks(coords, block_size_m, per_block, sdf, chunk_points)
     vertices, faces = ops.marching_cubes(coords, values)
     return vertices * block_size_m, faces
 
 
-def _check_samples(samples: int, cell_size_m: float, resolution_m: float) -> None:
-    if samples > MAX_SAMPLES:
-        raise SpslamError(
-            f"extract_surface: cells of {cell_size_m:g} m must take at most {MAX_SAMPLES} samples, got {samples}; "
-            f"choose a resolution_m above {resolution_m:g}"
-        )
+def _least_resolution_m(cells: int, cell_size_m: float) -> float:
+    """About the smallest resolution, m, at which a surface through so many cells can be extracted."""
+    per_block = _CUBES_PER_BLOCK.start
+    in_cells, in_one = (MAX_SAMPLES / cells) ** (1 / 3), CHUNK_POINTS ** (1 / 3)
+    near = math.sqrt(MAX_SAMPLES / (cells * _NEAR_BLOCKS * (per_block + 1) ** 3))
+    return cell_size_m / (per_block * min(in_cells, in_one, near))
+
+
+def _too_fine(resolution_m: float, least_m: float) -> SpslamError:
+    return SpslamError(
+        f"a mesh of the map at a resolution of {resolution_m:g} m needs too much memory: the smallest that fits is "
+        f"about {least_m:.2g} m (mesh.resolution_m, --resolution)"
+    )
 
 
 def cubes_per_cell(cell_size_m: float, resolution_m: float) -> tuple[int, int]:

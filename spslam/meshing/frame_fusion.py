@@ -162,8 +162,16 @@ def fuse_frames(
         The same frames and options give the same bytes.
 
     Raises:
-        SpslamError: voxels of over a hundred times the size would not fit either.
+        SpslamError: voxels of over a hundred times the size would not fit either. Where the map tells, no frame is read
+            for that, and the error names a size that fits.
     """
+    cells = None if scene is None else surface_cells(scene)
+    least_m = 0.0 if scene is None or cells is None else _least_voxel_m(len(cells), scene, options.max_blocks)
+    if options.voxel_size_m * COARSENING ** (_MOST_ATTEMPTS - 1) < least_m:
+        raise SpslamError(
+            f"voxels of {options.voxel_size_m:g} m need far more than {options.max_memory_mb} MB: choose a resolution "
+            f"of at least {least_m:.2g} m (mesh.resolution_m, --resolution), or allow more by mesh.max_memory_mb"
+        )
     parts = [frames] if isinstance(frames, PosedFrames) else frames
     noises = [part.noise or options.noise for part in parts]
     befores = np.cumsum([0, *map(len, parts)])  # frames of the parts before each
@@ -175,27 +183,42 @@ def fuse_frames(
     along_rays = [noise_along_rays(part, noise) for part, noise in zip(parts, noises, strict=True)]
     voxel_size_m = options.voxel_size_m
     for _ in range(_MOST_ATTEMPTS):
+        if voxel_size_m < least_m:
+            voxel_size_m *= COARSENING
+            continue
         truncations = options.truncation_m(voxel_size_m), options.near_truncation_m(voxel_size_m)
         volume = ops.TsdfVolume(voxel_size_m, truncations[0], options.max_blocks, device, truncations[1])
         try:
-            if scene is not None:
-                volume.add_blocks(blocks_of_scene(scene, volume))
+            if scene is not None and cells is not None:
+                volume.add_blocks(_blocks_of_cells(cells, scene.volume.voxel_size_m, volume))
             for each, noise in zip(images, along_rays, strict=True):
                 _fuse_part(volume, each, noise)
             return volume
         except ops.VoxelLimitError:
             del volume
             voxel_size_m *= COARSENING
+    tried_m = voxel_size_m / COARSENING
     raise SpslamError(
-        f"the frames' surface must fit into {options.max_memory_mb} MB with voxels of {voxel_size_m:.3g} m, but does "
-        "not; mesh.max_memory_mb allows more"
+        f"the frames' surface must fit into {options.max_memory_mb} MB with voxels of {tried_m:.3g} m, but does "
+        "not; choose a larger resolution (mesh.resolution_m, --resolution), or mesh.max_memory_mb allows more"
     )
 
 
-def blocks_of_scene(scene: Scene, volume: ops.TsdfVolume) -> torch.Tensor:
-    """Coordinates int32 [N, 3] of the volume's blocks that a map's surface may pass through, with repetitions."""
-    cells = surface_cells(scene)
-    size_m = scene.volume.voxel_size_m
+def _least_voxel_m(cells: int, scene: Scene, max_blocks: int) -> float:
+    """Edge of a voxel, m, below which the blocks of so many cells of a map are surely more than `max_blocks`.
+
+    The points of `_blocks_of_cells` fall into a block for each of its steps per axis, of which a cell shares one with
+    the next. So no memory is taken, and no frame read, for what can't fit.
+    """
+    if not cells:
+        return 0.0
+    steps = (max_blocks / cells) ** (1 / 3) + 1
+    # They are rounded to a whole number.
+    return scene.volume.voxel_size_m / (ops.tsdf.BLOCK_SIDE * (steps + 0.5))
+
+
+def _blocks_of_cells(cells: torch.Tensor, size_m: float, volume: ops.TsdfVolume) -> torch.Tensor:
+    """Coordinates int32 [N, 3] of the volume's blocks that cells of a map lie in, with repetitions."""
     steps = max(round(size_m / (ops.tsdf.BLOCK_SIDE * volume.voxel_size)), 1)
     offsets = torch.cartesian_prod(*[torch.linspace(0, 1, steps + 1, device=cells.device)] * 3)
     block_m = ops.tsdf.BLOCK_SIDE * volume.voxel_size

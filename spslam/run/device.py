@@ -8,7 +8,9 @@ import torch
 from spslam import ops
 from spslam.errors import DeviceError
 
-_CPU_OUT_OF_MEMORY = "not enough memory"
+# What torch's allocators say, by the way they ask for memory.
+_CPU_OUT_OF_MEMORY = ("not enough memory", "can't allocate memory", "Cannot allocate memory")
+_LESS_MEMORY = "lower pixels.budget_mb, choose a larger scene.voxel_size_m and scene.plane_cell_m"
 _CUDA_FAILED = ("CUDA error", "CUDA driver", "cudaError", "CUDA out of memory")
 
 
@@ -35,8 +37,12 @@ def resolve_device(name: str) -> torch.device:
 
 
 @contextlib.contextmanager
-def explained_failures(device: torch.device) -> Iterator[None]:
+def explained_failures(device: torch.device, less_memory: str = _LESS_MEMORY) -> Iterator[None]:
     """Replaces torch's errors about a failing device by one line that says what to change.
+
+    Args:
+        device: the device.
+        less_memory: what to change where memory is not enough, beside the device.
 
     Raises:
         DeviceError: out of memory, or the GPU has failed.
@@ -44,27 +50,24 @@ def explained_failures(device: torch.device) -> Iterator[None]:
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError) as error:
-        raise _out_of_memory(device) from error
+        raise _out_of_memory(device, less_memory) from error
     except RuntimeError as error:
-        if _CPU_OUT_OF_MEMORY in str(error):
-            raise _out_of_memory(torch.device("cpu")) from error
+        if any(text in str(error) for text in _CPU_OUT_OF_MEMORY):
+            raise _out_of_memory(torch.device("cpu"), less_memory) from error
         if any(text in str(error) for text in _CUDA_FAILED):
-            raise _failed(device, error) from error
+            raise _failed(device, error, less_memory) from error
         raise
 
 
-def _out_of_memory(device: torch.device) -> DeviceError:
+def _out_of_memory(device: torch.device, less_memory: str) -> DeviceError:
     other = "another GPU or --device cpu" if device.type == "cuda" else "a machine with more memory"
-    return DeviceError(
-        f"{_name(device)} is out of memory{_in_use(device)}: lower pixels.budget_mb, choose a larger "
-        f"scene.voxel_size_m and scene.plane_cell_m, or use {other}"
-    )
+    return DeviceError(f"{_name(device)} is out of memory{_in_use(device)}: {less_memory}, or use {other}")
 
 
-def _failed(device: torch.device, error: RuntimeError) -> DeviceError:
+def _failed(device: torch.device, error: RuntimeError, less_memory: str) -> DeviceError:
     reason = str(error).splitlines()[0]
     if "out of memory" in reason:
-        return _out_of_memory(device)
+        return _out_of_memory(device, less_memory)
     return DeviceError(
         f"{_name(device)} has failed: {reason}; nvidia-smi shows its state; use --device cpu to run without it"
     )

@@ -87,13 +87,21 @@ def _merge(request: MergeRequest, config: Config, device: torch.device) -> dict[
     archive = archive_of(state, None, joined.settings)
     temporary = OutputFolder(request.output_dir.parent / f".{request.output_dir.name}.merging")
     with temporary.locked():
-        _empty(temporary.path)
-        metrics = _write(temporary, request, config, state, archive)
         try:
-            os.replace(temporary.path, request.output_dir)
-        except OSError as error:
-            raise OutputError(f"{request.output_dir}: can't be made: {error.strerror or error}") from None
+            _empty(temporary.path)
+            metrics = _write(temporary, request, config, state, archive)
+            _rename(temporary.path, request.output_dir)
+        except BaseException:  # Ctrl-C among them: only a killed merge leaves its folder
+            shutil.rmtree(temporary.path, ignore_errors=True)
+            raise
     return metrics
+
+
+def _rename(made: Path, output: Path) -> None:
+    try:
+        os.replace(made, output)
+    except OSError as error:
+        raise OutputError(f"{output}: can't be made: {error.strerror or error}") from None
 
 
 def _check_output(path: Path) -> None:

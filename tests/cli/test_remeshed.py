@@ -108,8 +108,8 @@ def test_missing_and_unreadable_frames_are_said(folder):
     image = folder / "data" / "depth" / "000003.png"
     image.write_bytes(image.read_bytes()[:100])
     for said in (remesh(folder), spslam("eval", "out", "--views", cwd=folder).stdout):
-        assert "! 1 of 6 frames of the run are not in folder/data any more\n" in said
-        assert "! 1 frame of the run can't be read and are left out, the first: " in said and "000003.png" in said
+        assert "! 1 of 6 frames of the run is not in folder/data any more\n" in said
+        assert "! 1 frame of the run can't be read and is left out, the first: " in said and "000003.png" in said
 
 
 @pytest.mark.parametrize("source", ["tsdf", "neural"])
@@ -133,12 +133,24 @@ def test_a_mesh_without_surface_replaces_none(folder, monkeypatch):
     from spslam.meshing import TriangleMesh
     from spslam.run import mesh
 
-    empty = TriangleMesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.int64, np.uint8, np.float32)))
+    empty = TriangleMesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.int32, np.uint8, np.float32)))
     monkeypatch.setattr(mesh, "extract_mesh", lambda *_: empty)
     before = contents(folder / "out")
     refused = spslam("mesh", "out", "--source", "neural", "--resolution", "1", cwd=folder)
     assert_refused(refused, "out/mesh.ply: no surface at a resolution of 1 m, so no mesh was written")
     assert contents(folder / "out") == before
+
+
+@pytest.mark.parametrize("said", ["not enough memory", "DefaultCPUAllocator: can't allocate memory"])
+def test_memory_that_is_not_there_is_one_line(folder, monkeypatch, said):
+    from spslam.run import mesh
+
+    def fail(*_):
+        raise RuntimeError(said)
+
+    monkeypatch.setattr(mesh, "extract_mesh", fail)
+    refused = spslam("mesh", "out", "--source", "neural", cwd=folder)
+    assert_refused(refused, "the machine is out of memory: choose a larger --resolution, or use a machine with more")
 
 
 @pytest.mark.parametrize("texel", ["1e-9", "1e-300", "1e9"])

@@ -19,6 +19,7 @@ from spslam.config import load_config
 from spslam.datasets import export_folder
 from spslam.datasets.generated import GeneratedDataset
 from spslam.evaluation import finished_run
+from spslam.run.output_folder import OutputFolder
 from spslam.run_folder import RunFolder
 from spslam.slam.fit import Fit
 from tests.cli.command import ROOT, assert_refused, spslam, spslam_process
@@ -299,3 +300,30 @@ def test_a_texture_that_cannot_be_is_refused(finished, tmp_path):
     gone = spslam("mesh", "moved", "--texture", cwd=tmp_path)
     assert_refused(gone, "moved: a texture is made of the run's frames, which can't be read again")
     assert not (tmp_path / "moved" / "mesh.glb").exists()
+
+
+def test_a_second_demo_leaves_one_that_is_running_alone(finished, tmp_path):
+    shutil.copytree(finished[0] / "out", tmp_path / "demo")
+    before = {path.name for path in (tmp_path / "demo").iterdir()}
+    with OutputFolder(tmp_path / "demo").locked():
+        refused = spslam("demo", "--output", "demo", "--frames", "2", "--device", "cpu", cwd=tmp_path)
+    assert_refused(refused, "another run is writing into it")
+    assert {path.name for path in (tmp_path / "demo").iterdir()} == before
+
+
+def test_a_path_that_was_set_holds_in_any_folder(tmp_path):
+    export_folder(GeneratedDataset(4, 96, 72), tmp_path / "data")
+    words = ["run", "folder", *SMALL[2:], "--set=dataset.path=data", "--no-mesh", "--output", "out"]
+    result = spslam(*words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert load_config(tmp_path / "out" / "config.yaml").dataset.path == str(tmp_path / "data")
+
+
+def test_the_reason_why_frames_were_skipped_is_said(tmp_path):
+    export_folder(GeneratedDataset(4, 96, 72), tmp_path / "data")
+    image = sorted((tmp_path / "data" / "depth").iterdir())[2]
+    image.write_bytes(image.read_bytes()[:100])
+    words = ["run", "folder", *SMALL[2:], "--data", "data", "--no-mesh", "--output", "out"]
+    result = spslam(*words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert re.search(rf"skipped first: .*{image.name}.*; all are in out/skipped.jsonl", result.stdout)

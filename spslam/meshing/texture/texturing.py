@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from spslam.errors import DatasetError
+from spslam.errors import DatasetError, SpslamError
 from spslam.meshing.frame_fusion import PosedFrames
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.texture.atlas import Atlas, Texels, find_texels, make_atlas
@@ -27,6 +27,8 @@ VIEWS = 12
 _SHARPNESS_POWER = 4.0
 # Of the finest pixels that saw each vertex, this quantile counts; so many texels per axis are taken for one of them.
 _FINEST_SHARE, _TEXELS_PER_PIXEL = 0.25, 1.5
+# Edges of a texel that can be asked for, m: texels of less are too many to be counted, those of more show nothing.
+TEXEL_RANGE_M = (1e-6, 1.0)
 # A texel is at most this share of the mean edge of a face.
 _EDGE_SHARE = 0.7
 # Pages of 4096 x 4096 texels at most, in three quarters of which texels are: some 0.8 GB beside them while baking.
@@ -62,8 +64,11 @@ def texture_mesh(
         The textured mesh. The same input gives the same bytes.
 
     Raises:
+        SpslamError: the edge of a texel is outside `TEXEL_RANGE_M`.
         DatasetError: none of the frames can be read.
     """
+    if options.texel_m is not None:
+        check_texel(options.texel_m)
     parts = [parts] if isinstance(parts, PosedFrames) else parts
     survey = _survey(mesh, parts, options.noise)
     texel_m = options.texel_m or _fine_enough(survey.finest_m, mesh)
@@ -73,6 +78,15 @@ def texture_mesh(
     sums, at_vertices = accumulate(mesh, sets, views, survey.weights, survey.corrections)
     own = fitted_to_seen(mesh, corners, at_vertices)
     return _textured(mesh, atlas, _pages(atlas, texels, mixed_colors(mesh, own, texels, sums)), texel_m)
+
+
+def check_texel(texel_m: float) -> None:
+    """Raises SpslamError where no texture has texels of this edge, m."""
+    least_m, most_m = TEXEL_RANGE_M
+    if not least_m <= texel_m <= most_m:
+        raise SpslamError(
+            f"a texel of a texture (--texel) must have an edge from {least_m:g} to {most_m:g} m, got {texel_m:g} m"
+        )
 
 
 @dataclass(frozen=True)
