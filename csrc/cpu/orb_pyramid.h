@@ -80,9 +80,8 @@ inline void resize(const Level& from, const Level& to) {
                                              columns.weight[x] * source[columns.second[x]]);
       }
     }
-    const std::uint16_t *const upper = lines.data() + (wanted[0] % 2) * to.columns, *const lower =
-                                                                                        lines.data() +
-                                                                                        (wanted[1] % 2) * to.columns;
+    const std::uint16_t* const upper = lines.data() + (wanted[0] % 2) * to.columns;
+    const std::uint16_t* const lower = lines.data() + (wanted[1] % 2) * to.columns;
     const std::uint32_t below = rows.weight[y], above = 256 - below;
     std::uint8_t* const out = to.row(y);
     for (int x = 0; x < to.columns; ++x) {

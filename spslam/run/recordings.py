@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ def source_of(request: RunRequest) -> dict[str, Any]:
     """JSON object by which the frames of a request are read again."""
     dataset = request.config.dataset.model_dump(mode="json")
     if request.data_dir is not None:
-        dataset["path"] = str(Path(request.data_dir).resolve())
+        dataset["path"] = os.path.abspath(request.data_dir)
     return {"dataset": dataset}
 
 

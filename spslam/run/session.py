@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,7 +101,7 @@ def _has_options(folder: OutputFolder, config: Config) -> bool:
 
 def _path_of(config: Config) -> str | None:
     path = config.dataset.path
-    return None if path is None else str(Path(path).resolve())
+    return None if path is None else os.path.abspath(path)  # not what a link leads to: its name may tell the camera
 
 
 def _with_absolute_path(config: Config) -> Config:

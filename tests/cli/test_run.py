@@ -22,6 +22,7 @@ from spslam.evaluation import finished_run
 from spslam.run.output_folder import OutputFolder
 from spslam.run_folder import RunFolder
 from spslam.slam.fit import Fit
+from spslam.slam.graph.archive import KeyframeArchive
 from tests.cli.command import ROOT, assert_refused, spslam, spslam_process
 
 SMALL = [
@@ -317,6 +318,13 @@ def test_a_path_that_was_set_holds_in_any_folder(tmp_path):
     result = spslam(*words, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert load_config(tmp_path / "out" / "config.yaml").dataset.path == str(tmp_path / "data")
+    # By a link's own name a camera may be known, to what reads the data again as well.
+    (tmp_path / "freiburg1").symlink_to("data")
+    words = ["run", "folder", *SMALL[2:], "--data", "freiburg1", "--no-mesh", "--output", "linked"]
+    assert spslam(*words, cwd=tmp_path).returncode == 0
+    assert load_config(tmp_path / "linked" / "config.yaml").dataset.path == str(tmp_path / "freiburg1")
+    (recording,) = KeyframeArchive.load(tmp_path / "linked" / "keyframes.safetensors").recordings
+    assert recording.source["dataset"]["path"] == str(tmp_path / "freiburg1")
 
 
 def test_the_reason_why_frames_were_skipped_is_said(tmp_path):
