@@ -55,6 +55,15 @@ def _declare(library: ctypes.CDLL) -> None:
     library.spslam_unfilter_png.argtypes = [ctypes.c_char_p, pointer, integer, pointer]
     library.spslam_orb_features.argtypes = [pointer] * 5
     library.spslam_orb_features.restype = count
+    number = ctypes.c_double
+    library.spslam_point_equations.argtypes = [*[pointer] * 3, count, pointer, pointer, number, pointer]
+    library.spslam_point_equations.restype = count
+    library.spslam_ray_equations.argtypes = [*[pointer] * 4, count, pointer, pointer, number, count, pointer]
+    library.spslam_ray_equations.restype = count
+    library.spslam_hold_pose.argtypes = [*[pointer] * 3, count, pointer, pointer, count, *[pointer] * 5, count, pointer]
+    library.spslam_hold_pose.restype = count
+    library.spslam_rectify_features.argtypes = [pointer, pointer, count, *[pointer] * 4]
+    library.spslam_rectify_features.restype = None
     library.spslam_rasterize.argtypes = [pointer, pointer, count, pointer, pointer, integer, pointer, pointer]
     library.spslam_rastered_surface.argtypes = [pointer, pointer, count, *[pointer] * 7]
     library.spslam_light_pixels.argtypes = [pointer, count, *[pointer] * 3, integer, pointer]

@@ -85,6 +85,20 @@ void rectify_shutter_frame<Cpu>(Cpu device, const std::int32_t* records, std::in
   rectify_shutter_images(device, images, motion, image_camera, out.depth, out.intensity);
 }
 
+void rectify_shutter_features(Cpu, const float* positions, const float* points, std::int64_t count,
+                              const ShutterMotion& motion, const ShutterCamera& camera, float* out_positions,
+                              float* out_points) {
+  const ReadoutMotion readout = readout_motion(motion);
+  if (readout.readout == 0.0f) {
+    std::memmove(out_positions, positions, static_cast<std::size_t>(2 * count) * sizeof(float));
+    std::memmove(out_points, points, static_cast<std::size_t>(3 * count) * sizeof(float));
+    return;
+  }
+  for (std::int64_t i = 0; i < count; ++i) {
+    rectify_feature(readout, camera, positions + 2 * i, points + 3 * i, out_positions + 2 * i, out_points + 3 * i);
+  }
+}
+
 template <>
 void predict_frame<Cpu>(Cpu device, const float* before, const float* last, const float* readout, float seconds,
                         const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,

@@ -63,6 +63,29 @@ SPS_INLINE void rectify_record(const ReadoutMotion& motion, const ShutterCamera&
   __builtin_memcpy(out + 1, &moved.z, sizeof(float));
 }
 
+// m: of a feature that is rectified; nearer it stays as it was.
+constexpr float kMinRectifiedDepth = 0.05f;
+
+// An image feature at the middle row's moment: its position [2] and its point [3], 0 where the depth is unknown and
+// only the turn is heeded.
+SPS_INLINE void rectify_feature(const ReadoutMotion& motion, const ShutterCamera& camera, const float* position,
+                                const float* point, float* out_position, float* out_point) {
+  const Intrinsics& k = camera.intrinsics;
+  const bool known = point[2] > 0.0f;
+  const Vec3<float> ray{(position[0] - k.cx) / k.fx, (position[1] - k.cy) / k.fy, 1.0f};
+  const Vec3<float> before = known ? Vec3<float>{point[0], point[1], point[2]} : ray;
+  const Vec3<float> linear = known ? motion.linear : Vec3<float>{};
+  Vec3<float> moved = at_middle_row({motion.angular, linear, motion.readout}, before, position[1],
+                                    camera.height > 1 ? camera.height : 2);
+  if (!(moved.z > kMinRectifiedDepth)) moved = before;
+  out_position[0] = moved.x / moved.z * k.fx + k.cx;
+  out_position[1] = moved.y / moved.z * k.fy + k.cy;
+  const Vec3<float> kept = known ? moved : Vec3<float>{};
+  out_point[0] = kept.x;
+  out_point[1] = kept.y;
+  out_point[2] = kept.z;
+}
+
 // Which pixel, as it was read, shows what a pixel is to show, in px; its depth times scale is that of the pixel.
 struct ReadPixel {
   float column, row, scale;

@@ -28,10 +28,6 @@ class ColorMotion:
         """Pose float64 [4, 4] of the color image of a frame at a pose."""
         return self._moved(pose, 1.0 + self.share)
 
-    def lever(self, pose: np.ndarray) -> float:
-        """How much the color image's pose moves with a step of a pose float64 [4, 4]."""
-        return 1.0 if self.color_pose(pose) is pose else 1.0 + self.share
-
     def depth_pose(self, color_pose: np.ndarray) -> np.ndarray:
         """The inverse of `color_pose`."""
         return self._moved(color_pose, 1.0 / (1.0 + self.share))

@@ -7,22 +7,19 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.pose_graph import rotation_vectors
+from spslam.image_library import image_library
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_shape, depth_unit
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
-from spslam.slam.poses import pose_matrix
 
 if TYPE_CHECKING:
     from spslam.slam.frame_history import FrameHistory
     from spslam.slam.state import SlamState
 
-# rad, m, during the readout, as in csrc/kernels/rolling_shutter.h: what moves by more has jumped.
-MAX_READOUT_MOTION = 0.15
-MIN_DEPTH_M = 0.05  # of a point that is projected
 BENT_PX = 0.5  # by which rows of an image must be off to matter, the first and the last
 
 
@@ -124,19 +121,12 @@ class ShutterRectifier:
         readout = float(motion.readout)
         if readout == 0 or len(features) == 0:
             return features
-        before, pose = pose_matrix(motion.before), pose_matrix(motion.pose)
-        angular = rotation_vectors(before[:3, :3].T @ pose[:3, :3]) / motion.seconds
-        linear = pose[:3, :3].T @ (pose[:3, 3] - before[:3, 3]) / motion.seconds
-        if max(np.linalg.norm(angular), np.linalg.norm(linear)) * abs(readout) > MAX_READOUT_MOTION:
-            return features
-        k, height = self._image_intrinsics, self._image_rows
-        positions = features.positions.astype(np.float64)
-        known = features.points[:, 2:] > 0
-        rays = np.concatenate([(positions - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(positions), 1))], 1)
-        points = np.where(known, features.points, rays)
-        share = readout * (positions[:, 1:] / max(height - 1, 1) - 0.5)
-        moved = points + share * (np.cross(angular, points) + np.where(known, linear, 0))
-        moved = np.where(moved[:, 2:] > MIN_DEPTH_M, moved, points)
-        projected = moved[:, :2] / moved[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
-        kept = np.where(known, moved, 0)
-        return replace(features, positions=projected.astype(np.float32), points=kept.astype(np.float32))
+        poses = torch.cat([motion.before, motion.pose]).cpu().numpy()
+        moved = np.array([*poses, readout, motion.seconds], np.float32)
+        k = self._image_intrinsics
+        camera = np.array([k.fx, k.fy, k.cx, k.cy, self._image_rows], np.float32)
+        read = [np.ascontiguousarray(each, np.float32) for each in (features.positions, features.points)]
+        positions, points = (np.empty_like(each) for each in read)
+        addresses = [each.ctypes.data for each in (*read, moved, camera, positions, points)]
+        image_library().spslam_rectify_features(*addresses[:2], len(features), *addresses[2:])
+        return replace(features, positions=positions, points=points)

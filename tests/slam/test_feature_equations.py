@@ -1,24 +1,28 @@
-"""What image features want of a pose, against differences of their errors; what rays without depth can tell."""
+"""What image features want of a pose, against differences of their errors; what rays without depth can tell; and the
+pose that they hold, against plain NumPy."""
 
 import math
 
 import numpy as np
 import pytest
 
-from spslam.geometry import pose_from, rotation_angle
+from spslam.geometry import matrix_to_pose7, pose_from, rotation_angle
 from spslam.pose_graph import rotation_matrices
+from spslam.slam.color_motion import ColorMotion
 from spslam.slam.recovery.feature_equations import (
-    DEPTH_DEVIATIONS,
-    INDEPENDENT_FEATURES,
-    INVERSE_DEPTH_DEVIATION,
     SeenPoints,
     SeenRays,
     agreeing_points,
+    held_pose,
     point_equations,
     ray_equations,
 )
+from tests.reference import feature_pose as reference
 
+CAMERA = np.array([300.0, 290, 160, 120])
 MATRIX = np.array([[300.0, 0, 160], [0, 290, 120], [0, 0, 1]])
+# As in csrc/kernels/feature_pose.h.
+DEPTH_DEVIATIONS, INVERSE_DEPTH_DEVIATION, INDEPENDENT_FEATURES = 3.0, 4.0, 50
 COUNT = 30
 WIDE_PX = 1e5  # errors are so small beside it that no weight falls
 POSE = pose_from(rotation_matrices(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 0.5]))
@@ -51,8 +55,8 @@ def rays_of(origin, directions, positions, beyond_m):
 def test_few_rays_weigh_no_more_than_as_many_points(random):
     directions = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (COUNT, 3))) - POSE[:3, 3]
     rays = rays_of(POSE[:3, 3], directions, seen(POSE, directions + POSE[:3, 3]), 4.0)
-    _, alone, _ = ray_equations(MATRIX, rays, POSE, 3.0)
-    _, beside, _ = ray_equations(MATRIX, rays, POSE, 3.0, least=10 * INDEPENDENT_FEATURES)
+    _, alone, _ = ray_equations(CAMERA, rays, POSE, 3.0)
+    _, beside, _ = ray_equations(CAMERA, rays, POSE, 3.0, least=10 * INDEPENDENT_FEATURES)
     np.testing.assert_allclose(beside, alone / 10, rtol=1e-9)
 
 
@@ -75,7 +79,7 @@ def test_equations_of_points_are_those_of_their_errors(random):
     positions = random.uniform([0, 0], [320, 240], (COUNT, 2))
     share = math.sqrt(min(1.0, INDEPENDENT_FEATURES / COUNT)) / WIDE_PX
     check_equations(
-        point_equations(MATRIX, exact(points, positions), POSE, WIDE_PX),
+        point_equations(CAMERA, exact(points, positions), POSE, WIDE_PX),
         lambda step: (seen(stepped(POSE, step), points) - positions).ravel() * share,
     )
 
@@ -102,7 +106,7 @@ def test_equations_of_noisy_points_are_those_of_errors_across_their_epipolar_lin
     sight = (points - origin) / np.linalg.norm(points - origin, axis=1)[:, None]
     positions = seen(POSE, points) + random.normal(0, 1e-3, (COUNT, 2))
     check_along_epipolar_lines(
-        point_equations(MATRIX, SeenPoints(points, positions, 0.02 * sight), POSE, 3.0),
+        point_equations(CAMERA, SeenPoints(points, positions, 0.02 * sight), POSE, 3.0),
         lambda pose, at: seen(pose, points + at * sight),
         0.02 * DEPTH_DEVIATIONS,
         positions,
@@ -115,14 +119,14 @@ def test_points_that_agree_are_those_that_the_equations_count(random, deviation)
     points = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 2], (COUNT, 3)))
     deviations = deviation * (points - POSE[:3, 3] - np.array([0.3, -0.2, 0.1]))
     shown = SeenPoints(points, seen(POSE, points) + random.normal(0, 3.0, (COUNT, 2)), deviations)
-    agreeing = agreeing_points(MATRIX, shown, POSE, 3.0)
+    agreeing = agreeing_points(CAMERA, shown, POSE, 3.0)
     assert 0 < agreeing < COUNT
-    assert agreeing == point_equations(MATRIX, shown, POSE, 3.0)[0]
+    assert agreeing == point_equations(CAMERA, shown, POSE, 3.0)[0]
 
 
 def test_points_behind_the_camera_tell_nothing(random):
     points = to_world(np.array([[0.1, 0.2, -1.0], [0.0, 0.0, 0.0]]))
-    agreeing, matrix, gradient = point_equations(MATRIX, exact(points, np.zeros((2, 2))), POSE, 3.0)
+    agreeing, matrix, gradient = point_equations(CAMERA, exact(points, np.zeros((2, 2))), POSE, 3.0)
     assert agreeing == 0 and not matrix.any() and not gradient.any()
 
 
@@ -137,7 +141,7 @@ def test_equations_of_rays_are_those_of_errors_across_their_epipolar_lines(rando
         return np.stack([x / z, y / z], 1)
 
     positions = positions_at(POSE, 0.0) + random.normal(0, 1e-3, (COUNT, 2))
-    found = ray_equations(MATRIX, rays_of(origin, directions, positions, beyond_m), POSE, 3.0)
+    found = ray_equations(CAMERA, rays_of(origin, directions, positions, beyond_m), POSE, 3.0)
     check_along_epipolar_lines(found, positions_at, INVERSE_DEPTH_DEVIATION * inverse_depth, positions, 3.0)
 
 
@@ -154,9 +158,9 @@ def test_rays_tell_how_the_camera_has_turned(random, depth_m):
     def off(with_rays):
         at = POSE
         for _ in range(10):
-            _, matrix, gradient = point_equations(MATRIX, exact(near, shown_near), at, 3.0)
+            _, matrix, gradient = point_equations(CAMERA, exact(near, shown_near), at, 3.0)
             if with_rays:
-                _, more, toward = ray_equations(MATRIX, rays, at, 3.0)
+                _, more, toward = ray_equations(CAMERA, rays, at, 3.0)
                 matrix, gradient = matrix + more, gradient + toward
             at = stepped(at, -np.linalg.solve(matrix + 1e-9 * np.eye(6), gradient))
         turn = np.degrees(rotation_angle(at[:3, :3].T @ true[:3, :3]))
@@ -172,8 +176,56 @@ def test_rays_of_a_camera_that_has_only_turned_count_along_all_directions(random
     directions = to_world(random.uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (COUNT, 3))) - POSE[:3, 3]
     turned = stepped(POSE, np.array([0, 0, 0, 0.002, -0.003, 0.001]))
     positions = seen(turned, directions + POSE[:3, 3])
-    agreeing, matrix, gradient = ray_equations(MATRIX, rays_of(POSE[:3, 3], directions, positions, 4.0), POSE, 3.0)
+    agreeing, matrix, gradient = ray_equations(CAMERA, rays_of(POSE[:3, 3], directions, positions, 4.0), POSE, 3.0)
     assert agreeing == COUNT
     assert np.linalg.eigvalsh(matrix[3:, 3:]).min() > 1e3
     step = -np.linalg.solve(matrix[3:, 3:], gradient[3:])
     np.testing.assert_allclose(step, [0.002, -0.003, 0.001], atol=2e-5)
+
+
+def shaken(pose, random, size=0.01):
+    return stepped(pose, random.normal(0, size, 6))
+
+
+def held_case(random, motion=None):
+    """Points and rays of two earlier frames as a moved camera's color image sees them, and where surface has put it."""
+    points = to_world(random.uniform([-0.8, -0.6, 1], [0.8, 0.6, 3], (200, 3)))
+    far = to_world(random.uniform([-3, -2, 8], [3, 2, 12], (2, 60, 3)))
+    moved = stepped(POSE, np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
+    true = moved if motion is None else motion.color_pose(moved)
+    sight = points - POSE[:3, 3]
+    shown = SeenPoints(points, seen(true, points) + random.normal(0, 0.4, (200, 2)), 0.005 * sight)
+    rays = [
+        rays_of(origin, (each - origin) / (POSE[:3, :3].T @ (each - origin).T)[2:].T, seen(true, each), 4.0)
+        for origin, each in zip((POSE[:3, 3], true[:3, 3]), far, strict=True)
+    ]
+    root = random.normal(0, 1, (6, 6))
+    return shown, rays, matrix_to_pose7(shaken(moved, random)), 1e3 * root @ root.T
+
+
+@pytest.mark.parametrize("share", [None, 0.3, -0.5, 20.0], ids=["one moment", "late", "early", "jumped"])
+@pytest.mark.parametrize("with_rays", [False, True])
+def test_pose_is_held_as_by_plain_numpy(random, share, with_rays):
+    motion = None if share is None else ColorMotion(shaken(POSE, random, 0.02), share)
+    points, rays, pose, information = held_case(random, motion)
+    arguments = CAMERA, points, rays if with_rays else [], motion, pose, information, 3.0, 20
+    wanted, found = reference.held_pose(*arguments), held_pose(*arguments)
+    assert np.abs(wanted - pose).max() > 1e-3  # it has moved
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_pose_is_not_held_by_too_few_points(random):
+    points, rays, pose, information = held_case(random)
+    assert held_pose(CAMERA, points, rays, None, pose, information, 3.0, 1000) is None
+    few = SeenPoints(*(each[:0] for each in points.arrays))
+    assert held_pose(CAMERA, few, rays, None, pose, information, 3.0, 1) is None
+
+
+def test_arrays_in_any_layout_are_taken(random):
+    points, rays, pose, information = held_case(random)
+    wanted = held_pose(CAMERA, points, rays, None, pose, information, 3.0, 20)
+    strided = SeenPoints(*(np.asfortranarray(each) for each in points.arrays))
+    single = SeenRays(*(each.astype(np.float32) for each in rays[0].arrays))
+    found = held_pose(CAMERA, strided, [single, rays[1]], None, pose, np.asfortranarray(information), 3.0, 20)
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    assert agreeing_points(CAMERA, strided, POSE, 3.0) == agreeing_points(CAMERA, points, POSE, 3.0)

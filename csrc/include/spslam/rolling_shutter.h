@@ -52,6 +52,12 @@ void rectify_shutter_frame(Device device, const std::int32_t* records, std::int6
                            const FrameImages& images, const ShutterMotion& motion, const ShutterCamera& camera,
                            const ShutterCamera& image_camera, const ShutterFrame& out);
 
+// Image features of a frame: positions [count, 2] (px) and surface points [count, 3] in camera axes (m), 0 where the
+// depth is unknown and they turn only. `camera` is that of the image. On the host; out may be the same memory.
+void rectify_shutter_features(Cpu device, const float* positions, const float* points, std::int64_t count,
+                              const ShutterMotion& motion, const ShutterCamera& camera, float* out_positions,
+                              float* out_points);
+
 // What is predicted of a frame: its pose [7], the readout [1] that counts for it, and its records as they are
 // rectified.
 struct PredictedFrame {

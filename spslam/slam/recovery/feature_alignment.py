@@ -15,8 +15,7 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.geometry import inverse, pose_from
-from spslam.pose_graph import rotation_matrices, rotation_vectors
+from spslam.geometry import inverse
 from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
 from spslam.slam.image_features import ImageFeatures
@@ -25,7 +24,7 @@ from spslam.slam.recovery.feature_equations import (
     SeenPoints,
     SeenRays,
     agreeing_points,
-    point_equations,
+    held_pose,
     ray_equations,
 )
 
@@ -37,8 +36,6 @@ MIN_INLIERS = 20  # fewer may agree by chance, or lie on one small thing
 # wrong ones with which some twenty matches agree: those at one edge, after a jump.
 RANSAC_ITERATIONS = 100
 RANSAC_CONFIDENCE = 0.999
-HELD_ITERATIONS = 6  # at most; none after one that moved the pose by less than SMALL_STEP
-SMALL_STEP = 1e-5  # m and rad, a hundredth of what either matters
 COMPARED = 250  # of the strongest features, to find out which of many frames look alike
 MIN_ALIKE = 12  # matches of these
 
@@ -92,6 +89,7 @@ class FeatureAlignment:
         self._motion = motion
         k = depth_image_intrinsics(camera)
         self._matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+        self._intrinsics = np.array([k.fx, k.fy, k.cx, k.cy], np.float64)
         self.focal_px = k.fx
         self.max_error_px = max(k.fx * math.tan(math.radians(MAX_ERROR_DEG)), MIN_ERROR_PX)
 
@@ -166,26 +164,17 @@ class FeatureAlignment:
             matches: with earlier frames.
             late_px: by how much the features may be off, where that is more than `max_error_px`.
         """
-        points = _joined(matches)
-        rays = [one.rays for one in matches if one.rays is not None and len(one.rays)]
-        at = before = pose_matrix(pose)
-        error_px = max(self.max_error_px, late_px)
-        for _ in range(HELD_ITERATIONS):
-            lever = 1.0 if self._motion is None else self._motion.lever(at)
-            color_pose = self._of_color(at)
-            agreeing, features, toward = point_equations(self._matrix, points, color_pose, error_px)
-            if agreeing < MIN_INLIERS:
-                return None
-            for seen in rays:
-                _, by_rays, toward_rays = ray_equations(self._matrix, seen, color_pose, error_px, agreeing)
-                features, toward = features + by_rays, toward + toward_rays
-            change = np.r_[at[:3, 3] - before[:3, 3], rotation_vectors(at[:3, :3] @ before[:3, :3].T)]
-            normal = information + lever**2 * features
-            step = -np.linalg.solve(normal + np.eye(6), information @ change + lever * toward)
-            at = pose_from(rotation_matrices(step[3:]) @ at[:3, :3], at[:3, 3] + step[:3])
-            if np.abs(step).max() < SMALL_STEP:
-                break
-        return pose_tensor(at, pose.device)
+        held = held_pose(
+            self._intrinsics,
+            _joined(matches),
+            [one.rays for one in matches if one.rays is not None and len(one.rays)],
+            self._motion,
+            pose.cpu().numpy().astype(np.float64),
+            information,
+            max(self.max_error_px, late_px),
+            MIN_INLIERS,
+        )
+        return None if held is None else torch.from_numpy(held).to(pose.device, torch.float32)
 
     def color_pose(self, pose: torch.Tensor) -> np.ndarray:
         """Pose float64 [4, 4] of the frame's color image, of a pose float32 [7]; waits for the device."""
@@ -203,14 +192,14 @@ class FeatureAlignment:
             color_pose: of this frame, see `color_pose`.
             late_px: or to within so much, which the image may have moved since depth was measured.
         """
-        return agreeing_points(self._matrix, matches, color_pose, max(self.max_error_px, late_px))
+        return agreeing_points(self._intrinsics, matches, color_pose, max(self.max_error_px, late_px))
 
     def ray_inliers(self, matches: FeatureMatches, color_pose: np.ndarray) -> int:
         """How many rays agree with a pose, see `inliers`: reprojected, what lies on them beyond the range of depth may
         be within `max_error_px` of where the frame shows it."""
         if matches.rays is None or not len(matches.rays):
             return 0
-        return ray_equations(self._matrix, matches.rays, color_pose, self.max_error_px)[0]
+        return ray_equations(self._intrinsics, matches.rays, color_pose, self.max_error_px)[0]
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""
