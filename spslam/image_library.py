@@ -56,11 +56,11 @@ def _declare(library: ctypes.CDLL) -> None:
     library.spslam_orb_features.argtypes = [pointer] * 5
     library.spslam_orb_features.restype = count
     number = ctypes.c_double
-    library.spslam_point_equations.argtypes = [*[pointer] * 3, count, pointer, pointer, number, pointer]
+    library.spslam_point_equations.argtypes = [pointer, count, pointer, pointer, number, pointer]
     library.spslam_point_equations.restype = count
-    library.spslam_ray_equations.argtypes = [*[pointer] * 4, count, pointer, pointer, number, count, pointer]
+    library.spslam_ray_equations.argtypes = [pointer, count, pointer, pointer, number, count, pointer]
     library.spslam_ray_equations.restype = count
-    library.spslam_hold_pose.argtypes = [*[pointer] * 3, count, pointer, pointer, count, *[pointer] * 5, count, pointer]
+    library.spslam_hold_pose.argtypes = [pointer, pointer, count, pointer, count, pointer]
     library.spslam_hold_pose.restype = count
     library.spslam_rectify_features.argtypes = [pointer, pointer, count, *[pointer] * 4]
     library.spslam_rectify_features.restype = None

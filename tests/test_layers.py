@@ -32,6 +32,7 @@ GROUND = {
     "config",
     "errors",
     "geometry",
+    "array_messages",
     "helper_process",
     "image_library",
     "io",

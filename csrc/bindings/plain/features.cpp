@@ -35,39 +35,39 @@ SPS_EXPORT std::int64_t spslam_orb_features(const std::uint8_t* intensity, const
   }
 }
 
-// camera: fx, fy, cx, cy. equations: hessian and gradient [42]; null counts alone. Returns how many points agree.
-SPS_EXPORT std::int64_t spslam_point_equations(const double* points, const double* positions, const double* deviations,
-                                               std::int64_t count, const double* camera, const double* pose,
-                                               double error_px, double* equations) {
-  const spslam::SeenPoints seen{points, positions, deviations, count};
-  if (!equations) return spslam::agreeing_points(spslam::Cpu{}, seen, camera_of(camera), pose, error_px);
-  return store(spslam::point_equations(spslam::Cpu{}, seen, camera_of(camera), pose, error_px), equations);
+// seen: points, positions, deviations. camera: fx, fy, cx, cy. equations: hessian and gradient [42]; null counts alone.
+// Returns how many points agree.
+SPS_EXPORT std::int64_t spslam_point_equations(const double* const* seen, std::int64_t count, const double* camera,
+                                               const double* pose, double error_px, double* equations) {
+  const spslam::SeenPoints points{seen[0], seen[1], seen[2], count};
+  if (!equations) return spslam::agreeing_points(spslam::Cpu{}, points, camera_of(camera), pose, error_px);
+  return store(spslam::point_equations(spslam::Cpu{}, points, camera_of(camera), pose, error_px), equations);
 }
 
-SPS_EXPORT std::int64_t spslam_ray_equations(const double* origin, const double* directions, const double* positions,
-                                             const double* beyond, std::int64_t count, const double* camera,
+// seen: origin, directions, positions, range.
+SPS_EXPORT std::int64_t spslam_ray_equations(const double* const* seen, std::int64_t count, const double* camera,
                                              const double* pose, double error_px, std::int64_t least,
                                              double* equations) {
-  const spslam::SeenRays seen{origin, directions, positions, beyond, count};
-  return store(spslam::ray_equations(spslam::Cpu{}, seen, camera_of(camera), pose, error_px, least), equations);
+  const spslam::SeenRays rays{seen[0], seen[1], seen[2], seen[3], count};
+  return store(spslam::ray_equations(spslam::Cpu{}, rays, camera_of(camera), pose, error_px, least), equations);
 }
 
-// ray_arrays: origin, directions, positions and range of each of `groups` earlier frames; ray_counts of each. before
-// may be null. numbers: share of the motion, error_px. Returns how many points agreed, -1 where these were fewer than
-// least and -2 where there is not enough memory.
-SPS_EXPORT std::int64_t spslam_hold_pose(const double* points, const double* positions, const double* deviations,
-                                         std::int64_t count, const double* const* ray_arrays,
-                                         const std::int64_t* ray_counts, std::int64_t groups, const double* camera,
-                                         const double* before, const double* numbers, const double* pose,
-                                         const double* information, std::int64_t least, double* held) {
+// seen: points, positions, deviations, then origin, directions, positions and range of each earlier frame with rays;
+// counts [1 + groups] of them. frame: camera, pose [7], information [36], the pose before, which may be null, and two
+// numbers: share of the motion, error_px. Returns how many points agreed, -1 where these were fewer than least and -2
+// where there is not enough memory.
+SPS_EXPORT std::int64_t spslam_hold_pose(const double* const* seen, const std::int64_t* counts, std::int64_t groups,
+                                         const double* const* frame, std::int64_t least, double* held) {
   try {
     std::vector<spslam::SeenRays> rays;
     for (std::int64_t i = 0; i < groups; ++i) {
-      const double* const* of = ray_arrays + 4 * i;
-      rays.push_back({of[0], of[1], of[2], of[3], ray_counts[i]});
+      const double* const* of = seen + 3 + 4 * i;
+      rays.push_back({of[0], of[1], of[2], of[3], counts[1 + i]});
     }
-    return spslam::hold_pose(spslam::Cpu{}, {points, positions, deviations, count}, rays.data(), groups,
-                             camera_of(camera), {before, numbers[0]}, pose, information, {numbers[1], least}, held);
+    const double* numbers = frame[4];
+    return spslam::hold_pose(spslam::Cpu{}, {seen[0], seen[1], seen[2], counts[0]}, rays.data(), groups,
+                             camera_of(frame[0]), {frame[3], numbers[0]}, frame[1], frame[2], {numbers[1], least},
+                             held);
   } catch (const std::bad_alloc&) {
     return -2;
   }

@@ -75,18 +75,18 @@ def point_equations(
     Returns:
         How many; float64 [6, 6] and [6]: matrix and gradient of a step of the pose (m, rad) in world axes.
     """
-    equations, pose, arrays = np.empty(42), _row_major(pose), seen.arrays
+    equations, pose, arrays = np.empty(42), _row_major(pose), _Arrays(seen.arrays)
     count = image_library().spslam_point_equations(
-        *_addresses(arrays), len(seen), camera.ctypes.data, pose.ctypes.data, error_px, equations.ctypes.data
+        arrays.address, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, equations.ctypes.data
     )
     return count, equations[:36].reshape(6, 6), equations[36:]
 
 
 def agreeing_points(camera: np.ndarray, seen: SeenPoints, pose: np.ndarray, error_px: float) -> int:
     """How many points agree with a pose; as `point_equations`."""
-    pose, arrays = _row_major(pose), seen.arrays
+    pose, arrays = _row_major(pose), _Arrays(seen.arrays)
     return image_library().spslam_point_equations(
-        *_addresses(arrays), len(seen), camera.ctypes.data, pose.ctypes.data, error_px, None
+        arrays.address, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, None
     )
 
 
@@ -104,9 +104,9 @@ def ray_equations(
         seen: the rays.
         least: each weighs at most as one of so many that agree.
     """
-    equations, pose, arrays = np.empty(42), _row_major(pose), seen.arrays
+    equations, pose, arrays = np.empty(42), _row_major(pose), _Arrays(seen.arrays)
     count = image_library().spslam_ray_equations(
-        *_addresses(arrays), len(seen), *_addresses((camera, pose)), error_px, least, equations.ctypes.data
+        arrays.address, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, least, equations.ctypes.data
     )
     return count, equations[:36].reshape(6, 6), equations[36:]
 
@@ -139,33 +139,28 @@ def held_pose(
     Raises:
         MemoryError: there is not enough.
     """
-    held, information, numbers = np.empty(7), _row_major(information), np.array([0.0, error_px])
-    before = None
-    if motion is not None:
-        before, numbers[0] = matrix_to_pose7(motion.before), motion.share
-    point_arrays, ray_arrays = points.arrays, [array for one in rays for array in one.arrays]
-    addresses = np.array(_addresses(ray_arrays), np.uintp)
-    counts = np.array([len(one) for one in rays], np.int64)
+    before = None if motion is None else matrix_to_pose7(motion.before)
+    numbers = np.array([0.0 if motion is None else motion.share, error_px])
+    seen = _Arrays([*points.arrays, *(array for one in rays for array in one.arrays)])
+    frame = _Arrays([camera, pose, _row_major(information), before, numbers])
+    counts, held = np.array([len(points), *map(len, rays)], np.int64), np.empty(7)
     agreeing = image_library().spslam_hold_pose(
-        *_addresses(point_arrays),
-        len(points),
-        addresses.ctypes.data,
-        counts.ctypes.data,
-        len(rays),
-        camera.ctypes.data,
-        None if before is None else before.ctypes.data,
-        *_addresses((numbers, pose, information)),
-        least,
-        held.ctypes.data,
+        seen.address, counts.ctypes.data, len(rays), frame.address, least, held.ctypes.data
     )
-    check_memory(0 if agreeing == -1 else agreeing)
-    return None if agreeing < 0 else held
+    if agreeing == -1:
+        return None
+    check_memory(agreeing)
+    return held
+
+
+class _Arrays:
+    """Where arrays lie, as a compiled function takes several, and the arrays as long as that lives."""
+
+    def __init__(self, arrays: Sequence[np.ndarray | None]):
+        self._arrays = arrays
+        self._addresses = np.array([0 if array is None else array.ctypes.data for array in arrays], np.uintp)
+        self.address = self._addresses.ctypes.data
 
 
 def _row_major(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array, np.float64)
-
-
-def _addresses(arrays: Sequence[np.ndarray]) -> list[int]:
-    """Of arrays that somebody holds until they were used."""
-    return [array.ctypes.data for array in arrays]
