@@ -23,8 +23,9 @@ def send_message(connection: Connection, message: object) -> None:
     buffers: list[pickle.PickleBuffer] = []
     content = pickle.dumps(message, _WITH_BUFFERS, buffer_callback=buffers.append)
     parts = [buffer.raw() for buffer in buffers]
-    connection.send_bytes(np.array([len(part) for part in parts], np.int64))
-    for part in (content, *parts):
+    connection.send_bytes(np.array([len(part) for part in parts], np.int64).tobytes())
+    connection.send_bytes(content)
+    for part in parts:
         connection.send_bytes(part)
 
 
