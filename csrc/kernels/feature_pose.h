@@ -14,11 +14,11 @@ namespace spslam {
 constexpr double kMinFeatureDepth = 0.05;  // m before the camera, of what it can show
 // Of what was seen without depth, by its expected inverse depth: what seems to lie beyond the range may be nearer.
 constexpr double kInverseDepthDeviations = 4.0;
-constexpr double kDepthDeviations =
-    3.0;  // of a point's depth, by which it may be off, as an inlier's error is of its position
+// Of a point's depth, by which it may be off, as an inlier's error is of its position.
+constexpr double kDepthDeviations = 3.0;
 constexpr double kWideErrors = 3.0;  // times the error of an inlier, the width of the robust kernel
-constexpr double kIndependentFeatures =
-    50.0;  // as many a frame's are worth: those of one earlier frame are off by the same
+// As many a frame's are worth: those of one earlier frame are off by the same.
+constexpr double kIndependentFeatures = 50.0;
 
 // What a camera shows: a point in its axes, which may be scaled, the inverse of its depth (1/m), where it is shown, and
 // by how much that may be off beside, along the epipolar line (px).

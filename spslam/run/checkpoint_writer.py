@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,6 @@ import torch
 from spslam.config import Config
 from spslam.slam.checkpoint import Snapshot, take_snapshot, write_snapshot
 from spslam.slam.state import SlamState
-
-LogOnDisk = Callable[[], AbstractContextManager[None]]
 
 
 class CheckpointWriter:
@@ -35,14 +32,14 @@ class CheckpointWriter:
         """Whether the last checkpoint is still being written."""
         return self._thread is not None and self._thread.is_alive()
 
-    def write(self, state: SlamState, config: Config, source: dict[str, Any], log_on_disk: LogOnDisk) -> None:
-        """Writes the current state. The log is on the disk before, so that it has the frames of every checkpoint.
+    def write(self, state: SlamState, config: Config, source: dict[str, Any], sync_log: Callable[[], None]) -> None:
+        """Writes the current state. The log is flushed to disk before, so that it has the frames of every checkpoint.
 
         Args:
             state: after a complete frame.
             config: of the run.
             source: returned by `load_checkpoint`.
-            log_on_disk: as `RunLog.on_disk`, of a log that has the rows of all processed frames.
+            sync_log: brings the log, which has the rows of all processed frames, to the disk.
 
         Raises:
             OutputError: this or the last checkpoint can't be written; the file of the one before is left unchanged.
@@ -50,11 +47,11 @@ class CheckpointWriter:
         self.wait()
         snapshot = take_snapshot(state, config, source, copy=self.threaded)
         if not self.threaded:
-            _write(self.path, snapshot, log_on_disk)
+            _write(self.path, snapshot, sync_log)
             return
         device = state.scene.device
         taken = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
-        write = _on_own_stream(device, taken, lambda: _write(self.path, snapshot, log_on_disk))
+        write = _on_own_stream(device, taken, lambda: _write(self.path, snapshot, sync_log))
         self._thread = threading.Thread(target=self._keep_error, args=(write,), name="spslam-checkpoint")
         self._thread.start()
 
@@ -78,10 +75,10 @@ class CheckpointWriter:
             self._error = error
 
 
-def _write(path: Path, snapshot: Snapshot, log_on_disk: LogOnDisk) -> None:
+def _write(path: Path, snapshot: Snapshot, sync_log: Callable[[], None]) -> None:
     # The log must have the frames of every checkpoint, also after a power failure.
-    with log_on_disk():
-        write_snapshot(path, snapshot)
+    sync_log()
+    write_snapshot(path, snapshot)
 
 
 def _on_own_stream(

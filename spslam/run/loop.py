@@ -137,7 +137,7 @@ class RunLoop:
     def _save(self, position: int, log: RunLog, writer: CheckpointWriter) -> None:
         self._flush_reports(log, wait=True)
         source = {"data": self.session.identity, "next": position, "clock": self.session.clock.to_dict()}
-        writer.write(self.system.state, self.system.config, source, log.on_disk)
+        writer.write(self.system.state, self.system.config, source, log.sync)
 
 
 def _is_checkpoint_due(every: int, last_saved: int, done: int) -> bool:

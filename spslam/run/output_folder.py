@@ -6,7 +6,6 @@ import fcntl
 import json
 import os
 import shutil
-import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -28,7 +27,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF)
 
 
 class RunLog(contextlib.AbstractContextManager):
-    """log.jsonl, open to append rows; each is written out at once, but for those that come within `on_disk`.
+    """log.jsonl, open to append rows; each is written out at once.
 
     Raises:
         OutputError: the file can't be written.
@@ -36,37 +35,18 @@ class RunLog(contextlib.AbstractContextManager):
 
     def __init__(self, path: Path):
         self.path = path
-        self._lock = threading.Lock()
-        self._waiting: list[str] | None = None
         with writing(path):
             self._file = path.open("a", encoding="utf-8", buffering=1)
 
     def append(self, row: dict[str, Any]) -> None:
         """Adds a row."""
-        line = json.dumps(row) + "\n"
-        with writing(self.path), self._lock:
-            if self._waiting is None:
-                self._file.write(line)
-            else:
-                self._waiting.append(line)
+        with writing(self.path):
+            self._file.write(json.dumps(row) + "\n")
 
-    @contextlib.contextmanager
-    def on_disk(self) -> Iterator[None]:
-        """All rows so far are on the disk; those that come meanwhile are written out at the end. On any thread.
-
-        While the system brings a file of some size to the disk, to write to another one takes as long as that, in which
-        a GPU tracks dozens of frames.
-        """
-        with self._lock:
-            self._waiting = []
-        try:
-            with writing(self.path):
-                os.fsync(self._file.fileno())
-            yield
-        finally:
-            with writing(self.path), self._lock:
-                lines, self._waiting = self._waiting, None
-                self._file.write("".join(lines))
+    def sync(self) -> None:
+        """Returns when all rows are on the disk."""
+        with writing(self.path):
+            os.fsync(self._file.fileno())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

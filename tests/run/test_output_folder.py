@@ -106,22 +106,6 @@ def test_a_log_that_cannot_be_written_is_named():
         log.append({"frame": 0})
 
 
-def test_rows_that_come_while_the_log_is_brought_to_the_disk_are_written_afterwards(tmp_path):
-    path = tmp_path / "log.jsonl"
-    with RunLog(path) as log:
-        log.append({"frame": 0})
-        with log.on_disk():
-            log.append({"frame": 1})
-            log.append({"frame": 2})
-            assert path.read_text() == '{"frame": 0}\n'
-        assert path.read_text() == '{"frame": 0}\n{"frame": 1}\n{"frame": 2}\n'
-        with pytest.raises(ZeroDivisionError), log.on_disk():
-            log.append({"frame": 3})
-            raise ZeroDivisionError
-        log.append({"frame": 4})
-    assert [json.loads(line)["frame"] for line in path.read_text().splitlines()] == [0, 1, 2, 3, 4]
-
-
 def test_another_camera_or_scale_of_depth_is_other_data(monkeypatch, tmp_path):
     whole = Recorded(6)
     interrupt(monkeypatch, tmp_path / "out", 5, "run.checkpoint_every=2", dataset=whole)
