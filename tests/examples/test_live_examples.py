@@ -48,10 +48,12 @@ def test_the_realsense_loop_tracks_a_recording_of_the_sdk(tmp_path):
     ended = run("-c", RUN, EXAMPLES / "live_realsense.py", "room.ply", "--recording", "room.db3", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     lines = ended.stdout.splitlines()
-    assert len([line for line in lines if line.startswith("at (")]) >= 10
-    assert re.fullmatch(
-        r"SlamSystem\(160x120, cpu, \d+ frames \(0 lost\), \d+ voxels\): room.ply, trajectory.txt", lines[-1]
+    ending = re.fullmatch(
+        r"SlamSystem\(160x120, cpu, (\d+) frames \(0 lost\), \d+ voxels\): room.ply, trajectory.txt", lines[-1]
     )
+    assert ending, lines[-1]
+    # On a busy machine the SDK finds fewer pairs of depth and color; of those that it gives none is left out.
+    assert len([line for line in lines if line.startswith("at (")]) == int(ending[1]) >= 6
     assert (tmp_path / "room.ply").stat().st_size > 10_000
 
 
