@@ -1,6 +1,6 @@
 """Messages between processes whose arrays go beside the pickle: no copy of them holds up Python's interpreter.
 
-A pickle of some megabytes is made, and read, in one go; a frame loop beside it would wait for tens of milliseconds.
+A pickle is made, and read, in one go, while no other thread can do anything.
 """
 
 from __future__ import annotations
