@@ -32,7 +32,6 @@ GROUND = {
     "config",
     "errors",
     "geometry",
-    "array_messages",
     "helper_process",
     "image_library",
     "io",

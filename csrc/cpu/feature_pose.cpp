@@ -13,14 +13,13 @@ constexpr int kHoldIterations = 6;   // at most; none after one that moved the p
 constexpr double kSmallStep = 1e-5;  // m and rad, a hundredth of what either matters
 constexpr double kSolvable = 1e-12;  // share of a diagonal entry that elimination must leave
 
-using Rotation = Mat3<double>;
 using Point = Vec3<double>;
 
 Point load_point(const double* p) {
   return {p[0], p[1], p[2]};
 }
 
-Point to_camera_axes(const Rotation& rotation, const Point& v) {
+Point to_camera(const Mat3<double>& rotation, const Point& v) {
   const double* r = rotation.m;
   return {r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z,
           r[2] * v.x + r[5] * v.y + r[8] * v.z};
@@ -34,26 +33,23 @@ Pose<double> pose_of(const double* m) {
 template <class F>
 void for_each_point(const SeenPoints& seen, const FeatureCamera& k, const Pose<double>& pose, const F& f) {
   for (std::int64_t i = 0; i < seen.count; ++i) {
-    const Point point = to_camera_axes(pose.rotation, load_point(seen.points + 3 * i) - pose.translation);
+    const Point point = to_camera(pose.rotation, load_point(seen.points + 3 * i) - pose.translation);
     if (!(point.z > kMinFeatureDepth)) continue;
-    ShownFeature shown{point, 1.0 / point.z, seen.positions[2 * i], seen.positions[2 * i + 1], 0.0, 0.0};
-    const Point moved = to_camera_axes(pose.rotation, load_point(seen.deviations + 3 * i));
-    shown_motion(k, point, kDepthDeviations * moved, &shown);
-    f(shown);
+    const Point moved = kDepthDeviations * to_camera(pose.rotation, load_point(seen.deviations + 3 * i));
+    f(shown_feature(k, point, 1.0 / point.z, seen.positions + 2 * i, moved));
   }
 }
 
 // And of each ray at its expected inverse depth, by which its point is scaled.
 template <class F>
 void for_each_ray(const SeenRays& seen, const FeatureCamera& k, const Pose<double>& pose, const F& f) {
-  const Point moved = to_camera_axes(pose.rotation, load_point(seen.origin) - pose.translation);
+  const Point moved = to_camera(pose.rotation, load_point(seen.origin) - pose.translation);
   for (std::int64_t i = 0; i < seen.count; ++i) {
     const double inverse_depth = 0.5 / seen.beyond[i];
-    const Point point = to_camera_axes(pose.rotation, load_point(seen.directions + 3 * i)) + inverse_depth * moved;
+    const Point point = to_camera(pose.rotation, load_point(seen.directions + 3 * i)) + inverse_depth * moved;
     if (!(point.z > kMinFeatureDepth)) continue;
-    ShownFeature shown{point, inverse_depth / point.z, seen.positions[2 * i], seen.positions[2 * i + 1], 0.0, 0.0};
-    shown_motion(k, point, kInverseDepthDeviations * inverse_depth * moved, &shown);
-    f(shown);
+    const Point off = kInverseDepthDeviations * inverse_depth * moved;
+    f(shown_feature(k, point, inverse_depth / point.z, seen.positions + 2 * i, off));
   }
 }
 
@@ -71,7 +67,7 @@ struct FeatureSums {
   }
 
   // In world axes; features weigh as `kIndependentFeatures` where more agree, or should.
-  FeatureEquations equations(const Rotation& rotation, std::int64_t least) const {
+  FeatureEquations equations(const Mat3<double>& rotation, std::int64_t least) const {
     const double agree = static_cast<double>(std::max<std::int64_t>({agreeing, least, 1}));
     const double share = std::min(1.0, kIndependentFeatures / agree) / (error_px * error_px);
     double hessian[36], gradient[6], cost;

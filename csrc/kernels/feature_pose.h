@@ -34,12 +34,16 @@ struct FeatureError {
   SPS_INLINE double square() const { return u * u + v * v; }
 };
 
-// How far a position moves, to first order, where a point moves.
-SPS_INLINE void shown_motion(const FeatureCamera& k, const Vec3<double>& point, const Vec3<double>& moved,
-                             ShownFeature* shown) {
+// A feature whose point may have moved by `moved` (m): to first order its position moves along the epipolar line.
+SPS_INLINE ShownFeature shown_feature(const FeatureCamera& k, const Vec3<double>& point, double inverse_depth,
+                                      const double* position, const Vec3<double>& moved) {
   const double by_z = 1.0 / point.z;
-  shown->along_u = k.fx * (moved.x - point.x * by_z * moved.z) * by_z;
-  shown->along_v = k.fy * (moved.y - point.y * by_z * moved.z) * by_z;
+  return {point,
+          inverse_depth,
+          position[0],
+          position[1],
+          k.fx * (moved.x - point.x * by_z * moved.z) * by_z,
+          k.fy * (moved.y - point.y * by_z * moved.z) * by_z};
 }
 
 SPS_INLINE FeatureError feature_error(const FeatureCamera& k, const ShownFeature& shown, double error_px) {

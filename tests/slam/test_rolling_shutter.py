@@ -79,6 +79,9 @@ def test_features_are_rectified_as_records_are():
     rectifier = ShutterRectifier(dataset.camera, 8.0)
     motion = ops.ShutterMotion(pose_tensor(BEFORE, CPU), pose_tensor(POSE, CPU), INTERVAL, torch.tensor([0.02]))
     features = extract_features(pixels, dataset.camera, 8.0)
+    points = features.points.copy()
+    points[::3] = 0  # as if their depth were unknown
+    features = replace(features, points=points)
     moved = rectifier.features(features, motion)
     shares = 0.02 * (features.positions[:, 1] / (dataset.camera.height - 1) - 0.5) / INTERVAL
     known = features.points[:, 2] > 0
@@ -93,6 +96,11 @@ def test_features_are_rectified_as_records_are():
     projected = moved.points[known, :2] / moved.points[known, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
     np.testing.assert_allclose(moved.positions[known], projected, atol=0.01)
     assert not moved.points[~known].any()
+    # Where the depth is unknown they turn as what is far away does.
+    for i in np.flatnonzero(~known)[::20]:
+        ray = np.array([(features.positions[i, 0] - k.cx) / k.fx, (features.positions[i, 1] - k.cy) / k.fy, 1.0])
+        x, y, z = rotation_matrices(shares[i] * np.array((0.03, 0.06, -0.01))) @ ray
+        np.testing.assert_allclose(moved.positions[i], (x / z * k.fx + k.cx, y / z * k.fy + k.cy), atol=0.01)
     far = pose_tensor(BEFORE @ pose_of((0, 0, 0), (1.0, 0, 0)), CPU)
     for unmoved in (motion._replace(readout=torch.zeros(1)), motion._replace(pose=far)):
         same = rectifier.features(features, unmoved)

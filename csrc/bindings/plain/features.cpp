@@ -3,11 +3,10 @@
 #include <new>
 #include <vector>
 
+#include "bindings/plain/export.h"
 #include "spslam/feature_pose.h"
 #include "spslam/orb_features.h"
 #include "spslam/rolling_shutter.h"
-
-#define SPS_EXPORT extern "C" __attribute__((visibility("default")))
 
 namespace {
 

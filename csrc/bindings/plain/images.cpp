@@ -1,11 +1,12 @@
 // Plain C functions that Python calls by ctypes: the data is looked at while torch is loaded, so they need none.
 #include <new>
 
+#include "bindings/plain/export.h"
 #include "spslam/color_registration.h"
 #include "spslam/png_filters.h"
 
 // Whether this processor has the instructions that the kernels are compiled for; this file is compiled for any.
-extern "C" __attribute__((visibility("default"))) int spslam_runs_here() {
+SPS_EXPORT int spslam_runs_here() {
 #if defined(SPSLAM_NEEDS_AVX512)
   return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
          __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
@@ -19,9 +20,9 @@ extern "C" __attribute__((visibility("default"))) int spslam_runs_here() {
 // colors and registered_colors: null where only depth is wanted. sizes: of the color image, the depth image and the
 // depth buffer, width and height each. numbers: those of a `PixelMap` in its order, the typical depth and the hidden
 // share. Returns 0, or 1 where there is not enough memory.
-extern "C" __attribute__((visibility("default"))) int spslam_register_color(
-    const std::uint8_t* colors, const std::uint8_t* unseen, const float* depth, const std::int32_t* sizes,
-    const float* numbers, std::uint8_t* registered_colors, float* registered_depth) {
+SPS_EXPORT int spslam_register_color(const std::uint8_t* colors, const std::uint8_t* unseen, const float* depth,
+                                     const std::int32_t* sizes, const float* numbers, std::uint8_t* registered_colors,
+                                     float* registered_depth) {
   spslam::ColorRegistration registration{};
   for (int k = 0; k < 3; ++k) {
     registration.map.by_u[k] = numbers[k];
@@ -44,9 +45,8 @@ extern "C" __attribute__((visibility("default"))) int spslam_register_color(
 
 // sizes: rows, bytes of a row without its filter's number, bytes of a pixel. Of numbers of 16 bits the bytes are
 // exchanged. Returns 0, 1 where there is not enough memory, 2 where a row's filter is none.
-extern "C" __attribute__((visibility("default"))) int spslam_unfilter_png(const std::uint8_t* filtered,
-                                                                          const std::int32_t* sizes, int is_16_bit,
-                                                                          std::uint8_t* out) {
+SPS_EXPORT int spslam_unfilter_png(const std::uint8_t* filtered, const std::int32_t* sizes, int is_16_bit,
+                                   std::uint8_t* out) {
   const spslam::PngRows image{sizes[0], sizes[1], sizes[2]};
   try {
     if (!spslam::unfilter_png(spslam::Cpu{}, image, filtered, out)) return 2;

@@ -8,6 +8,7 @@ process solves the graph itself, with the same result.
 from __future__ import annotations
 
 import contextlib
+import pickle
 import subprocess
 import warnings
 from collections.abc import Sequence
@@ -16,7 +17,6 @@ from multiprocessing.connection import Connection
 
 import torch
 
-from spslam.array_messages import receive_message, send_message
 from spslam.config import Config
 from spslam.errors import SpslamError, brief
 from spslam.helper_process import DISCONNECTED, NOT_STARTED, HelperProcess, describe_exit
@@ -81,8 +81,8 @@ class SolverProcess:
             self._known = []
         request = Request.of(self._config, len(self._known), keyframes[len(self._known) :], problem)
         self._is_solving = True
-        send_message(connection, request)
-        answer: Answer = receive_message(connection)
+        connection.send_bytes(pickle.dumps(request, pickle.HIGHEST_PROTOCOL))
+        answer = Answer(*connection.recv())
         self._is_solving = False
         if answer.content is None or answer.update is None:
             self._known = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import pickle
 import traceback
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -11,7 +12,6 @@ import cv2
 import torch
 
 from spslam import ops
-from spslam.array_messages import receive_message, send_message
 from spslam.helper_process import DISCONNECTED
 from spslam.slam.graph.host_threads import host_thread_count
 from spslam.slam.graph.keyframe import Keyframe
@@ -37,12 +37,12 @@ def serve(socket: int) -> None:
         service = SolverService(pool)
         GraphSolver.prepare()
         while True:
-            request: Request = receive_message(connection)
+            request: Request = pickle.loads(connection.recv_bytes())
             try:
                 answer = service.answer(request)
             except Exception:
                 answer = Answer(failure=traceback.format_exc())
-            send_message(connection, answer)
+            connection.send(answer)
 
 
 class SolverService:
