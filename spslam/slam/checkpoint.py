@@ -16,6 +16,7 @@ from spslam.config import Config, read_shipped
 from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
 from spslam.slam.depth_keyframes import depth_image_shape
+from spslam.slam.device_events import host_copy
 from spslam.slam.recovery.pose_confidence import MODEL_FILE
 from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames, keeps_moments
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
@@ -111,7 +112,7 @@ def write_snapshot(path: Path, snapshot: Snapshot) -> None:
     Raises:
         OutputError: the file can't be written; the checkpoint before is left as it was.
     """
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in snapshot.tensors.items()}
+    tensors = {name: host_copy(tensor.detach()) for name, tensor in snapshot.tensors.items()}
     save_tensors(path, tensors, snapshot.header)
 
 

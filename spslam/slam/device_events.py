@@ -7,6 +7,8 @@ from typing import Any
 
 import torch
 
+PIECE_BYTES = 1 << 20  # of page-locked memory
+
 
 class DeviceEvent(ABC):
     """A place in a device's queue; events of one kind can be compared."""
@@ -68,6 +70,26 @@ def event_recorder(device: torch.device) -> Callable[[], DeviceEvent]:
         return HostEvent
     stream = current_stream(device)
     return lambda: StreamEvent(stream)
+
+
+def host_copy(tensor: torch.Tensor) -> torch.Tensor:
+    """A tensor on the CPU, contiguous: itself if it is so already; waits for this thread's stream.
+
+    A large one comes in pieces by page-locked memory: while the driver copies to any other, threads that launch
+    something else wait for it.
+    """
+    if tensor.device.type == "cpu":
+        return tensor.contiguous()
+    source, copy = tensor.contiguous().view(-1), torch.empty(tensor.shape, dtype=tensor.dtype)
+    size = max(PIECE_BYTES // tensor.element_size(), 1)
+    staging = torch.empty(min(size, len(source)), dtype=tensor.dtype, pin_memory=True)
+    record = event_recorder(tensor.device)
+    for piece, part in zip(copy.view(-1).split(size), source.split(size), strict=True):
+        staged = staging[: len(part)]
+        staged.copy_(part, non_blocking=True)
+        record().wait()
+        piece.copy_(staged)
+    return copy
 
 
 def fetch(numbers: torch.Tensor) -> torch.Tensor:
