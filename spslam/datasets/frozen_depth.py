@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -22,24 +20,14 @@ _CELLS = (16, 12)
 _MOVED_LEVELS = 1.5
 
 
-class Signature(Protocol):
-    """What is compared of a frame.
+@dataclass(frozen=True)
+class FrameSignature:
+    """What is compared of a frame; kept, or sent to another process, without it.
 
     Attributes:
         depth: checksum of the depth image; 0 without depth.
         brightness: float32 [12, 16], mean brightness of the cells of a grid, less the image's mean.
     """
-
-    @property
-    def depth(self) -> int: ...
-
-    @property
-    def brightness(self) -> np.ndarray: ...
-
-
-@dataclass(frozen=True)
-class FrameSignature:
-    """A `Signature` that is kept, or sent to another process, without its frame."""
 
     depth: int
     brightness: np.ndarray
@@ -48,20 +36,6 @@ class FrameSignature:
     def of(cls, frame: RgbdFrame) -> FrameSignature:
         """The signature of a frame."""
         return cls(_checksum(frame.depth), _brightness(frame.color[::_COLOR_ROW_STEP]))
-
-
-class ArrivingSignature:
-    """A `Signature` of a frame whose pose is waited for: brightness is looked at where depth does not tell.
-
-    It keeps rows of the color image, not the frame, whose memory a camera may use again.
-    """
-
-    def __init__(self, frame: RgbdFrame) -> None:
-        self.depth, self._rows = _checksum(frame.depth), frame.color[::_COLOR_ROW_STEP].copy()
-
-    @cached_property
-    def brightness(self) -> np.ndarray:
-        return _brightness(self._rows)
 
 
 def _checksum(depth: np.ndarray) -> int:
@@ -88,16 +62,47 @@ class FrozenDepth:
         first: of the frames before; None where there are none.
     """
 
-    def __init__(self, first: Signature | None = None) -> None:
+    def __init__(self, first: FrameSignature | None = None) -> None:
         self._first = first
 
-    def check(self, signature: Signature) -> bool:
+    def check(self, signature: FrameSignature) -> bool:
         """Whether the depth of the next frame is frozen. A camera that stands still before an exact sensor is not."""
         first = self._first
         if first is None or not signature.depth or signature.depth != first.depth:
             self._first = signature
             return False
         return has_moved(signature.brightness, first.brightness)
+
+
+class ArrivingFrozenDepth:
+    """`FrozenDepth` of frames whose poses are waited for: a row of depth tells most frames from the one before.
+
+    Of a frame that later ones are compared with, rows are copied: a camera may use its memory again.
+    """
+
+    def __init__(self) -> None:
+        self._depth: np.ndarray | None = None
+        self._color = np.zeros((0, 0, 3), np.uint8)
+
+    def check(self, frame: RgbdFrame) -> bool:
+        """Whether the depth of the next frame is frozen; each that is not must be given to `keep`."""
+        if not self._has_depth_of(frame):
+            return False
+        return has_moved(_brightness(frame.color[::_COLOR_ROW_STEP]), _brightness(self._color))
+
+    def keep(self, frame: RgbdFrame) -> None:
+        """Has the next frames compared with this one, if its depth is new; takes longer than `check`."""
+        if not self._has_depth_of(frame):
+            self._depth = frame.depth[::_DEPTH_ROW_STEP].copy()
+            self._color = frame.color[::_COLOR_ROW_STEP].copy()
+
+    def _has_depth_of(self, frame: RgbdFrame) -> bool:
+        """Whether there is depth, and the same as in the frame kept."""
+        rows, kept = frame.depth[::_DEPTH_ROW_STEP], self._depth
+        middle = len(rows) // 2
+        if kept is None or not np.array_equal(rows[middle], kept[middle], equal_nan=True):
+            return False
+        return np.array_equal(rows, kept, equal_nan=True) and bool(rows.any())
 
 
 def frozen_depth_before(dataset: RgbdDataset, start: int) -> FrozenDepth:

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from spslam.datasets.base import clear_border
-from spslam.datasets.frozen_depth import FROZEN, ArrivingSignature, FrozenDepth
+from spslam.datasets.frozen_depth import FROZEN, ArrivingFrozenDepth
 from spslam.errors import DatasetError, SpslamError
 from spslam.live.capture import Capture
 from spslam.live.frame_queue import FrameQueue
@@ -117,7 +117,7 @@ class LiveLoop:
         self.failure: SpslamError | None = None
         self._queue: FrameQueue = capture.queue
         self._progress = progress
-        self._frozen_depth = FrozenDepth()
+        self._frozen_depth = ArrivingFrozenDepth()
         self._uploader = Uploader(system.device) if system.device.type == "cuda" else None
         self._record = event_recorder(system.device)
         mapping = system.config.mapping
@@ -152,7 +152,7 @@ class LiveLoop:
         status.dropped = self._dropped()
         if isinstance(item, DatasetError):
             self._skip(item)
-        elif self._frozen_depth.check(ArrivingSignature(item.frame)):
+        elif self._frozen_depth.check(item.frame):
             self._skip(DatasetError(f"{self.capture.source.name}, frame {item.frame.index}: {FROZEN}"))
         else:
             queue_ms = 1e3 * (time.monotonic() - item.complete_s)
@@ -175,6 +175,7 @@ class LiveLoop:
         self.poses.append(item.frame.pose)
         pending = self.system.submit(frame, lambda pose: known.append(time.monotonic()), defer_mapping=True)
         latency_ms = 1e3 * (known[0] - item.complete_s)
+        self._frozen_depth.keep(item.frame)
         self._write_row(log)  # of the frame before, whose mapping has ended; the pose does not wait for it
         status.report = pending.result()
         status.latencies.add(latency_ms)

@@ -17,7 +17,7 @@ from spslam.slam.constraints import Constraints, ConstraintSource
 from spslam.slam.device_events import event_recorder, fetch
 from spslam.slam.feature_keeper import FeatureKeeper
 from spslam.slam.frame_history import FrameHistory
-from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report, pose_matrix
+from spslam.slam.frame_report import FrameEvents, PendingReport, frame_report
 from spslam.slam.graph.edges import LoopDecision
 from spslam.slam.graph.global_mapping import GlobalMapping
 from spslam.slam.image_features import FrameFeatures
@@ -157,12 +157,12 @@ class FramePipeline:
         if not begins_map:
             constraints = self.constraints.gather(self.history, read, frame.depth_time, frame.offsets.color)
         tracked, shutter, pixels = self._track(frame, features, constraints, number, events)
-        self._store(frame, pixels, constraints, tracked, features, shutter)
         if not begins_map:
-            self._tell(on_pose, tracked)
+            self._tell(on_pose, tracked, tracked.lost)
+        self._store(frame, pixels, constraints, tracked, features, shutter)
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
-            self._tell(on_pose, tracked)
+            self._tell(on_pose, tracked, self.state.frames.is_lost(-1))
         self.features.keep(self.state, frame, features, tracked, shutter)
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
@@ -366,13 +366,9 @@ class FramePipeline:
             return None
         return tracked.matrix if tracked.is_on_host else fetch(self.state.frames.poses[-1])
 
-    def _tell(self, on_pose: PoseCallback | None, tracked: TrackedFrame) -> None:
-        if on_pose is None:
-            return
-        pose = self._pose(tracked)
-        if isinstance(pose, torch.Tensor):
-            self._record().wait()
-        on_pose(pose_matrix(pose))
+    def _tell(self, on_pose: PoseCallback | None, tracked: TrackedFrame, lost: bool) -> None:
+        if on_pose is not None:
+            on_pose(None if lost else tracked.matrix.copy())
 
     def _has_too_little_depth(self, pixels: FramePixels) -> bool:
         """Whether too little of the image has depth to determine a pose."""

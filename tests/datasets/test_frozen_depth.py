@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spslam.datasets.base import RgbdFrame
-from spslam.datasets.frozen_depth import ArrivingSignature, FrameSignature, FrozenDepth, frozen_depth_before
+from spslam.datasets.frozen_depth import ArrivingFrozenDepth, FrameSignature, FrozenDepth, frozen_depth_before
 from spslam.datasets.generated import GeneratedDataset
 from spslam.errors import DatasetError
 
@@ -23,12 +23,15 @@ def with_depth_of(frame, other):
 
 def checks(frames):
     """By signatures that are kept, and by those of a camera that has all its images in the same memory."""
-    frozen, arriving, answers = FrozenDepth(), FrozenDepth(), []
+    frozen, arriving, answers = FrozenDepth(), ArrivingFrozenDepth(), []
     color, depth = np.empty_like(frames[0].color), np.empty_like(frames[0].depth)
     for frame in frames:
         color[:], depth[:] = frame.color, frame.depth
         answers.append(frozen.check(FrameSignature.of(frame)))
-        assert arriving.check(ArrivingSignature(RgbdFrame(frame.index, frame.timestamp, color, depth))) is answers[-1]
+        arrived = RgbdFrame(frame.index, frame.timestamp, color, depth)
+        assert arriving.check(arrived) is answers[-1]
+        if not answers[-1]:
+            arriving.keep(arrived)
     return answers
 
 
@@ -52,6 +55,13 @@ def test_a_camera_that_stands_still_with_noise_and_another_exposure(frames):
 def test_frames_without_depth_are_not_frozen(frames):
     empty = [RgbdFrame(i, 0.0, frame.color, np.zeros_like(frame.depth)) for i, frame in enumerate(frames)]
     assert checks(empty) == [False] * 6
+
+
+def test_depth_that_is_not_a_number_may_be_frozen_too(frames):
+    holed = [with_depth_of(frame, frames[0]) for frame in frames[:3]]
+    for frame in holed:
+        frame.depth[::3] = np.nan
+    assert checks(holed) == [False, True, True]
 
 
 @pytest.mark.parametrize("start", range(7))
