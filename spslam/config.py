@@ -49,7 +49,10 @@ def load_config(path: str | os.PathLike, preset: str | None = None, overrides: I
     file = _read(path)
     changes = [_parse_override(override) for override in overrides]
     defaults = _read(_config_dir() / "defaults.yaml")
-    name = preset or dict(changes).get("preset") or file.get("preset") or defaults["preset"]
+    changed = dict(changes).get("preset")
+    if preset is not None and changed not in (None, preset):
+        raise ConfigError(f"preset is given twice: {preset} and, among changes of options, {shown(changed)}")
+    name = preset or changed or file.get("preset") or defaults["preset"]
     if name not in PRESETS:
         raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {shown(name)}")
     is_resolved = _pop_resolved(file, path, name)

@@ -69,6 +69,12 @@ def test_empty_section_changes_nothing(tmp_path):
     assert load_config(path).tracking == load_config("replica").tracking
 
 
+def test_a_preset_that_is_given_twice():
+    assert load_config("replica", "fast", ["preset=fast"]).preset == "fast"
+    with pytest.raises(ConfigError, match="preset is given twice: fast and, among changes of options, 'paper'"):
+        load_config("replica", "fast", ["preset=paper"])
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_dump_reads_back_equal(tmp_path, preset):
     config = load_config("replica", preset, ["seed=7", ("prior.weights", "some: file.safetensors")])

@@ -18,8 +18,9 @@ from spslam.datasets.files import require_folder
 from spslam.datasets.image_files import ColorFiles, DepthFiles, first_depth_size
 from spslam.datasets.images import Size, first_size
 from spslam.datasets.lens import Lens
-from spslam.datasets.pairing import interpolate_trajectory, pair_by_time, sorted_trajectory
+from spslam.datasets.pairing import pair_by_time, sorted_trajectory
 from spslam.datasets.recording import Calibration, Recording, View
+from spslam.datasets.reference_poses import ReferencePoses, interpolated_poses
 from spslam.datasets.text import camera_from_matrix, read_numbers, read_rows
 from spslam.errors import DatasetError, brief
 from spslam.geometry import inverse, pose_from
@@ -67,10 +68,12 @@ def open_arkitscenes(path: Path, min_confidence: int = 0, tolerance_s: float = 0
         confidence=[path if path.is_file() else None for path in sure],
         min_confidence=min_confidence,
     )
-    poses = _poses(folder / TRAJECTORY_FILE, depth_times[pairs[:, 1]])
+    reference = _poses(folder / TRAJECTORY_FILE, depth_times[pairs[:, 1]])
     color = ColorFiles(colors, color_times, size)
     calibration = Calibration.of_one_view(lens, depth_size)
-    return Recording(f"arkitscenes/{path.name}", color, stream, pairs, calibration, poses, view=view)
+    dataset = Recording(f"arkitscenes/{path.name}", color, stream, pairs, calibration, reference.poses, view=view)
+    dataset.doubts = reference.doubts
+    return dataset
 
 
 def _frames_folder(path: Path) -> Path:
@@ -105,9 +108,9 @@ def _lens(folder: Path, size: Size) -> Lens:
     return Lens(camera_from_matrix(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), *size, str(folder)))
 
 
-def _poses(path: Path, times: np.ndarray) -> np.ndarray | None:
+def _poses(path: Path, times: np.ndarray) -> ReferencePoses:
     if not path.is_file():
-        return None
+        return ReferencePoses()
     rows = []
     for words in read_rows(path, columns=7):
         try:
@@ -116,8 +119,6 @@ def _poses(path: Path, times: np.ndarray) -> np.ndarray | None:
             raise DatasetError(f"{path}: must be `time rx ry rz tx ty tz`, got {brief(' '.join(words))!r}") from None
     table = np.array(rows, dtype=np.float64).reshape(-1, 7)
     table = table[np.isfinite(table).all(axis=1)]
-    if not len(table):
-        return None
-    rotations = np.array([cv2.Rodrigues(row)[0] for row in table[:, 1:4]])
+    rotations = np.array([cv2.Rodrigues(row)[0] for row in table[:, 1:4]]).reshape(-1, 3, 3)
     trajectory = sorted_trajectory(table[:, 0], inverse(pose_from(rotations, table[:, 4:])))
-    return interpolate_trajectory(trajectory, times, _MAX_GAP_S)
+    return interpolated_poses(trajectory, times, _MAX_GAP_S, str(path))

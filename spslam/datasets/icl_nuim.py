@@ -16,6 +16,7 @@ from spslam.camera import Camera
 from spslam.datasets.base import MAX_FRAMES
 from spslam.datasets.files import FileDataset, FramePaths, require_folder
 from spslam.datasets.images import first_size
+from spslam.datasets.reference_poses import ReferencePoses
 from spslam.datasets.text import read_rows
 from spslam.datasets.tum import UNITS_PER_METER
 from spslam.errors import DatasetError, brief
@@ -38,8 +39,15 @@ def open_icl_nuim(folder: Path) -> FileDataset:
     """
     frames = _frames(require_folder(folder))
     camera = _CAMERA.resized(*first_size(frame.color for frame in frames.values()))
-    poses = _poses(folder, list(frames))
-    return FileDataset(f"icl_nuim/{folder.name}", camera, list(frames.values()), poses, UNITS_PER_METER)
+    reference = _poses(folder, list(frames))
+    return FileDataset(
+        f"icl_nuim/{folder.name}",
+        camera,
+        list(frames.values()),
+        reference.poses,
+        UNITS_PER_METER,
+        doubts=reference.doubts,
+    )
 
 
 def _frames(folder: Path) -> dict[int, FramePaths]:
@@ -57,14 +65,14 @@ def _frames(folder: Path) -> dict[int, FramePaths]:
     return dict(sorted(frames.items()))
 
 
-def _poses(folder: Path, numbers: list[int]) -> np.ndarray | None:
+def _poses(folder: Path, numbers: list[int]) -> ReferencePoses:
     files = sorted(folder.glob("*.gt.freiburg"))
     if not files:
-        return None
+        return ReferencePoses()
     trajectory = Trajectory.load_tum(files[0], skip_unknown=True)
     rows = {int(round(time)): row for row, time in enumerate(trajectory.timestamps) if abs(time) < MAX_FRAMES}
     poses = np.full((len(numbers), 4, 4), np.nan)
     for place, number in enumerate(numbers):
         if number in rows:
             poses[place] = _MIRROR @ trajectory.poses[rows[number]] @ _MIRROR
-    return poses
+    return ReferencePoses.of(poses, [], str(files[0]))

@@ -114,26 +114,37 @@ def trajectory_poses(path: Path, times: np.ndarray, max_gap_s: float) -> Referen
     if not path.is_file():
         return ReferencePoses()
     stored = Trajectory.load_tum(path, skip_unknown=True)
-    ordered = sorted_trajectory(stored.timestamps, stored.poses)
-    poses = interpolate_trajectory(ordered, times, max_gap_s)
+    return interpolated_poses(sorted_trajectory(stored.timestamps, stored.poses), times, max_gap_s, str(path))
+
+
+def interpolated_poses(trajectory: Trajectory, times: np.ndarray, max_gap_s: float, source: str) -> ReferencePoses:
+    """Poses of a trajectory at the times of frames.
+
+    Args:
+        trajectory: its timestamps must be strictly ascending, its poses finite.
+        times: [F], s.
+        max_gap_s: between two poses further apart nothing is interpolated.
+        source: what the trajectory was read from.
+    """
+    poses = interpolate_trajectory(trajectory, times, max_gap_s)
     if np.isfinite(poses).any():
         return ReferencePoses(poses)
-    return ReferencePoses(None, (_uncovered(path, ordered.timestamps, times, max_gap_s),))
+    return ReferencePoses(None, (_uncovered(source, trajectory.timestamps, times, max_gap_s),))
 
 
-def _uncovered(path: Path, stored: np.ndarray, times: np.ndarray, max_gap_s: float) -> Finding:
+def _uncovered(source: str, stored: np.ndarray, times: np.ndarray, max_gap_s: float) -> Finding:
     """Why a trajectory has a pose for no frame."""
     if not len(stored):
-        return Finding("reference poses", f"{path} holds no pose", "write poses, or remove it")
+        return Finding("reference poses", f"{source} holds no pose", "write poses, or remove it")
     if stored[-1] < times.min() or stored[0] > times.max():
         text = (
-            f"no frame has a ground-truth pose: {path} covers {stored[0]:.15g} to {stored[-1]:.15g} s, "
+            f"no frame has a ground-truth pose: {source} covers {stored[0]:.15g} to {stored[-1]:.15g} s, "
             f"the frames {times.min():.15g} to {times.max():.15g} s"
         )
         return Finding("reference poses", text, "bring both to one clock, in seconds")
     apart = float(np.median(np.diff(stored))) if len(stored) > 1 else float("inf")
     text = (
-        f"no frame has a ground-truth pose: the poses of {path} are {apart:.3g} s apart, "
+        f"no frame has a ground-truth pose: the poses of {source} are {apart:.3g} s apart, "
         f"and none is interpolated between poses over {max_gap_s:g} s apart"
     )
     return Finding("reference poses", text, f"give poses at least every {max_gap_s:g} s, or at the times of the images")

@@ -71,7 +71,11 @@ class MappingOptions(Section):
     iterations: int = option("I_m, iterations per mapped frame", "iterations", ge=0)
     first_iterations: int = option("iterations on the first frame", "iterations", ge=0)
     pixels: int = option(
-        "M_p, pixels drawn in each iteration from all selected frames together", "px", needs=(_MAPPING,), ge=16
+        "M_p, pixels drawn in each iteration from all selected frames together",
+        "px",
+        needs=(_MAPPING,),
+        ge=16,
+        le=2**20,
     )
     frames: int = option(
         "maximum number of selected frames: recent and co-visible ones, the rest at random",

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 from pathlib import Path
 
@@ -301,6 +302,27 @@ def test_what_is_broken_is_one_line(tmp_path, name, spoil, message):
         open_dataset(load_config(config, overrides=[("dataset.path", str(recording))]).dataset)
     assert "\n" not in str(error.value)
     assert str(tmp_path) in str(error.value)
+
+
+ELSEWHEN = " ".join(["1.0"] * 7) + "\n" + " ".join(["2.0"] * 7)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "words"),
+    [
+        ("arkitscenes", put("lowres_wide.traj", ELSEWHEN), r"lowres_wide.traj covers 1 to 2 s, the frames \d+"),
+        ("arkitscenes", put("lowres_wide.traj", ""), "lowres_wide.traj holds no pose; write poses, or remove it"),
+        ("icl_nuim", put("*.gt.freiburg", "77 0 0 0 0 0 0 1"), "livingRoom0.gt.freiburg hold no finite one for any"),
+    ],
+)
+def test_poses_of_no_frame_are_a_doubt(tmp_path, name, spoil, words):
+    config, writer, _ = FORMATS[name]
+    recording = writer(tmp_path / "mine", COUNT)
+    spoil(recording)
+    dataset = open_dataset(load_config(config, overrides=[("dataset.path", str(recording))]).dataset)
+    assert dataset.poses() is None
+    (doubt,) = dataset.doubts
+    assert re.search(f"no frame has a (known|ground-truth) pose.*{words}|{words}", str(doubt)), str(doubt)
 
 
 def test_broken_archives_are_one_line(tmp_path):

@@ -1,6 +1,7 @@
 """ROS bags of every kind give the frames that were written into them."""
 
 import pickle
+import re
 import threading
 
 import numpy as np
@@ -192,6 +193,32 @@ def test_poses_of_a_topic(tmp_path, kind):
     bag = write_ros2(tmp_path / "r", messages, make)
     assert open_rosbag(bag).poses() is None
     np.testing.assert_allclose(open_rosbag(bag, RosOptions(pose_topic="/truth")).poses(), POSES[:8], atol=1e-6)
+
+
+def test_transforms_of_another_clock_are_a_doubt(tmp_path):
+    frames, make = same_view(8), Messages(True)
+    messages = camera_messages(make, frames)
+    for topic, seconds, message in messages:
+        if topic == "/tf":
+            for transform in message.transforms:
+                transform.header.stamp = make.header(seconds + 500, "map").stamp
+    dataset = open_rosbag(write_ros2(tmp_path / "r", messages, make))
+    assert dataset.poses() is None
+    (doubt,) = dataset.doubts
+    assert "from color_optical to map are known for no time of a frame" in str(doubt)
+
+
+def test_a_topic_of_another_clock_is_a_doubt(tmp_path):
+    frames, make = same_view(8), Messages(True)
+    messages = camera_messages(make, frames, transforms=False)
+    for message in messages:
+        message[2].header.frame_id = "cam"
+    for number, seconds in enumerate(frames.times()):
+        messages.append(("/truth", seconds, make.stamped(seconds - 100, "world", "cam", POSES[number])))
+    dataset = open_rosbag(write_ros2(tmp_path / "r", messages, make), RosOptions(pose_topic="/truth"))
+    assert dataset.poses() is None
+    (doubt,) = dataset.doubts
+    assert re.search(r"no frame has a ground-truth pose: .*r, /truth, covers .* s, the frames .* s", str(doubt)), doubt
 
 
 ENCODINGS = {

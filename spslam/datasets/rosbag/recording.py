@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from spslam.datasets.findings import Finding
 from spslam.datasets.lens import Lens
-from spslam.datasets.pairing import interpolate_trajectory, pair_by_time
+from spslam.datasets.pairing import pair_by_time
 from spslam.datasets.recording import Calibration, Recording, View
+from spslam.datasets.reference_poses import ReferencePoses, interpolated_poses
 from spslam.datasets.rosbag.bag import Bag, explained, topic_index
 from spslam.datasets.rosbag.messages import camera_of, decode_color_message, decode_depth_message
 from spslam.datasets.rosbag.stream import TopicStream
@@ -67,12 +69,14 @@ def open_rosbag(path: Path, options: RosOptions | None = None) -> Recording:
         tree = read_transforms(bag)
         place = np.eye(4) if is_registered else _place(bag, color, depth, tree, float(color_index.seconds[0]))
         pairs = pair_by_time(color_index.seconds, depth_index.seconds, options.pair_tolerance_s, str(path))
-        poses = _reference(bag, tree, _frame(color) or "", depth_index.seconds[pairs[:, 1]], options)
+        reference = _reference(bag, tree, _frame(color) or "", depth_index.seconds[pairs[:, 1]], options)
     calibration = Calibration(color_lens, depth_lens, place)
     name = f"rosbag/{path.stem if path.is_file() else path.name}"
     color_stream = TopicStream(path, color.name, color_index, False)
     depth_stream = TopicStream(path, depth.name, depth_index, True, options.depth_scale)
-    return Recording(name, color_stream, depth_stream, pairs, calibration, poses, view=options.view)
+    dataset = Recording(name, color_stream, depth_stream, pairs, calibration, reference.poses, view=options.view)
+    dataset.doubts = reference.doubts
+    return dataset
 
 
 def image_size(topic: ImageTopic) -> tuple[int, int]:
@@ -117,19 +121,31 @@ def _place(bag: Bag, color: ImageTopic, depth: ImageTopic, tree: TransformTree, 
     return found
 
 
-def _reference(bag: Bag, tree: TransformTree, frame: str, times: np.ndarray, options: RosOptions) -> np.ndarray | None:
-    """Poses of the color camera at the frames' times, NaN where unknown; None where the bag has none."""
+def _reference(bag: Bag, tree: TransformTree, frame: str, times: np.ndarray, options: RosOptions) -> ReferencePoses:
+    """Poses of the color camera at the frames' times."""
     if options.pose_topic is not None:
         trajectory, child = read_pose_topic(bag, options.pose_topic)
-        poses = interpolate_trajectory(trajectory, times, MAX_GAP_S)
+        reference = interpolated_poses(trajectory, times, MAX_GAP_S, f"{bag.path}, {options.pose_topic},")
         child_from_color = tree.between(child, frame, float(times[0])) if child else None
-        return poses if child_from_color is None else poses @ child_from_color
+        if reference.poses is None or child_from_color is None:
+            return reference
+        return ReferencePoses(reference.poses @ child_from_color)
     chain = tree.ancestors(frame)
-    world = options.world_frame or chain[-1]
-    if world.lstrip("/") not in chain:
+    world = (options.world_frame or chain[-1]).lstrip("/")
+    if world not in chain:
         raise DatasetError(
-            f"{bag.path}: dataset.world_frame must be one that {frame} is in: {', '.join(chain)}, got {world}"
+            f"{bag.path}: dataset.world_frame must be one that {frame} is in: {', '.join(chain)}, got "
+            f"{options.world_frame}"
         )
-    if not tree.moves(frame, world.lstrip("/")):
-        return None
-    return tree.poses(frame, world.lstrip("/"), times)
+    if not tree.moves(frame, world):
+        return ReferencePoses()
+    poses = tree.poses(frame, world, times)
+    if np.isfinite(poses).any():
+        return ReferencePoses(poses)
+    text = (
+        f"no frame has a ground-truth pose: the transforms of {bag.path} from {frame} to {world} are known for no time "
+        f"of a frame, and none is interpolated over more than {MAX_GAP_S:g} s"
+    )
+    return ReferencePoses(
+        None, (Finding("reference poses", text, "bring both to one clock, or set dataset.pose_topic"),)
+    )
