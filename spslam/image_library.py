@@ -6,8 +6,10 @@ There is a library for each instruction set, of which the best that this process
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -31,11 +33,22 @@ def image_library() -> ctypes.CDLL:
             library = ctypes.CDLL(str(path))
             if chosen or library.spslam_runs_here():
                 _declare(library)
+                library.spslam_set_threads(1)
                 return library
     raise ImportError(
         f"spslam: no compiled image functions for {' or '.join(names)} in {_FOLDER}; install the wheel, "
         "or build in place with `make dev`"
     )
+
+
+@contextlib.contextmanager
+def images_shared(threads: int) -> Iterator[None]:
+    """Has threads share an image, where frames come one at a time; else each is its thread's own."""
+    image_library().spslam_set_threads(threads)
+    try:
+        yield
+    finally:
+        image_library().spslam_set_threads(1)
 
 
 def check_memory(result: int) -> int:
@@ -51,6 +64,8 @@ def check_memory(result: int) -> int:
 
 def _declare(library: ctypes.CDLL) -> None:
     pointer, integer, count = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
+    library.spslam_set_threads.argtypes = [integer]
+    library.spslam_set_threads.restype = None
     library.spslam_register_color.argtypes = [pointer] * 7
     library.spslam_unfilter_png.argtypes = [ctypes.c_char_p, pointer, integer, pointer]
     library.spslam_orb_features.argtypes = [pointer] * 5

@@ -1,11 +1,14 @@
 #include "spslam/orb_features.h"
 
 #include <algorithm>
+#include <atomic>
 #include <cfloat>
 #include <cmath>
 #include <cstring>
+#include <new>
 #include <vector>
 
+#include "core/parallel.h"
 #include "cpu/orb_corners.h"
 #include "cpu/orb_pyramid.h"
 #include "kernels/orb_pattern.h"
@@ -15,6 +18,21 @@ namespace {
 
 constexpr int kRadius = 15;  // of the round patch that a feature's direction is that of
 constexpr int kPatchLanes = 32;
+constexpr std::int64_t kDescribed = 64;  // features of a chunk
+
+// parallel_for where f may find no memory: then this does.
+template <class F>
+void parallel_with_memory(std::int64_t n, std::int64_t grain, const F& f) {
+  std::atomic<bool> failed{false};
+  parallel_for(n, grain, [&](std::int64_t begin, std::int64_t end) {
+    try {
+      for (std::int64_t i = begin; i < end; ++i) f(i);
+    } catch (const std::bad_alloc&) {
+      failed.store(true, std::memory_order_relaxed);
+    }
+  });
+  if (failed.load(std::memory_order_relaxed)) throw std::bad_alloc();
+}
 
 struct Feature {
   float x, y, response;  // px of the image
@@ -68,9 +86,12 @@ void Levels::make(const std::uint8_t* intensity, int height, int width, int edge
 }
 
 void Levels::blur() {
-  for (std::size_t i = 0; i < images.size(); ++i) {
-    orb::blur(images[i], smooth[i], lines_.reserve((images[i].rows + 6) * std::int64_t{images[i].columns}));
-  }
+  const auto room = [&](std::size_t i) { return (images[i].rows + 6) * std::int64_t{images[i].columns}; };
+  std::vector<std::int64_t> first(images.size() + 1);
+  for (std::size_t i = 0; i < images.size(); ++i) first[i + 1] = first[i] + room(i);
+  float* const lines = lines_.reserve(first.back());
+  parallel_for(static_cast<std::int64_t>(images.size()), 1,
+               [&](std::int64_t i, std::int64_t) { orb::blur(images[i], smooth[i], lines + first[i]); });
 }
 
 // How many corners each level may have: as many as its area has a share in.
@@ -91,11 +112,15 @@ std::vector<Feature> detected(const Levels& levels, const OrbOptions& options, i
   std::size_t counts[orb::kLevels];
   counts_of(options.detected, counts);
   const float per_px = static_cast<float>(static_cast<double>(options.cell_columns) / width);
+  const auto threshold = static_cast<std::uint8_t>(options.fast_threshold);
+  std::vector<orb::Corner> corners[orb::kLevels];
+  parallel_with_memory(static_cast<std::int64_t>(levels.images.size()), 1, [&](std::int64_t i) {
+    corners[i] = orb::corners_of(levels.images[i], options.edge_px, threshold, counts[i]);
+  });
   std::vector<Feature> features;
   for (int i = 0; i < static_cast<int>(levels.images.size()); ++i) {
     const float scale = scale_of(i);
-    const auto threshold = static_cast<std::uint8_t>(options.fast_threshold);
-    for (const orb::Corner& corner : orb::corners_of(levels.images[i], options.edge_px, threshold, counts[i])) {
+    for (const orb::Corner& corner : corners[i]) {
       const float x = corner.x * scale, y = corner.y * scale;
       const auto column = static_cast<std::int32_t>(x * per_px), row = static_cast<std::int32_t>(y * per_px);
       features.push_back({x, y, corner.response, i, corner.x, corner.y, row * options.cell_columns + column, 0});
@@ -234,13 +259,16 @@ std::int64_t orb_features(Cpu, const std::uint8_t* intensity, std::int32_t heigh
   spread(features);
   if (features.size() > static_cast<std::size_t>(options.count)) features.resize(options.count);
   levels.blur();
-  for (std::size_t i = 0; i < features.size(); ++i) {
-    const Feature& one = features[i];
-    positions[2 * i] = one.x;
-    positions[2 * i + 1] = one.y;
-    const float degrees = direction(levels.images[one.level], one.column, one.row);
-    describe(levels.smooth[one.level], one.column, one.row, degrees, descriptors + kOrbBytes * i);
-  }
+  Levels& own = levels;  // of this thread, for others too
+  parallel_for(static_cast<std::int64_t>(features.size()), kDescribed, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const Feature& one = features[i];
+      positions[2 * i] = one.x;
+      positions[2 * i + 1] = one.y;
+      const float degrees = direction(own.images[one.level], one.column, one.row);
+      describe(own.smooth[one.level], one.column, one.row, degrees, descriptors + kOrbBytes * i);
+    }
+  });
   return static_cast<std::int64_t>(features.size());
 }
 

@@ -7,6 +7,8 @@
 #include <cstring>
 #include <vector>
 
+#include "core/macros.h"
+
 namespace spslam {
 namespace orb {
 
@@ -48,7 +50,7 @@ struct Level {
 // Which two pixels a pixel of a smaller image lies between, and the weight of the second in 1/256.
 struct Between {
   std::vector<std::int32_t> first, second;
-  std::vector<std::uint16_t> weight;
+  std::vector<std::uint32_t> weight;
 
   Between(int from, int to) : first(to), second(to), weight(to) {
     const double scale = 1.0 / (static_cast<double>(to) / from);
@@ -58,7 +60,7 @@ struct Between {
       const bool inside = before >= 0 && before < from - 1;
       first[i] = std::clamp(before, 0, from - 1);
       second[i] = inside ? before + 1 : first[i];
-      weight[i] = inside ? static_cast<std::uint16_t>(rounded((place - before) * 256)) : 0;
+      weight[i] = inside ? static_cast<std::uint32_t>(rounded((place - before) * 256)) : 0;
     }
   }
 };
@@ -66,6 +68,9 @@ struct Between {
 // Linear interpolation, as OpenCV's INTER_LINEAR_EXACT.
 inline void resize(const Level& from, const Level& to) {
   const Between columns(from.columns, to.columns), rows(from.rows, to.rows);
+  const std::int32_t* const first = columns.first.data();
+  const std::uint32_t* const weight = columns.weight.data();
+  std::vector<std::uint32_t> pairs(from.columns);  // a pixel and the next one: vectors are gathered of words only
   std::vector<std::uint16_t> lines(2 * to.columns);
   int held[2] = {-1, -1};
   for (int y = 0; y < to.rows; ++y) {
@@ -75,16 +80,20 @@ inline void resize(const Level& from, const Level& to) {
       if (held[wanted[k] % 2] == wanted[k]) continue;
       held[wanted[k] % 2] = wanted[k];
       const std::uint8_t* const source = from.row(wanted[k]);
-      for (int x = 0; x < to.columns; ++x) {
-        line[x] = static_cast<std::uint16_t>((256 - columns.weight[x]) * source[columns.first[x]] +
-                                             columns.weight[x] * source[columns.second[x]]);
+      std::uint32_t* const pair = pairs.data();
+      SPS_SIMD for (int x = 0; x < from.columns; ++x) {
+        pair[x] = source[x] | static_cast<std::uint32_t>(source[x + 1]) << 16;
+      }
+      SPS_SIMD for (int x = 0; x < to.columns; ++x) {
+        const std::uint32_t both = pair[first[x]];
+        line[x] = static_cast<std::uint16_t>((256 - weight[x]) * (both & 0xFFFF) + weight[x] * (both >> 16));
       }
     }
     const std::uint16_t* const upper = lines.data() + (wanted[0] % 2) * to.columns;
     const std::uint16_t* const lower = lines.data() + (wanted[1] % 2) * to.columns;
     const std::uint32_t below = rows.weight[y], above = 256 - below;
     std::uint8_t* const out = to.row(y);
-    for (int x = 0; x < to.columns; ++x) {
+    SPS_SIMD for (int x = 0; x < to.columns; ++x) {
       out[x] = static_cast<std::uint8_t>((above * upper[x] + below * lower[x] + (1u << 15)) >> 16);
     }
   }

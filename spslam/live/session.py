@@ -14,6 +14,7 @@ import torch
 
 from spslam.config import dump_config
 from spslam.errors import OutputError, SourceError, SpslamError
+from spslam.image_library import images_shared
 from spslam.io import atomic_write
 from spslam.live.capture import Capture
 from spslam.live.frame_queue import FrameQueue
@@ -36,7 +37,7 @@ from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 
-SAMPLING_THREADS = 4  # that share a frame beside a GPU
+FRAME_THREADS = 4  # that share a frame beside a GPU: its sampling, and the extraction of image features
 
 
 def run_live(
@@ -81,7 +82,8 @@ def _run_on_device(
     device = resolve_device(request.config.device)
     with (
         library_threads_limited(),
-        kernel_threads_limited(device, SAMPLING_THREADS),
+        kernel_threads_limited(device, FRAME_THREADS),
+        images_shared(FRAME_THREADS if device.type == "cuda" else 1),
         interpreter_shared(),
         explained_failures(device),
     ):

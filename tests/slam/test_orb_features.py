@@ -1,9 +1,12 @@
 """Compiled image features against OpenCV's ORB, and on images that have none."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
 
+from spslam.image_library import images_shared
 from spslam.slam.image_features import (
     CELL_COLUMNS,
     COUNT,
@@ -57,6 +60,17 @@ def test_features_are_those_of_opencv(size):
         differing = np.unpackbits(descriptors ^ codes).mean() if len(codes) else 0.0
         assert differing < (1e-4 if cv2.__version__ >= "5" else 4e-3)
     assert size[0] < 100 or len(positions) > 100
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_any_number_of_threads_finds_the_same_also_for_several_callers(threads):
+    images = [textured(size, seed) for size in ((320, 240), (64, 48), (20, 20)) for seed in range(2)]
+    wanted = [detect(image) for image in images]
+    with images_shared(threads), ThreadPoolExecutor(3) as callers:
+        for found in callers.map(lambda _: [detect(image) for image in images], range(6)):
+            for (positions, descriptors), (expected, codes) in zip(found, wanted, strict=True):
+                np.testing.assert_array_equal(positions, expected)
+                np.testing.assert_array_equal(descriptors, codes)
 
 
 def test_features_of_a_room_are_those_of_opencv():

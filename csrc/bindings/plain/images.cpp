@@ -2,6 +2,7 @@
 #include <new>
 
 #include "bindings/plain/export.h"
+#include "core/parallel.h"
 #include "spslam/color_registration.h"
 #include "spslam/png_filters.h"
 
@@ -15,6 +16,11 @@ SPS_EXPORT int spslam_runs_here() {
 #else
   return 1;
 #endif
+}
+
+// Threads that share one image, the calling one included; these functions have a pool of their own.
+SPS_EXPORT void spslam_set_threads(int count) {
+  spslam::set_num_threads(count);
 }
 
 // colors and registered_colors: null where only depth is wanted. sizes: of the color image, the depth image and the

@@ -1,5 +1,5 @@
 // Image features: corners of an image at several scales with binary descriptors (ORB), of which any prefix covers the
-// image. On the host alone, by the thread that calls: several threads extract features of several images.
+// image. On the host alone; the kernels' threads share an image (`set_num_threads`), unless another has them.
 //
 // Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, with the numbers of OpenCV's `cv::ORB`
 // (eight levels, each 1.2 times smaller; FAST of nine pixels, of which the best by Harris's measure are taken).
@@ -22,7 +22,7 @@ struct OrbOptions {
 };
 
 // Features of `intensity` [height, width]; writes `positions` [count, 2] (column and row in px) and `descriptors`
-// [count, 32], and returns how many there are. Throws std::bad_alloc.
+// [count, 32], and returns how many there are: the same for any number of threads. Throws std::bad_alloc.
 std::int64_t orb_features(Cpu device, const std::uint8_t* intensity, std::int32_t height, std::int32_t width,
                           const OrbOptions& options, float* positions, std::uint8_t* descriptors);
 
