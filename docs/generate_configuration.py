@@ -142,11 +142,11 @@ def _allowed(field: Any) -> str:
     limits = {type(limit).__name__: limit for limit in field.metadata}
     parts = [_type(field.annotation)]
     if "Ge" in limits:
-        parts.append(f"from {limits['Ge'].ge:g}")
+        parts.append(f"from {limits['Ge'].ge:.10g}")
     if "Gt" in limits:
-        parts.append(f"above {limits['Gt'].gt:g}")
+        parts.append(f"above {limits['Gt'].gt:.10g}")
     if "Le" in limits:
-        parts.append(f"to {limits['Le'].le:g}")
+        parts.append(f"to {limits['Le'].le:.10g}")
     return " ".join(parts)
 
 

@@ -132,6 +132,7 @@ def test_every_option_has_a_description():
         ("prior.enabled=3", "prior.enabled must be true or false, got 3"),
         ("dataset.sequence=[1]", "dataset.sequence must be text, got [1]"),
         ("device=gpu", "device must be auto, cpu, cuda or cuda:N, got 'gpu'"),
+        ("mapping.pixels=2000000", "mapping.pixels must be at most 1048576, got 2000000"),
         ("preset=best", "preset must be one of paper, balanced, fast, got 'best'"),
         ("sampling.near=2", "sampling.far must be above sampling.near, got 1.02"),
         ("tracking.kernel_end_m=1", "tracking.kernel_end_m must be at most tracking.kernel_start_m, got 1.0"),

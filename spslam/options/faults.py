@@ -106,9 +106,9 @@ def _option_path(path: str) -> str:
 
 def _rule(kind: str, context: Mapping[str, Any]) -> str:
     rules = {
-        "greater_than_equal": "be at least {ge:g}",
-        "greater_than": "be above {gt:g}",
-        "less_than_equal": "be at most {le:g}",
+        "greater_than_equal": "be at least {ge:.10g}",
+        "greater_than": "be above {gt:.10g}",
+        "less_than_equal": "be at most {le:.10g}",
         "less_than": "be below {lt}",
         "finite_number": "be finite",
         "literal_error": "be {expected}",
