@@ -43,7 +43,7 @@ def image_library() -> ctypes.CDLL:
 
 @contextlib.contextmanager
 def images_shared(threads: int) -> Iterator[None]:
-    """Has threads share an image, where frames come one at a time; else each is its thread's own."""
+    """Has so many threads share an image, where frames come one at a time; else each is its thread's own."""
     image_library().spslam_set_threads(threads)
     try:
         yield

@@ -259,7 +259,7 @@ std::int64_t orb_features(Cpu, const std::uint8_t* intensity, std::int32_t heigh
   spread(features);
   if (features.size() > static_cast<std::size_t>(options.count)) features.resize(options.count);
   levels.blur();
-  Levels& own = levels;  // of this thread, for others too
+  const Levels& own = levels;  // in the lambda `levels` would be those of the thread that runs it
   parallel_for(static_cast<std::int64_t>(features.size()), kDescribed, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const Feature& one = features[i];

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from spslam import ops
 from spslam.config import dump_config
 from spslam.errors import OutputError, SourceError, SpslamError
 from spslam.image_library import images_shared
@@ -83,7 +84,7 @@ def _run_on_device(
     with (
         library_threads_limited(),
         kernel_threads_limited(device, FRAME_THREADS),
-        images_shared(FRAME_THREADS if device.type == "cuda" else 1),
+        images_shared(ops.get_num_threads() if device.type == "cuda" else 1),
         interpreter_shared(),
         explained_failures(device),
     ):

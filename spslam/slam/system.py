@@ -46,8 +46,8 @@ class SlamSystem(FramePipeline):
 
         Args:
             frame: color, depth, timestamp; `RgbdFrame.from_arrays` makes one.
-            on_pose: called once with the frame's pose as soon as it is known: where the frame is mapped too, the
-                optimization of the map comes after.
+            on_pose: called once with the frame's pose as soon as it is known: `trajectory()` has the frame, and the map
+                is optimized, only after it. Where it raises, the frame is left out (but the first).
             defer_mapping: leave the optimization to `optimize_map`, to be called while no frame waits; what is left of
                 it is taken up by the next mapped frame. `finish`, `save` complete it.
 

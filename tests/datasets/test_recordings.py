@@ -322,7 +322,7 @@ def test_poses_of_no_frame_are_a_doubt(tmp_path, name, spoil, words):
     dataset = open_dataset(load_config(config, overrides=[("dataset.path", str(recording))]).dataset)
     assert dataset.poses() is None
     (doubt,) = dataset.doubts
-    assert re.search(f"no frame has a (known|ground-truth) pose.*{words}|{words}", str(doubt)), str(doubt)
+    assert re.search(words, str(doubt)), str(doubt)
 
 
 def test_broken_archives_are_one_line(tmp_path):

@@ -80,6 +80,18 @@ def test_the_pose_is_known_before_the_map_is_optimized(dataset, monkeypatch):
     assert order == ["pose", "map", "pose", "pose", "pose", "pose", "pose", "map"]
 
 
+def test_the_pose_is_told_before_the_frame_is_stored_so_a_callback_that_fails_changes_nothing(dataset):
+    system, fresh, lengths = new_system(dataset), new_system(dataset), []
+    for index in range(6):
+        if index > 0:
+            with pytest.raises(ZeroDivisionError):
+                system.process(dataset[index], lambda pose: lengths.append(len(system.trajectory())) or 1 / 0)
+        system.process(dataset[index])
+        fresh.process(dataset[index])
+    assert lengths == [1, 2, 3, 4, 5]
+    assert bytes_of(system) == bytes_of(fresh)
+
+
 @pytest.mark.parametrize("preset", ["balanced", "paper"])
 def test_mapping_in_parts_gives_the_same_bytes(dataset, preset):
     whole, parts = new_system(dataset, preset=preset), new_system(dataset, preset=preset)
