@@ -25,7 +25,6 @@ std::tuple<Tensor, Tensor> unproject_pixels(Tensor records, Tensor normals, Tens
   return {points, world_normals};
 }
 
-#ifndef SPS_CUDA
 // Places in the lists of numbers of sample_frame_pixels; spslam/ops/pixel_sampling.py fills them.
 enum class Scalar { kFx, kFy, kCx, kCy, kMinDepth, kMaxDepth, kMaxJump, kDepthImageUnit, kCount };
 enum class Integer { kNumPixels, kStepPx, kThumbnailStep, kDepthImageStep, kShared, kSeed, kStream, kFrame, kCount };
@@ -56,9 +55,8 @@ std::int64_t words_of(std::int64_t count, std::int64_t per_word) {
   return (count + per_word - 1) / per_word;
 }
 
-// For the CPU alone, where frames arrive. One buffer for all: records [count, 3], normals [count, 3] as
-// their bits, the depth thumbnail's halves in pairs, the depth image's 16-bit numbers in pairs, the intensity image's
-// bytes by fours.
+// One buffer for all: records [count, 3], normals [count, 3] as their bits, the depth thumbnail's halves in pairs, the
+// depth image's 16-bit numbers in pairs, the intensity image's bytes by fours.
 std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color, std::vector<double> scalar_list,
                                                      std::vector<std::int64_t> integer_list) {
   const Scalars<Scalar> scalars("sample_frame_pixels", "scalars", scalar_list);
@@ -80,19 +78,24 @@ std::tuple<Tensor, std::int64_t> sample_frame_pixels(Tensor depth, Tensor color,
                                    depth_image_size(width, sampling.depth_image_step);
   const std::int64_t thumbnail_at = 6 * sampling.count, depth_image_at = thumbnail_at + words_of(thumbnail, 2);
   const std::int64_t intensity_at = depth_image_at + words_of(depth_image, 2);
-  const Tensor buffer = empty(depth, {intensity_at + words_of(depth_image, 4)}, ScalarType::Int);
+  Tensor buffer = empty(depth, {intensity_at + words_of(depth_image, 4)}, ScalarType::Int);
+  DeviceScope scope(depth);
+  const auto blank_before = [&](std::int64_t end) {
+    torch::stable::fill_(torch::stable::narrow(buffer, 0, end - 1, 1), 0);
+  };
+  if (thumbnail % 2 != 0) blank_before(depth_image_at);
+  if (depth_image % 2 != 0) blank_before(intensity_at);
+  if (depth_image % 4 != 0) blank_before(buffer.numel());
+  const Tensor workspace =
+      empty(depth, {sample_pixels_workspace_bytes(scope.context, width, height)}, ScalarType::Byte);
   std::int32_t* words = mutable_data<std::int32_t>(buffer);
-  if (thumbnail % 2 != 0) words[depth_image_at - 1] = 0;
-  if (depth_image % 2 != 0) words[intensity_at - 1] = 0;
-  if (depth_image % 4 != 0) words[buffer.numel() - 1] = 0;
   const SampledPixels out{words, reinterpret_cast<float*>(words + 3 * sampling.count),
                           reinterpret_cast<std::uint16_t*>(words + thumbnail_at),
                           reinterpret_cast<std::uint16_t*>(words + depth_image_at),
                           reinterpret_cast<std::uint8_t*>(words + intensity_at)};
-  return {buffer, sample_pixels(image, load_key(integers, 0), sampling, out)};
+  return {buffer, sample_pixels(scope.context, image, load_key(integers, 0), sampling,
+                                mutable_data<std::uint8_t>(workspace), out)};
 }
-
-#endif
 
 }  // namespace
 
@@ -105,14 +108,11 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "sample_frame_pixels(Tensor depth, Tensor color, float[] scalars, int[] integers) -> (Tensor buffer, int "
       "num_valid)");
 }
-
-STABLE_TORCH_LIBRARY_IMPL(spslam, CPU, m) {
-  m.impl("sample_frame_pixels", TORCH_BOX(&sample_frame_pixels));
-}
 #endif
 
 SPS_LIBRARY_IMPL(m) {
   m.impl("unproject_pixels", TORCH_BOX(&unproject_pixels));
+  m.impl("sample_frame_pixels", TORCH_BOX(&sample_frame_pixels));
 }
 
 }  // namespace spslam::bindings

@@ -2,9 +2,9 @@
 
 #include <algorithm>
 
-#include "core/half.h"
 #include "core/parallel.h"
 #include "cpu/depth_normals.h"
+#include "kernels/pixel_sampling.h"
 #include "launch/pixel_sampling.h"
 
 namespace spslam {
@@ -30,10 +30,7 @@ std::int64_t list_valid(const RgbdImage& image, const PixelSampling& sampling, P
   for (std::int32_t v = begin; v < end; ++v) {
     const float* from = image.depth + static_cast<std::int64_t>(v) * image.width;
     float* to = depth.row(v);
-    SPS_SIMD for (std::int32_t u = 0; u < image.width; ++u) {
-      const float z = valid_depth(from[u]);
-      to[u] = (z >= low) & (z <= high) ? z : 0.0f;
-    }
+    SPS_SIMD for (std::int32_t u = 0; u < image.width; ++u) to[u] = usable_depth(from[u], low, high);
     const std::int32_t first = v * image.width;
     for (std::int32_t u = 0; u < image.width; ++u) {
       valid[count] = first + u;
@@ -60,10 +57,7 @@ void write_images(const RgbdImage& image, const PixelSampling& sampling, PaddedD
   for (std::int32_t r = (begin + step - 1) / step; r * step < end; ++r) {
     const float* depths = depth.row(r * step);
     std::uint16_t* depth_image = out.depth_image + static_cast<std::int64_t>(r) * columns;
-    SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) {
-      const float units = depths[c * step] * per_unit + 0.5f;
-      depth_image[c] = static_cast<std::uint16_t>(units < 65536.0f ? static_cast<std::int32_t>(units) : 0);
-    }
+    SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) depth_image[c] = depth_image_number(depths[c * step], per_unit);
     const std::uint8_t* colors = image.color + 3 * static_cast<std::int64_t>(r * step) * image.width;
     std::uint8_t* intensity_image = out.intensity_image + static_cast<std::int64_t>(r) * columns;
     SPS_SIMD for (std::int32_t c = 0; c < columns; ++c) intensity_image[c] = rounded_luma(colors + 3 * c * step);
@@ -85,24 +79,24 @@ void draw_batch(const RgbdImage& image, PaddedDepth& depth, const std::int32_t* 
     u[i] = place - v[i] * image.width;
     __builtin_prefetch(image.color + 3 * static_cast<std::int64_t>(place));
   }
-  const DepthImage whole{image.depth,
-                         image.width,
-                         image.height,
-                         {static_cast<float>(image.fx), static_cast<float>(image.fy), static_cast<float>(image.cx),
-                          static_cast<float>(image.cy)}};
+  const DepthImage whole{image.depth, image.width, image.height, camera_of(image)};
   float* normals = out.normals + 3 * first;
   normals_of_batch(whole, depth, u, v, n, sampling.step_px, sampling.max_jump, normals);
   for (int i = 0; i < n; ++i) {
-    const std::uint8_t* color = image.color + 3 * (static_cast<std::int64_t>(v[i]) * image.width + u[i]);
-    pack_pixel(u[i], v[i], depth.row(v[i])[u[i]], color, normals + 3 * i, image.fx, image.fy, image.cx, image.cy,
-               out.records + kPixelWords * (first + i));
+    write_record(image, u[i], v[i], depth.row(v[i])[u[i]], normals + 3 * i, out.records + kPixelWords * (first + i));
   }
 }
 
 }  // namespace
 
-std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling,
-                           const SampledPixels& out) {
+template <>
+std::int64_t sample_pixels_workspace_bytes<Cpu>(Cpu, std::int32_t, std::int32_t) {
+  return 0;
+}
+
+template <>
+std::int64_t sample_pixels<Cpu>(Cpu, const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling, void*,
+                                const SampledPixels& out) {
   PaddedDepth depth(image.width, image.height);
   depth.allocate(scratch.depth);
   // Each chunk lists its own pixels, with room for one more; together they make the list, that of a single one at once.

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +24,8 @@ from spslam.run.observer import RunObserver
 from spslam.run.output_folder import OutputFolder, RunLog
 from spslam.slam.device_events import event_recorder
 from spslam.slam.frame_report import FrameReport
-from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.system import SlamSystem
-from spslam.slam.upload import Uploader
 
 _POLL_S = 0.1  # between two looks for Ctrl-C while no frame comes
 # Of a frame's share of a mapping call, what is made while the next frame waits already: a frame that is dropped costs
@@ -118,7 +116,6 @@ class LiveLoop:
         self._queue: FrameQueue = capture.queue
         self._progress = progress
         self._frozen_depth = ArrivingFrozenDepth()
-        self._uploader = Uploader(system.device) if system.device.type == "cuda" else None
         self._record = event_recorder(system.device)
         mapping = system.config.mapping
         self._least = math.ceil(LEAST_SHARE * mapping.iterations / mapping.every)
@@ -195,8 +192,6 @@ class LiveLoop:
         prepared = system.prepare(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         self.clock.decode_s += prepared.decode_ms / 1e3
-        if self._uploader:
-            prepared.pixels = self._uploader.send(cast(FramePixels, prepared.pixels))
         prepared.wait_ms, prepared.requested = wait_ms, requested
         return prepared
 

@@ -25,7 +25,8 @@ class PixelSampling:
         depth_image_step: distance of the pixels of the small depth and intensity images, px; the first lies at 0. With
             0 there are none.
         depth_image_unit: m, of the small image's depth.
-        shared: whether the kernels' threads (`set_num_threads`) share the frame; else the calling thread does it alone.
+        shared: whether the kernels' threads (`set_num_threads`) share a frame on the CPU; else the calling thread does
+            it alone.
     """
 
     count: int
@@ -73,7 +74,7 @@ def sample_frame_pixels(
     direction with camera z = 1; 0 = unknown). Runs without Python's lock.
 
     Args:
-        depth: float32 [H, W] on the CPU, meters; not finite, 0 and outside the range is invalid.
+        depth: float32 [H, W], meters; not finite, 0 and outside the range is invalid.
         color: uint8 [H, W, 3].
         fx, fy, cx, cy: pinhole camera, px.
         sampling: how many, and what is valid.
@@ -85,7 +86,8 @@ def sample_frame_pixels(
         `thumbnail_step`-th pixel, two per word; the small depth image, uint16 [h', w'] in `depth_image_unit`, rounded
         (0 where invalid or beyond 65535), at every `depth_image_step`-th pixel, two per word; and of the same pixels
         the intensity image, uint8 [h', w'] (`LUMA_WEIGHTS`, 1/255), four per word. And the number of valid pixels.
-        Where that is 0, records and normals are 0. The same bits on every run, for any number of threads.
+        Where that is 0, records and normals are 0. The same bits on every run, for any number of threads; devices
+        differ by rounding in normals, and by that in c. On CUDA this waits for the device.
 
     Raises:
         ValueError: wrong shapes or devices, or a number out of range.
@@ -101,7 +103,6 @@ def sample_frame_pixels(
     name = "sample_frame_pixels"
     check_tensor(name, "depth", depth, ["H", "W"], torch.float32)
     height, width = depth.shape
-    check(depth.device.type == "cpu", name, "depth", "be on cpu", depth.device)
     check(
         max(height, width) <= _MAX_SIDE and height * width < 2**31,
         name,

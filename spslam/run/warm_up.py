@@ -10,10 +10,7 @@ from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.slam.device_events import event_recorder
 from spslam.slam.frame_report import FrameReport
-from spslam.slam.pixels import sample_frame
-from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.system import SlamSystem
-from spslam.slam.upload import Uploader
 
 FRAMES = 4
 DEPTH_M = 2.0
@@ -38,16 +35,12 @@ def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameR
         The reports of the frames before. Loaded kernels and reserved memory are all that remains; results don't change.
     """
     shortened = _shortened(config)
-    uploader = Uploader(device) if device.type == "cuda" else None
-    reports = []
-    frames = [_wall_frame(camera, config, index) for index in range(FRAMES + (2 if uploader else 0))]
-    if uploader:
+    loads = device.type == "cuda"
+    frames = [_wall_frame(camera, config, index) for index in range(FRAMES + (2 if loads else 0))]
+    if loads:
         frames[-2] = _other_frame(frames[-2])
     with contextlib.closing(SlamSystem(shortened, camera, device=device)) as system:
-        for frame in frames:
-            pixels = sample_frame(frame, camera, shortened)
-            sent = uploader.send(pixels) if uploader else pixels
-            reports.append(system.submit(PreparedFrame(frame.index, frame.timestamp, sent)).result())
+        reports = [system.submit(system.prepare(frame)).result() for frame in frames]
         system.finish()
     event_recorder(device)().wait()
     return reports[:FRAMES]

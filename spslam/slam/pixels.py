@@ -115,10 +115,19 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config, shared: bool 
         config: sections `dataset` (depth range), `pixels` and `prior` (normals).
         shared: whether the kernels' threads share the work, as where nothing else has any for them.
     """
+    depth = torch.from_numpy(np.ascontiguousarray(frame.depth, np.float32))
+    color = torch.from_numpy(np.ascontiguousarray(frame.color))
+    return sample_images(depth, color, frame.index, camera, config, shared)
+
+
+def sample_images(
+    depth: torch.Tensor, color: torch.Tensor, index: int, camera: Camera, config: Config, shared: bool = False
+) -> FramePixels:
+    """`sample_frame` of images on any device, float32 and uint8; on CUDA it waits for its stream."""
     sampling = replace(_sampling(camera, config), shared=shared)
     buffer, num_valid = ops.sample_frame_pixels(
-        torch.from_numpy(np.ascontiguousarray(frame.depth, np.float32)),
-        torch.from_numpy(np.ascontiguousarray(frame.color)),
+        depth,
+        color,
         camera.fx,
         camera.fy,
         camera.cx,
@@ -126,11 +135,10 @@ def sample_frame(frame: RgbdFrame, camera: Camera, config: Config, shared: bool 
         sampling,
         config.seed,
         ops.RandomStream.PIXEL_DATABASE,
-        frame.index,
+        index,
     )
-    size = frame.depth.shape
-    shapes = sampling.thumbnail_shape(*size), sampling.depth_image_shape(*size)
-    return FramePixels(buffer, sampling.count, *shapes, num_valid / frame.depth.size)
+    shapes = sampling.thumbnail_shape(*depth.shape), sampling.depth_image_shape(*depth.shape)
+    return FramePixels(buffer, sampling.count, *shapes, num_valid / depth.numel())
 
 
 def blank_pixels(camera: Camera, config: Config) -> FramePixels:

@@ -4,10 +4,14 @@ import contextlib
 import threading
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
-from spslam.slam.device_events import StreamEvent, current_stream
-from spslam.slam.pixels import FramePixels
+from spslam.camera import Camera
+from spslam.config import Config
+from spslam.datasets.base import RgbdFrame
+from spslam.slam.device_events import StreamEvent, current_stream, fetch
+from spslam.slam.pixels import FramePixels, image_pixels, sample_images
 
 
 @dataclass(frozen=True)
@@ -16,12 +20,12 @@ class Upload:
 
     Attributes:
         pixels: on the device; not to be read before `received`.
-        source: the same in page-locked memory, not to be changed until `end` is complete.
+        source: page-locked memory that is copied, not to be changed until `end` is complete; None where it is by then.
         begin, end: of the copy.
     """
 
     pixels: FramePixels
-    source: FramePixels
+    source: torch.Tensor | None
     begin: StreamEvent
     end: StreamEvent
 
@@ -43,13 +47,12 @@ class Uploader:
 
     def send(self, pixels: FramePixels) -> Upload:
         """Starts the copy and returns."""
-        buffer = pixels.buffer
-        source = pixels if buffer.is_pinned() else pixels.holding(buffer.pin_memory())
+        source = pixels.buffer if pixels.buffer.is_pinned() else pixels.buffer.pin_memory()
         stream = self._stream()
         with torch.cuda.stream(stream):
-            buffer = torch.empty(len(source.buffer), dtype=torch.int32, device=self.device)
+            buffer = torch.empty(len(source), dtype=torch.int32, device=self.device)
             begin = StreamEvent(stream)
-            buffer.copy_(source.buffer, non_blocking=True)
+            buffer.copy_(source, non_blocking=True)
             return Upload(pixels.holding(buffer), source, begin, StreamEvent(stream))
 
     def _stream(self) -> torch.cuda.Stream:
@@ -74,3 +77,39 @@ class Uploader:
     def unlock_pages(memory: torch.Tensor) -> None:
         """Undoes `lock_pages` where that was done; all copies must have ended."""
         torch.cuda.cudart().cudaHostUnregister(memory.data_ptr())
+
+
+class ImageUploader:
+    """Copies the images of single frames to a CUDA device, which samples them: that takes it less than the copy.
+
+    Args:
+        device: the device.
+        camera: of all frames.
+        config: how they are sampled.
+    """
+
+    def __init__(self, device: torch.device, camera: Camera, config: Config):
+        self.device, self._camera, self._config = device, camera, config
+        self._stream = torch.cuda.Stream(device)
+        size = camera.height, camera.width
+        self._depth = torch.empty(size, dtype=torch.float32, pin_memory=True)
+        self._color = torch.empty((*size, 3), dtype=torch.uint8, pin_memory=True)
+
+    def sample(self, frame: RgbdFrame) -> Upload:
+        """Copies a frame's images and samples them; waits until that is done, but not for the device's other work."""
+        with torch.cuda.stream(self._stream):
+            begin = StreamEvent(self._stream)
+            depth, color = self._sent(frame.depth, self._depth), self._sent(frame.color, self._color)
+            pixels = sample_images(depth, color, frame.index, self._camera, self._config)
+            return Upload(pixels, None, begin, StreamEvent(self._stream))
+
+    def _sent(self, image: np.ndarray, locked: torch.Tensor) -> torch.Tensor:
+        """An image on its way to the device, through page-locked memory."""
+        np.copyto(locked.numpy(), image)
+        return locked.to(self.device, non_blocking=True)
+
+    def fetch_images(self, pixels: FramePixels) -> tuple[FramePixels, StreamEvent]:
+        """The small images of a frame that was sampled, on their way to the host, and when they are there."""
+        with torch.cuda.stream(self._stream):
+            images = image_pixels(fetch(pixels.depth_image), fetch(pixels.intensity_image))
+            return images, StreamEvent(self._stream)

@@ -124,7 +124,8 @@ def _frame_pixels(generator, device, n):
         n, min_depth=0.1, max_depth=9.0, step_px=2, max_jump=0.1, thumbnail_step=16, depth_image_step=2
     )
     key = dict(seed=7, stream=ops.RandomStream.PIXEL_DATABASE, frame=3)
-    return dict(depth=1 + 0.1 * uniform(generator, 48, 64), color=color, **CAMERA, sampling=sampling, **key)
+    images = dict(depth=1 + 0.1 * uniform(generator, 48, 64), color=color)
+    return on_device(device, images) | CAMERA | dict(sampling=sampling, **key)
 
 
 def _samples(generator, n):

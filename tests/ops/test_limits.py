@@ -45,7 +45,7 @@ MORE_AXES = {
     ("interpolate_volumes", "points"),
     ("mlp", "input"),
 }
-CPU_ONLY = {"sample_frame_pixels", "encode_frame_"}
+CPU_ONLY = {"encode_frame_"}
 # Integers that name rows or places. None may lead outside of a table, whatever its value.
 EXTREME_INTEGERS = (-(2**31), -1, 2**31 - 1)
 # Made by the voxel_hash functions alone; to look through them for sense would cost more than to use them.

@@ -25,7 +25,7 @@ struct PixelSampling {
   std::int32_t thumbnail_step;    // px; the first pixel of the depth thumbnail lies at half of it
   std::int32_t depth_image_step;  // px; the first pixel of the small images lies at 0; 0: no small images
   float depth_image_unit;         // m, of its depth
-  bool shared;                    // whether several threads share the frame
+  bool shared;                    // whether several threads of the CPU share the frame
 };
 
 // Where the results go.
@@ -45,11 +45,16 @@ constexpr std::int32_t depth_image_size(std::int32_t size, std::int32_t step) {
   return step > 0 ? (size + step - 1) / step : 0;
 }
 
+// Bytes of scratch memory that sample_pixels needs.
+template <class Device>
+std::int64_t sample_pixels_workspace_bytes(Device device, std::int32_t width, std::int32_t height);
+
 // Draws pixels among those of valid depth, with replacement: the i-th takes element i of the key's draws. Returns how
-// many pixels were valid; where none was, records and normals are 0. On the CPU only, where frames arrive, and on the
-// calling thread alone.
-std::int64_t sample_pixels(const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling,
-                           const SampledPixels& out);
+// many pixels were valid, for which it waits; where none was, records and normals are 0. Devices differ by rounding in
+// normals, and so in a record's foreshortening. On the CPU a frame's own thread does it, unless it is shared.
+template <class Device>
+std::int64_t sample_pixels(Device device, const RgbdImage& image, PhiloxKey key, const PixelSampling& sampling,
+                           void* workspace, const SampledPixels& out);
 
 // Surface points [n, 3] (m) and normals [n, 3] in the world of pixels' records [n, 3] and normals [n, 3] in the camera
 // at `pose`: seven numbers, unit quaternion (w, x, y, z) and translation of T_world_camera, on the device.
