@@ -10,18 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from spslam.config import Config, load_config, read_shipped
+from spslam.datasets.prefetch import usable_cores
 from spslam.errors import ConfigError
 from spslam.evaluation.html_parts import section, security_policy, table, web_file
 from spslam.evaluation.report_charts import error_section, time_section, tracking_section, trajectory_section
 from spslam.evaluation.report_map import outward_mesh, overview_figure, views_section
 from spslam.evaluation.report_view import LIBRARY, packed_mesh, view_3d
-from spslam.evaluation.run_output import Mesh, RunOutput
+from spslam.evaluation.run_output import RunOutput
 from spslam.evaluation.verdict import judge_run, number
 from spslam.io import atomic_write
 
 MAX_BYTES = 8_000_000
 # For style, scripts and what is around the sections.
 _RESERVED_BYTES = 100_000
+# The mesh, and the pictures of it, of which each needs some 200 MB.
+_THREADS = 5
 _SCRIPTS = ("charts.js", "unpack.js", "scene.js", "view3d.js")
 _STYLE = "report.css"
 # The metrics at the top: label, key in metrics.json, format.
@@ -62,9 +65,12 @@ def write_report(output_dir: str | os.PathLike) -> Path:
     config = _options(run)
     mesh = outward_mesh(run)
     above = [_header(run), _verdict(run, config), _tiles(run.metrics), _warnings(run.metrics)]
-    below = [views_section(run, mesh), error_section(run), time_section(run), tracking_section(run)]
-    below += [_paper_table(run.metrics), _command(run, config), _figures(run.metrics), _settings(run)]
-    still, packed = ("", None) if mesh is None else _pictured(run, mesh)
+    with ThreadPoolExecutor(min(usable_cores(), _THREADS)) as threads:  # they work without Python's lock
+        packing = None if mesh is None else threads.submit(packed_mesh, mesh)  # takes longest
+        picturing = None if mesh is None else threads.submit(overview_figure, run, mesh)
+        below = [views_section(run, mesh, threads), error_section(run), time_section(run), tracking_section(run)]
+        below += [_paper_table(run.metrics), _command(run, config), _figures(run.metrics), _settings(run)]
+        still, packed = picturing.result() if picturing else "", packing.result() if packing else None
     used = _size([*above, *below, trajectory_section(run, "")]) + _RESERVED_BYTES
     view = view_3d(run, mesh, packed, still, MAX_BYTES - used) if len(run.trajectory) else ""
     of_map = "" if mesh is None else section("Map", view)
@@ -72,13 +78,6 @@ def write_report(output_dir: str | os.PathLike) -> Path:
     path = run.folder.report
     atomic_write(path, _encoded(_page(run, [*above, of_map, below[0], trajectory, *below[1:]])))
     return path
-
-
-def _pictured(run: RunOutput, mesh: Mesh) -> tuple[str, dict[str, Any] | None]:
-    """The mesh from above, and as the 3-D view shows it."""
-    with ThreadPoolExecutor(1) as beside:  # NumPy and zlib work without Python's lock
-        packed = beside.submit(packed_mesh, mesh)
-        return overview_figure(run, mesh), packed.result()
 
 
 def _size(parts: list[str]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 
 import numpy as np
 
@@ -13,8 +13,6 @@ from spslam.evaluation.run_output import Mesh, Preview, RunOutput
 from spslam.meshing.render import render_mesh
 
 VIEWS = 3
-# Of rendering; each needs some 200 MB.
-_THREADS = 2
 
 
 def outward_mesh(run: RunOutput) -> Mesh | None:
@@ -38,13 +36,12 @@ def overview_figure(run: RunOutput, mesh: Mesh) -> str:
     return figure(image, 1200, caption, "map")
 
 
-def views_section(run: RunOutput, mesh: Mesh | None) -> str:
-    """Input images beside the mesh as seen from there; empty without a mesh or a preview."""
+def views_section(run: RunOutput, mesh: Mesh | None, threads: Executor) -> str:
+    """Input images beside the mesh as seen from there, made by these threads; empty without a mesh or a preview."""
     if mesh is None or run.camera is None:
         return ""
     camera = run.camera
-    with ThreadPoolExecutor(_THREADS) as threads:  # NumPy works without Python's lock
-        rows = list(threads.map(lambda preview: _view(run, mesh, camera, preview), _spread(run.previews(), VIEWS)))
+    rows = list(threads.map(lambda preview: _view(run, mesh, camera, preview), _spread(run.previews(), VIEWS)))
     return section("Views", "".join(rows), "Input images, and the mesh rendered from the estimated poses")
 
 

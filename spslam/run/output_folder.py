@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
+from spslam.datasets.prefetch import usable_cores
 from spslam.errors import DatasetError, OutputError
 from spslam.io import atomic_write, writing
 from spslam.run.chunk_options import ChunkPlan
@@ -24,6 +26,7 @@ from spslam.trajectory import Trajectory
 
 # Error codes of flock on file systems without locks.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF)
+_PREVIEW_THREADS = 4  # that encode images, one frame each
 
 
 class RunLog(contextlib.AbstractContextManager):
@@ -201,11 +204,15 @@ class OutputFolder(RunFolder):
         atomic_write(self.preview_camera, json.dumps(vars(camera)) + "\n")
         if ground_truth is not None:
             ground_truth.save_tum(self.preview_ground_truth)
-        for row, frame in frames:
-            millimeters = np.nan_to_num(np.rint(1000 * frame.depth), nan=0.0)
-            depth = np.clip(millimeters, 0, np.iinfo(np.uint16).max).astype(np.uint16)
-            _write_png(self.color_preview(row), cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
-            _write_png(self.depth_preview(row), depth)
+        with ThreadPoolExecutor(min(usable_cores(), _PREVIEW_THREADS)) as threads:
+            for written in [threads.submit(self._write_preview, row, frame) for row, frame in frames]:
+                written.result()
+
+    def _write_preview(self, row: int, frame: RgbdFrame) -> None:
+        millimeters = np.nan_to_num(np.rint(1000 * frame.depth), nan=0.0)
+        depth = np.clip(millimeters, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+        _write_png(self.color_preview(row), cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+        _write_png(self.depth_preview(row), depth)
 
     def write_report(self) -> None:
         """Writes the report from the other files."""
