@@ -36,26 +36,62 @@ PlaneFrame load_frame(const char* name, const Tensor& planes, const Tensor& pose
           load_intrinsics(name, intrinsics)};
 }
 
+// A table of blocks that is read; its tensors must outlive the launch.
+struct HashTable {
+  HashTable(const char* name, const Tensor& hash_keys, const Tensor& hash_values)
+      : keys(as_contiguous(hash_keys)), values(as_contiguous(hash_values)) {
+    const std::int64_t capacity = keys.numel();
+    SPS_CHECK(capacity >= 2 && (capacity & (capacity - 1)) == 0 && values.numel() == capacity, name,
+              ": hash_keys and hash_values must have a power of two of slots");
+  }
+
+  VoxelTable view() const { return {data<std::int64_t>(keys), data<std::int32_t>(values), keys.numel() - 1}; }
+
+  Tensor keys, values;
+};
+
 DepthNoise load_noise(const char* name, const std::vector<double>& noise) {
   SPS_CHECK(noise.size() == 2 && noise[0] >= 0.0 && noise[1] >= 0.0, name, ": noise must be two numbers of at least 0");
   return {static_cast<float>(noise[0]), static_cast<float>(noise[1])};
 }
 
-Tensor tsdf_touched_blocks(Tensor planes, Tensor pose, std::vector<double> intrinsics, double voxel_size,
-                           double truncation, std::vector<double> noise, std::int64_t step) {
-  constexpr char kName[] = "tsdf_touched_blocks";
-  check_count(kName, "step", step);
-  SPS_CHECK(voxel_size > 0.0 && truncation > 0.0, kName, ": voxel_size and truncation must be positive");
-  const TouchOptions options{static_cast<float>(voxel_size), static_cast<float>(truncation), load_noise(kName, noise),
+// The blocks that a frame's planes touch; `name` is the function that errors name.
+Tensor touched_blocks(const char* name, const DeviceScope& scope, const Tensor& planes, const Tensor& pose,
+                      const std::vector<double>& intrinsics, double voxel_size, double truncation,
+                      const std::vector<double>& noise, std::int64_t step) {
+  check_count(name, "step", step);
+  SPS_CHECK(voxel_size > 0.0 && truncation > 0.0, name, ": voxel_size and truncation must be positive");
+  const TouchOptions options{static_cast<float>(voxel_size), static_cast<float>(truncation), load_noise(name, noise),
                              static_cast<std::int32_t>(step)};
-  DeviceScope scope(planes);
-  planes = as_contiguous(planes);
-  pose = as_contiguous(pose);
-  const PlaneFrame frame = load_frame(kName, planes, pose, intrinsics);
+  const Tensor whole = as_contiguous(planes), place = as_contiguous(pose);
+  const PlaneFrame frame = load_frame(name, whole, place, intrinsics);
   Tensor coords = empty(planes, {touched_rows(frame, options.step), 3}, ScalarType::Int);
   const std::int64_t written =
       spslam::tsdf_touched_blocks(scope.context, frame, options, mutable_data<std::int32_t>(coords));
   return torch::stable::narrow(coords, 0, 0, written);
+}
+
+Tensor tsdf_touched_blocks(Tensor planes, Tensor pose, std::vector<double> intrinsics, double voxel_size,
+                           double truncation, std::vector<double> noise, std::int64_t step) {
+  const DeviceScope scope(planes);
+  return touched_blocks("tsdf_touched_blocks", scope, planes, pose, intrinsics, voxel_size, truncation, noise, step);
+}
+
+// Those of the touched blocks that a table lacks, with repetitions: one wait for the device instead of several.
+Tensor tsdf_missing_blocks(Tensor planes, Tensor pose, std::vector<double> intrinsics, double voxel_size,
+                           double truncation, std::vector<double> noise, std::int64_t step, Tensor hash_keys,
+                           Tensor hash_values) {
+  constexpr char kName[] = "tsdf_missing_blocks";
+  const DeviceScope scope(planes);
+  const Tensor touched = touched_blocks(kName, scope, planes, pose, intrinsics, voxel_size, truncation, noise, step);
+  const HashTable table(kName, hash_keys, hash_values);
+  const std::int64_t n = touched.size(0);
+  const Tensor workspace = empty(touched, {tsdf_missing_workspace_bytes(n)}, ScalarType::Byte);
+  Tensor missing = empty(touched, {n, 3}, ScalarType::Int);
+  const std::int64_t count =
+      spslam::tsdf_missing_blocks(scope.context, table.view(), data<std::int32_t>(touched), n,
+                                  mutable_data<std::uint8_t>(workspace), mutable_data<std::int32_t>(missing));
+  return torch::stable::narrow(missing, 0, 0, count);
 }
 
 void check_blocks(const char* name, const Tensor& sdf, const Tensor& weights, const Tensor& colors) {
@@ -99,19 +135,15 @@ void tsdf_integrate(Tensor block_coords, Tensor sdf, Tensor weights, Tensor colo
 struct ReadField {
   ReadField(const char* name, const Tensor& hash_keys, const Tensor& hash_values, const Tensor& sdf_rows,
             const Tensor& weight_rows, const Tensor& color_rows)
-      : keys(as_contiguous(hash_keys)),
-        values(as_contiguous(hash_values)),
+      : table(name, hash_keys, hash_values),
         sdf(as_contiguous(sdf_rows)),
         weights(as_contiguous(weight_rows)),
         colors(as_contiguous(color_rows)) {
     check_blocks(name, sdf, weights, colors);
-    const std::int64_t capacity = keys.numel();
-    SPS_CHECK(capacity >= 2 && (capacity & (capacity - 1)) == 0 && values.numel() == capacity, name,
-              ": hash_keys and hash_values must have a power of two of slots");
   }
 
   TsdfView view(double voxel_size, double min_weight) const {
-    return {{data<std::int64_t>(keys), data<std::int32_t>(values), keys.numel() - 1},
+    return {table.view(),
             data<float>(sdf),
             data<float>(weights),
             data<std::uint16_t>(colors),
@@ -119,7 +151,8 @@ struct ReadField {
             static_cast<float>(min_weight)};
   }
 
-  Tensor keys, values, sdf, weights, colors;
+  HashTable table;
+  Tensor sdf, weights, colors;
 };
 
 std::tuple<Tensor, Tensor, Tensor> tsdf_query(Tensor hash_keys, Tensor hash_values, Tensor sdf, Tensor weights,
@@ -169,6 +202,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "measure_planes(Tensor depth, float[] intrinsics, float noise_floor, float noise_growth, bool shared_noise) -> "
       "Tensor");
   m.def(
+      "tsdf_missing_blocks(Tensor planes, Tensor pose, float[] intrinsics, float voxel_size, float truncation, "
+      "float[] noise, int step, Tensor hash_keys, Tensor hash_values) -> Tensor");
+  m.def(
       "tsdf_touched_blocks(Tensor planes, Tensor pose, float[] intrinsics, float voxel_size, float truncation, "
       "float[] noise, int step) -> Tensor");
   m.def(
@@ -186,6 +222,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
 
 SPS_LIBRARY_IMPL(m) {
   m.impl("measure_planes", TORCH_BOX(&measure_planes));
+  m.impl("tsdf_missing_blocks", TORCH_BOX(&tsdf_missing_blocks));
   m.impl("tsdf_touched_blocks", TORCH_BOX(&tsdf_touched_blocks));
   m.impl("tsdf_integrate_", TORCH_BOX(&tsdf_integrate));
   m.impl("tsdf_query", TORCH_BOX(&tsdf_query));

@@ -2,9 +2,11 @@
 #include <cstring>
 #include <vector>
 
+#include "core/for_each.h"
 #include "core/parallel.h"
 #include "cpu/plane_lanes.h"
 #include "kernels/tsdf.h"
+#include "kernels/tsdf_view.h"
 
 namespace spslam {
 namespace {
@@ -170,6 +172,20 @@ std::int64_t tsdf_touched_blocks<Cpu>(Cpu, const PlaneFrame& frame, const TouchO
     total += counts[chunk];
   }
   return total;
+}
+
+template <>
+std::int64_t tsdf_missing_blocks<Cpu>(Cpu, const VoxelTable& table, const std::int32_t* coords, std::int64_t n,
+                                      void* workspace, std::int32_t* missing) {
+  std::uint8_t* is_missing = static_cast<std::uint8_t*>(workspace);
+  parallel_for(n, kElementGrain, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) is_missing[i] = is_missing_block(table, load_voxel(coords, i));
+  });
+  std::int64_t count = 0;
+  for (std::int64_t i = 0; i < n; ++i) {
+    if (is_missing[i]) std::copy_n(coords + 3 * i, 3, missing + 3 * count++);
+  }
+  return count;
 }
 
 }  // namespace spslam

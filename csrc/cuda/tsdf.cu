@@ -1,12 +1,13 @@
-// One block of threads per block of voxels; the other launches are one thread per pixel, tile, point or ray.
+// One block of threads per block of voxels, a warp per tile; the other launches are one thread per pixel, point or ray.
 #include "core/cuda_check.cuh"
+#include "cuda/warp_sums.cuh"
 #include "kernels/depth_planes.h"
 #include "launch/tsdf.h"
 
 namespace spslam {
 namespace {
 
-constexpr int kIntegrateThreads = 128;
+constexpr int kIntegrateThreads = 128, kTileThreads = 128;
 
 // Writes the blocks that a pixel touches, but those that its left neighbor's same sample touches too.
 __device__ void write_touched(const PlaneFrame& frame, const Pose<float>& pose, float inverse_block_size,
@@ -31,24 +32,20 @@ __device__ void write_touched(const PlaneFrame& frame, const Pose<float>& pose, 
   }
 }
 
-// The farthest surface (m) in a tile of the image; 0 without any.
-__device__ float tile_far(const PlaneFrame& frame, int tile_u, int tile_v) {
-  float far = 0.0f;
-  for (int v = tile_v * kTsdfTileSide; v < (tile_v + 1) * kTsdfTileSide && v < frame.height; ++v) {
-    for (int u = tile_u * kTsdfTileSide; u < (tile_u + 1) * kTsdfTileSide && u < frame.width; ++u) {
-      const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + u);
-      const float depth = plane_depth(load_plane(plane), frame.camera, static_cast<float>(u), static_cast<float>(v));
-      far = depth > far ? depth : far;
-    }
+// The farthest surface (m) in each tile of the image, 0 without any; a warp for each.
+__global__ void __launch_bounds__(kTileThreads) measure_tiles(PlaneFrame frame, int columns, int tiles, float* far) {
+  const int tile = static_cast<int>((blockIdx.x * kTileThreads + threadIdx.x) / kWarp), lane = threadIdx.x % kWarp;
+  if (tile >= tiles) return;
+  const int first_u = tile % columns * kTsdfTileSide, first_v = tile / columns * kTsdfTileSide;
+  float most = 0.0f;
+  for (int m = lane; m < kTsdfTileSide * kTsdfTileSide; m += kWarp) {
+    const int u = first_u + m % kTsdfTileSide, v = first_v + m / kTsdfTileSide;
+    if (u >= frame.width || v >= frame.height) continue;
+    const float* plane = frame.planes + kPlaneSize * (static_cast<std::int64_t>(v) * frame.width + u);
+    most = larger(plane_depth(load_plane(plane), frame.camera, static_cast<float>(u), static_cast<float>(v)), most);
   }
-  return far;
-}
-
-void measure_tiles(Cuda device, const PlaneFrame& frame, float* tiles_far) {
-  const int columns = tiles_along(frame.width);
-  for_each(device, static_cast<std::int64_t>(columns) * tiles_along(frame.height), [=] __device__(std::int64_t i) {
-    tiles_far[i] = tile_far(frame, static_cast<int>(i % columns), static_cast<int>(i / columns));
-  });
+  for (int step = kWarp / 2; step > 0; step /= 2) most = larger(most, __shfl_xor_sync(kAllLanes, most, step));
+  if (lane == 0) far[tile] = most;
 }
 
 // Adds a pixel's color to a voxel at a depth.
@@ -133,15 +130,37 @@ std::int64_t tsdf_touched_blocks<Cuda>(Cuda device, const PlaneFrame& frame, con
 }
 
 template <>
+std::int64_t tsdf_missing_blocks<Cuda>(Cuda device, const VoxelTable& table, const std::int32_t* coords, std::int64_t n,
+                                       void* workspace, std::int32_t* missing) {
+  const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
+  std::int32_t* count = static_cast<std::int32_t*>(workspace);
+  SPS_CUDA_CHECK(cudaMemsetAsync(count, 0, sizeof(*count), stream));
+  const VoxelTable known = table;
+  for_each(device, n, [=] __device__(std::int64_t i) {
+    const VoxelCoord at = load_voxel(coords, i);
+    if (!is_missing_block(known, at)) return;
+    std::int32_t* out = missing + 3 * static_cast<std::int64_t>(atomicAdd(count, 1));
+    out[0] = at.x, out[1] = at.y, out[2] = at.z;
+  });
+  std::int32_t found = 0;
+  SPS_CUDA_CHECK(cudaMemcpyAsync(&found, count, sizeof(found), cudaMemcpyDeviceToHost, stream));
+  SPS_CUDA_CHECK(cudaStreamSynchronize(stream));
+  return found;
+}
+
+template <>
 void tsdf_integrate<Cuda>(Cuda device, const TsdfBlocks& blocks, const PlaneFrame& frame, const TsdfOptions& options,
                           void* workspace) {
   if (blocks.count == 0 || frame.width == 0 || frame.height == 0) return;
   constexpr std::int64_t kMostBlocks = 1 << 20;
   float* tiles_far = static_cast<float*>(workspace);
-  measure_tiles(device, frame, tiles_far);
+  const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
+  const int columns = tiles_along(frame.width), tiles = columns * tiles_along(frame.height);
+  constexpr int kTilesPerBlock = kTileThreads / kWarp;
+  measure_tiles<<<(tiles + kTilesPerBlock - 1) / kTilesPerBlock, kTileThreads, 0, stream>>>(frame, columns, tiles,
+                                                                                            tiles_far);
   const int grid = static_cast<int>(blocks.count < kMostBlocks ? blocks.count : kMostBlocks);
-  integrate_kernel<<<grid, kIntegrateThreads, 0, static_cast<cudaStream_t>(device.stream)>>>(blocks, frame, options,
-                                                                                             tiles_far);
+  integrate_kernel<<<grid, kIntegrateThreads, 0, stream>>>(blocks, frame, options, tiles_far);
   SPS_CUDA_CHECK(cudaGetLastError());
 }
 

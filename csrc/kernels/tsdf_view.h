@@ -75,6 +75,11 @@ SPS_INLINE Vec3<float> tsdf_normal(const TsdfView& view, const Vec3<float>& worl
   return length > 0.0f ? (1.0f / length) * gradient : gradient;
 }
 
+// Whether a row of block coordinates is a block, and not in a table.
+SPS_INLINE bool is_missing_block(const VoxelTable& table, VoxelCoord block) {
+  return block.x != kNoBlock && find_voxel(table, block) == kNoVoxel;
+}
+
 // Whether the block around a point exists.
 SPS_INLINE bool in_block(const TsdfView& view, const Vec3<float>& world) {
   const VoxelCoord block = block_at(world, 1.0f / (kTsdfBlockSide * view.voxel_size));

@@ -59,13 +59,17 @@ def tsdf_touched_blocks(
         >>> blocks[:, 2].unique()  # blocks of 0.8 m, from 1.7 to 2.3 m
         tensor([2], dtype=torch.int32)
     """
-    coords = touched_blocks("tsdf_touched_blocks", planes, pose, intrinsics, voxel_size, truncation, noise, step)
+    _check_touch("tsdf_touched_blocks", planes, pose, intrinsics, voxel_size, truncation, noise, step)
+    coords = torch.ops.spslam.tsdf_touched_blocks(
+        planes, pose, list(intrinsics), voxel_size, truncation, list(noise), step
+    )
     # Not by a mask, for which torch wakes its own threads, however few rows there are: they would wait for cores.
     return coords.index_select(0, (coords[:, 0] != NO_BLOCK).nonzero()[:, 0])
 
 
-def touched_blocks(
+def missing_blocks(
     name: str,
+    table: tuple[torch.Tensor, torch.Tensor],
     planes: torch.Tensor,
     pose: torch.Tensor,
     intrinsics: Intrinsics,
@@ -74,17 +78,30 @@ def touched_blocks(
     noise: tuple[float, float],
     step: int,
 ) -> torch.Tensor:
-    """`tsdf_touched_blocks` on behalf of another function, which its errors name; without waiting for CUDA.
+    """Those of `tsdf_touched_blocks` that a table lacks, on behalf of another function, which errors name.
 
     Returns:
-        int32 [N, 3], among them rows that begin with `NO_BLOCK`, which are none.
+        int32 [N, 3], with repetitions, in no particular order; the call waits for CUDA once.
     """
+    _check_touch(name, planes, pose, intrinsics, voxel_size, truncation, noise, step)
+    sizes = voxel_size, truncation, list(noise)
+    return torch.ops.spslam.tsdf_missing_blocks(planes, pose, list(intrinsics), *sizes, step, *table)
+
+
+def _check_touch(
+    name: str,
+    planes: torch.Tensor,
+    pose: torch.Tensor,
+    intrinsics: Intrinsics,
+    voxel_size: float,
+    truncation: float,
+    noise: tuple[float, float],
+    step: int,
+) -> None:
     _check_frame(name, planes, pose, intrinsics)
     _check_sizes(name, voxel_size, truncation)
     check_noise(name, noise)
     check_count(name, "step", step)
-    sizes = voxel_size, truncation, list(noise)
-    return torch.ops.spslam.tsdf_touched_blocks(planes, pose, list(intrinsics), *sizes, step)
 
 
 @public_op()
@@ -303,6 +320,7 @@ def _check_field(name: str, field: tuple[torch.Tensor, ...], voxel_size: float) 
     check(voxel_size > 0, name, "voxel_size", "be positive", voxel_size)
 
 
+@torch.library.register_fake("spslam::tsdf_missing_blocks")
 @torch.library.register_fake("spslam::tsdf_touched_blocks")
 def _(planes, *_):
     return planes.new_empty((torch.library.get_ctx().new_dynamic_size(), 3), dtype=torch.int32)

@@ -15,8 +15,7 @@ from spslam.ops.tsdf import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
     COLOR_SIZE,
-    NO_BLOCK,
-    touched_blocks,
+    missing_blocks,
     tsdf_integrate_,
     tsdf_query,
 )
@@ -211,10 +210,10 @@ class TsdfVolume:
         reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics[0]
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
         sizes = self.voxel_size, self.truncation, noise, step
-        touched = touched_blocks(name, planes, pose, intrinsics, *sizes)
-        missing = (self.blocks.find(touched) < 0) & (touched[:, 0] != NO_BLOCK)
-        # Not by the mask, for which torch would wake its threads.
-        self.add_blocks(touched.index_select(0, missing.nonzero()[:, 0]))
+        table = self.blocks.hash_keys, self.blocks.hash_values
+        missing = missing_blocks(name, table, planes, pose, intrinsics, *sizes)
+        if len(missing):
+            self.add_blocks(missing)
 
     def query(self, points: torch.Tensor, min_weight: float = 1e-3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Distance (m), color and whether both are known, at points float32 [N, 3]; see `tsdf_query`."""
