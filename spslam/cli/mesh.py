@@ -12,6 +12,7 @@ from spslam.cli.arguments import add_device, add_run_folder, mesh_resolution, po
 from spslam.config import Config, load_config
 from spslam.errors import DatasetError, OutputError
 from spslam.io import writing
+from spslam.run.standby import end_standby, launch_image_readers
 from spslam.run_folder import MESH_FORMATS, TEXTURED_FORMATS, RunFolder, is_merged
 
 if TYPE_CHECKING:
@@ -69,15 +70,20 @@ def execute(args: argparse.Namespace) -> None:
     folder = RunFolder(args.output)
     require_run_file(folder.map)
     config = load_config(require_run_file(folder.config))
+    if args.source != "neural":
+        launch_image_readers(config, args.device or config.device)  # loading torch takes seconds
 
     from spslam.run.device import explained_failures, resolve_device
 
-    device = resolve_device(args.device or config.device)
-    with explained_failures(device, "choose a larger --resolution"):
-        if is_merged(folder):
-            _execute_merged(args, folder, config, file_format, device)
-        else:
-            _execute_run(args, folder, config, file_format, device)
+    try:
+        device = resolve_device(args.device or config.device)
+        with explained_failures(device, "choose a larger --resolution"):
+            if is_merged(folder):
+                _execute_merged(args, folder, config, file_format, device)
+            else:
+                _execute_run(args, folder, config, file_format, device)
+    finally:
+        end_standby()
 
 
 def _execute_run(

@@ -102,7 +102,7 @@ def run(
 
     # Loading torch takes seconds: unusable data are reported before, and a thread looks at the frames meanwhile.
     opened = OpenedData(request)
-    launch_standby(request.config)
+    launch_standby(request.config, fuses=request.mesh)
     with collector_paused():
         from spslam.run.sequence import run_sequence
 

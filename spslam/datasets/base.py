@@ -107,6 +107,7 @@ class RgbdDataset(ABC):
             do not expect it.
         is_random_access: whether each frame is read by itself, so that several processes may share the frames; frames
             of a video, or of a bag, are read best in order.
+        readers: number of processes that read its frames; 0 where the thread does that asks for one.
         doubts: what opening the recording found doubtful, which a run says as well as a check of the data.
         remarks: what a check of the data says besides, as it may be meant so.
         scale_remedy: how the scale of depth is set for this kind of data.
@@ -118,6 +119,7 @@ class RgbdDataset(ABC):
     border_px: int = 0
     is_registered: bool = True
     is_random_access: bool = False
+    readers: int = 0
     doubts: Sequence[Finding] = ()
     remarks: Sequence[str] = ()
     scale_remedy: str = "correct the scale of depth (units per meter)"

@@ -27,6 +27,10 @@ class RunData(Subset):
         super().__init__(dataset)
         self.unreadable: set[int] = set()
 
+    def __reduce__(self) -> tuple[type[Subset], tuple[RgbdDataset]]:
+        """For a process that only reads: it tells this one what it can't read."""
+        return Subset, (self._dataset,)
+
     def __getitem__(self, index: int) -> RgbdFrame:
         with self._remembered(index):
             return super().__getitem__(index)

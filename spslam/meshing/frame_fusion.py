@@ -100,7 +100,7 @@ class PosedFrames:
 
     def read(self) -> Iterator[tuple[int, RgbdFrame]]:
         """Positions and frames in order, read ahead by threads; frames that can't be read are left out."""
-        with prefetch(self, *reading_threads()) as frames:
+        with prefetch(self, *reading_threads(self.dataset.readers)) as frames:
             for position, frame in enumerate(frames):
                 if not isinstance(frame, DatasetError):
                     yield position, frame
@@ -297,7 +297,7 @@ class _EdgeImages:
 
     def read(self) -> Iterator[tuple[int, _EdgeImage]]:
         """Positions and images on the device, in order; frames that can't be read are left out."""
-        with prefetch(self, *reading_threads()) as images:
+        with prefetch(self, *reading_threads(self.part.dataset.readers)) as images:
             for position, image in enumerate(images):
                 if not isinstance(image, DatasetError):
                     parts = (None if part is None else part.to(self.device, non_blocking=True) for part in image)

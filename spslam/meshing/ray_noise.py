@@ -59,7 +59,7 @@ def noise_along_rays(frames: PosedFrames, noise: tuple[float, float]) -> tuple[f
     if count < 1:
         return noise
     firsts = np.unique(np.linspace(0, max(len(frames) - 1 - _STEPS[0], 0), count).round().astype(int))
-    with prefetch(_Pairs(frames, firsts), *reading_threads()) as pairs:
+    with prefetch(_Pairs(frames, firsts), *reading_threads(frames.dataset.readers)) as pairs:
         found = [each for each in pairs if not isinstance(each, DatasetError)]
     if not found:
         return noise

@@ -9,7 +9,11 @@ from spslam.datasets.prefetch import usable_cores
 _LEAST, _MOST = 2, 6
 
 
-def reading_threads() -> tuple[int, int]:
-    """Number of threads that read, half the cores, and of frames that they read in advance."""
-    threads = min(max(usable_cores() // 2, _LEAST), _MOST)
+def reading_threads(readers: int = 0) -> tuple[int, int]:
+    """Number of threads that read, half the cores, and of frames that they read in advance.
+
+    Args:
+        readers: of the dataset: processes that read it, for each of which a thread only waits.
+    """
+    threads = readers or min(max(usable_cores() // 2, _LEAST), _MOST)
     return threads, 2 * threads

@@ -59,7 +59,7 @@ def read_seen(
     device = surface.points.device
     for part in parts:
         intrinsics, poses = frame_intrinsics(part), poses7_on(part.poses, device)
-        with prefetch(_ToBeUploaded(part, device), *reading_threads()) as frames:
+        with prefetch(_ToBeUploaded(part, device), *reading_threads(part.dataset.readers)) as frames:
             for position, images in enumerate(frames):
                 if not isinstance(images, DatasetError):
                     depth, color = (image.to(device, non_blocking=True) for image in images)

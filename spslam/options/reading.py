@@ -178,7 +178,7 @@ class RunOptions(Section):
     reader: Literal["auto", "process", "threads"] = option(
         "where these threads run: in a separate `process`, which forks one for each thread where frames are files of "
         "their own, or as `threads` of the run's own; `auto` is `process` for a GPU if the command line starts the run "
-        "and the process can read the dataset"
+        "and the process can read the dataset. By `threads` a mesh reads its frames without other processes too"
     )
     graph_solver: Literal["auto", "process", "thread"] = option(
         "where the keyframe graph is solved: in a separate `process` or on a `thread` of the run's own, with the same "

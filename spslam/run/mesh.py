@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
 from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.options import MeshOptions
+from spslam.run.image_readers import shared_out
 from spslam.run.memory import keep_freed_memory
 from spslam.run.threads import library_threads_limited
 from spslam.scene import Scene
@@ -115,7 +117,8 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
     if dataset is None or job.options.source == "neural":
         mesh, figures = _extracted(job)
     else:
-        mesh, figures = _fused(job, dataset)
+        with shared_out(dataset) if job.scene.device.type == "cuda" else nullcontext(dataset) as readable:
+            mesh, figures = _fused(job, readable)
     if job.texture is None or dataset is None:
         save_mesh(mesh, path)
     else:

@@ -15,7 +15,7 @@ from spslam.run.memory import LARGEST_KEPT, MOST_KEPT
 SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.reader_service", "serve"
 # Frames at a time: one that is read, one that waits for one before it, and one that is sent.
 AHEAD_PER_WORKER = 3
-_ENVIRONMENT = {
+READER_ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "MALLOC_MMAP_THRESHOLD_": str(LARGEST_KEPT),
     "MALLOC_TRIM_THRESHOLD_": str(MOST_KEPT),
@@ -50,7 +50,7 @@ def launch() -> LaunchedReader:
     """
     shared = os.memfd_create("spslam-frames")
     try:
-        helper = HelperProcess.launch(SERVICE_MODULE, SERVICE_FUNCTION, _ENVIRONMENT, (shared,))
+        helper = HelperProcess.launch(SERVICE_MODULE, SERVICE_FUNCTION, READER_ENVIRONMENT, (shared,))
     except BaseException:
         os.close(shared)
         raise

@@ -76,7 +76,7 @@ def read_views(parts: Sequence[PosedFrames], noise: tuple[float, float]) -> Iter
     """All frames of all parts in order; those that can't be read are left out, the others keep their numbers."""
     first = 0
     for part in parts:
-        with prefetch(part, *reading_threads()) as frames:
+        with prefetch(part, *reading_threads(part.dataset.readers)) as frames:
             for position, frame in enumerate(frames):
                 if not isinstance(frame, DatasetError):
                     camera, pose = part.dataset.camera, part.poses[position]
