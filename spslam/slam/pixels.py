@@ -7,6 +7,7 @@ turns a depth difference along the ray into a distance to the surface's tangent 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -98,6 +99,11 @@ class FramePixels:
     def holding(self, buffer: torch.Tensor) -> FramePixels:
         """The same in another buffer, to which the words were copied."""
         return replace(self, buffer=buffer)
+
+    def only_images(self, copy: Callable[[torch.Tensor], torch.Tensor]) -> FramePixels:
+        """Depth and intensity image without the rest, in a buffer of their own that `copy` makes of theirs."""
+        first = self.buffer.numel() - sum(self._image_words)
+        return replace(self, buffer=copy(self.buffer[first:]), capacity=0, thumbnail_shape=(0, 0))
 
     def having(self, **views: torch.Tensor) -> FramePixels:
         """The same, but for views by their names, which are tensors of their own; the buffer is as it was read."""

@@ -11,7 +11,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.datasets.base import RgbdFrame
 from spslam.slam.device_events import StreamEvent, current_stream, fetch
-from spslam.slam.pixels import FramePixels, image_pixels, sample_images
+from spslam.slam.pixels import FramePixels, sample_images
 
 
 @dataclass(frozen=True)
@@ -111,5 +111,4 @@ class ImageUploader:
     def fetch_images(self, pixels: FramePixels) -> tuple[FramePixels, StreamEvent]:
         """The small images of a frame that was sampled, on their way to the host, and when they are there."""
         with torch.cuda.stream(self._stream):
-            images = image_pixels(fetch(pixels.depth_image), fetch(pixels.intensity_image))
-            return images, StreamEvent(self._stream)
+            return pixels.only_images(fetch), StreamEvent(self._stream)
