@@ -31,9 +31,12 @@ SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.image_service", "serve"
 # Fewer hardly read faster than threads; more wait for the thread that works on what they read.
 MIN_READERS, MAX_READERS = 4, 12
 LEAST_FRAMES = 30  # fewer are read before the processes have started
+MOST_BYTES = 256 << 20  # that frames are left in; of large images fewer processes read
 COLOR_BYTES, DEPTH_BYTES = 3, 4  # of a pixel
 DEPTH_REQUEST, FRAME_REQUEST = b"d", b"f"
 INDEX_BYTES = 8
+# Raised by `SharedOutDataset` where another process can't read a dataset.
+NOT_SHARED = (*NOT_STARTED, *DISCONNECTED, pickle.PicklingError)
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,12 @@ class ImageWork:
 
     Attributes:
         dataset: the frames.
-        frame_bytes: of the memory that each process leaves a frame in.
+        readers: number of processes.
+        frame_bytes: of the memory that each leaves a frame in.
     """
 
     dataset: RgbdDataset
+    readers: int
     frame_bytes: int
 
 
@@ -105,20 +110,15 @@ def shared_out(dataset: RgbdDataset) -> Iterator[RgbdDataset]:
 
     What it holds is the same; in any other case it is the dataset itself.
     """
-    if IMAGE_READERS.waiting is None or not dataset.is_random_access or len(dataset) < LEAST_FRAMES:
-        yield dataset
-        return
-    try:
-        shared = SharedOutDataset(dataset, IMAGE_READERS.take())
-    except NOT_SHARED:
+    shared = None
+    if IMAGE_READERS.waiting is not None and dataset.is_random_access and len(dataset) >= LEAST_FRAMES:
+        with contextlib.suppress(*NOT_SHARED):
+            shared = SharedOutDataset(dataset, IMAGE_READERS.take())
+    if shared is None:
         yield dataset
         return
     with contextlib.closing(shared):
         yield shared
-
-
-# Raised by `SharedOutDataset` where another process can't read a dataset.
-NOT_SHARED = (*NOT_STARTED, *DISCONNECTED, pickle.PicklingError)
 
 
 class SharedOutDataset(Subset):
@@ -135,11 +135,11 @@ class SharedOutDataset(Subset):
     def __init__(self, dataset: RgbdDataset, launched: LaunchedReaders) -> None:
         super().__init__(dataset)
         self._launched = launched
-        self.readers = len(launched.connections)
-        pixels = self.camera.width * self.camera.height
-        work = ImageWork(dataset, pixels * (DEPTH_BYTES + COLOR_BYTES))
+        frame_bytes = self.camera.width * self.camera.height * (DEPTH_BYTES + COLOR_BYTES)
+        self.readers = min(len(launched.connections), max(MOST_BYTES // frame_bytes, 1))
+        work = ImageWork(dataset, self.readers, frame_bytes)
         try:
-            os.ftruncate(launched.shared, max(self.readers * work.frame_bytes, 1))
+            os.ftruncate(launched.shared, self.readers * frame_bytes)
             memory = np.frombuffer(mmap.mmap(launched.shared, 0), np.uint8)
             launched.helper.connection.send_bytes(pickle.dumps(work))
             if not launched.helper.connection.recv():
@@ -147,9 +147,7 @@ class SharedOutDataset(Subset):
         except BaseException:
             launched.end()
             raise
-        self._images = [
-            images_in(memory[i * work.frame_bytes : (i + 1) * work.frame_bytes], dataset) for i in range(self.readers)
-        ]
+        self._images = [images_in(memory, number, work) for number in range(self.readers)]
         self._free: SimpleQueue[int] = SimpleQueue()
         for reader in range(self.readers):
             self._free.put(reader)
@@ -184,13 +182,15 @@ class SharedOutDataset(Subset):
             yield answer, *self._images[reader]
         except DISCONNECTED:
             what = f"{self.name}: a process that reads frames has ended"
-            raise SpslamError(f"{what}; if memory was short, run.reader=threads needs none") from None
+            threads = "run.reader=threads (for spslam mesh in the run's config.yaml)"
+            raise SpslamError(f"{what}; if memory was short, {threads} needs none") from None
         finally:
             self._free.put(reader)
 
 
-def images_in(memory: np.ndarray, dataset: RgbdDataset) -> Sequence[np.ndarray]:
-    """Depth float32 [H, W] and color uint8 [H, W, 3] of a frame, as they lie in a reader's memory."""
-    size = dataset.camera.height, dataset.camera.width
+def images_in(memory: np.ndarray, number: int, work: ImageWork) -> Sequence[np.ndarray]:
+    """Depth float32 [H, W] and color uint8 [H, W, 3] of a frame, as a reader of some number leaves them."""
+    size = work.dataset.camera.height, work.dataset.camera.width
+    own = memory[number * work.frame_bytes :][: work.frame_bytes]
     depth_bytes = DEPTH_BYTES * size[0] * size[1]
-    return memory[:depth_bytes].view(np.float32).reshape(size), memory[depth_bytes:].reshape(*size, COLOR_BYTES)
+    return own[:depth_bytes].view(np.float32).reshape(size), own[depth_bytes:].reshape(*size, COLOR_BYTES)

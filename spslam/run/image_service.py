@@ -36,10 +36,10 @@ def serve(socket: int, shared: int, *sockets: int) -> None:
             return
         memory = np.frombuffer(mmap.mmap(shared, 0), np.uint8)
         context = multiprocessing.get_context("fork")
-        for number, own in enumerate(connections):
-            place = memory[number * work.frame_bytes : (number + 1) * work.frame_bytes]
+        for number, own in enumerate(connections[: work.readers]):
             others = [connection, *(other for other in connections if other is not own)]
-            context.Process(target=_read, args=(work.dataset, own, place, others), daemon=True).start()
+            images = images_in(memory, number, work)
+            context.Process(target=_read, args=(work.dataset, own, images, others), daemon=True).start()
         for own in connections:  # else nobody would notice that a process has ended
             own.close()
         connection.send(True)
@@ -47,11 +47,12 @@ def serve(socket: int, shared: int, *sockets: int) -> None:
             connection.recv_bytes()  # until it is closed; those forked end then, as they are daemons
 
 
-def _read(dataset: RgbdDataset, connection: Connection, memory: np.ndarray, others: Sequence[Connection]) -> None:
+def _read(
+    dataset: RgbdDataset, connection: Connection, images: Sequence[np.ndarray], others: Sequence[Connection]
+) -> None:
     """What a forked process does until its connection is closed."""
     for other in others:
         other.close()
-    images = images_in(memory, dataset)
     # What is forked gets its memory page by page: its first frame would take ten times as long as the next.
     _answer(dataset, FRAME_REQUEST, 0, images)
     with contextlib.suppress(*DISCONNECTED):

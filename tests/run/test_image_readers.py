@@ -65,6 +65,16 @@ def test_frames_are_the_datasets():
     wait_until_ended(pids)
 
 
+def test_large_images_are_read_by_fewer_processes(monkeypatch):
+    alone = Recorded(FRAMES, is_random_access=True)
+    monkeypatch.setattr(image_readers, "MOST_BYTES", 2 * 7 * alone.camera.width * alone.camera.height)
+    dataset = shared()
+    assert dataset.readers == len(processes_of(dataset)) - 1 == 2
+    for index in range(6):
+        assert np.array_equal(dataset[index].depth, alone[index].depth)
+    dataset.close()
+
+
 def test_what_can_not_be_read_is_remembered():
     data = RunData(Recorded(FRAMES, refuse_some, is_random_access=True))
     dataset = SharedOutDataset(data, launch())
@@ -89,7 +99,7 @@ def test_a_process_that_has_ended_is_named():
     for pid in pids[1:]:
         os.kill(pid, signal.SIGKILL)
     wait_until_ended(pids[1:])
-    with pytest.raises(SpslamError, match=r"a process that reads frames has ended; .*run.reader=threads needs none"):
+    with pytest.raises(SpslamError, match=r"a process that reads frames has ended; .*run.reader=threads .*needs none"):
         dataset[0]
     dataset.close()
 
