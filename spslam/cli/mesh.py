@@ -70,7 +70,7 @@ def execute(args: argparse.Namespace) -> None:
     folder = RunFolder(args.output)
     require_run_file(folder.map)
     config = load_config(require_run_file(folder.config))
-    if args.source != "neural":
+    if args.texture or (args.source or config.mesh.source) == "tsdf":
         launch_image_readers(config, args.device or config.device)  # loading torch takes seconds
 
     from spslam.run.device import explained_failures, resolve_device

@@ -100,7 +100,9 @@ class ArrivingFrozenDepth:
         """Whether there is depth, and the same as in the frame kept."""
         rows, kept = frame.depth[::_DEPTH_ROW_STEP], self._depth
         middle = len(rows) // 2
-        if kept is None or rows[middle].tobytes() != kept[middle].tobytes():  # a tenth of what comparing numbers takes
+        if (
+            kept is None or rows[middle].tobytes() != kept[middle].tobytes()
+        ):  # an image that is the same has the same bits
             return False
         return np.array_equal(rows, kept, equal_nan=True) and bool(rows.any())
 

@@ -28,7 +28,7 @@ class RunData(Subset):
         self.unreadable: set[int] = set()
 
     def __reduce__(self) -> tuple[type[Subset], tuple[RgbdDataset]]:
-        """For a process that only reads: it tells this one what it can't read."""
+        """Pickled it is all frames without a memory: what another process can't read, it leaves to this one."""
         return Subset, (self._dataset,)
 
     def __getitem__(self, index: int) -> RgbdFrame:

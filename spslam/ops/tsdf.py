@@ -83,7 +83,7 @@ def missing_blocks(
     Returns:
         int32 [N, 3], with repetitions, in no particular order; the call waits for CUDA once.
     """
-    _check_touch(name, planes, pose, intrinsics, voxel_size, truncation, noise, step)
+    _check_touch(name, planes, pose, intrinsics, voxel_size, truncation, noise, step, like=table[0])
     sizes = voxel_size, truncation, list(noise)
     return torch.ops.spslam.tsdf_missing_blocks(planes, pose, list(intrinsics), *sizes, step, *table)
 
@@ -97,8 +97,9 @@ def _check_touch(
     truncation: float,
     noise: tuple[float, float],
     step: int,
+    like: torch.Tensor | None = None,
 ) -> None:
-    _check_frame(name, planes, pose, intrinsics)
+    _check_frame(name, planes, pose, intrinsics, like)
     _check_sizes(name, voxel_size, truncation)
     check_noise(name, noise)
     check_count(name, "step", step)

@@ -23,7 +23,7 @@ import numpy as np
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.prefetch import usable_cores
 from spslam.errors import SpslamError
-from spslam.helper_process import DISCONNECTED, NOT_STARTED, HelperProcess, Standby
+from spslam.helper_process import DISCONNECTED, HelperProcess, Standby
 from spslam.run.reader_launch import READER_ENVIRONMENT
 
 # What the first process runs, which forks the others; a test checks that it exists.
@@ -31,12 +31,14 @@ SERVICE_MODULE, SERVICE_FUNCTION = "spslam.run.image_service", "serve"
 # Fewer hardly read faster than threads; more wait for the thread that works on what they read.
 MIN_READERS, MAX_READERS = 4, 12
 LEAST_FRAMES = 30  # fewer are read before the processes have started
-MOST_BYTES = 256 << 20  # that frames are left in; of large images fewer processes read
+MOST_BYTES = 256 << 20  # that frames are left in; of large images fewer processes read, or none
 COLOR_BYTES, DEPTH_BYTES = 3, 4  # of a pixel
 DEPTH_REQUEST, FRAME_REQUEST = b"d", b"f"
 INDEX_BYTES = 8
-# Raised by `SharedOutDataset` where another process can't read a dataset.
-NOT_SHARED = (*NOT_STARTED, *DISCONNECTED, pickle.PicklingError)
+
+
+class NotSharedError(Exception):
+    """Other processes can't read a dataset: it can't be pickled, its class not be imported there, or none be forked."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +88,8 @@ def launch() -> LaunchedReaders:
     if count < MIN_READERS:
         raise OSError(f"{usable_cores()} cores are too few for {MIN_READERS} processes")
     with contextlib.ExitStack() as theirs:
-        shared = os.memfd_create("spslam-images")
         pairs = [Pipe() for _ in range(count)]
+        shared = os.memfd_create("spslam-images")
         for _, other in pairs:
             theirs.callback(other.close)
         try:
@@ -111,8 +113,9 @@ def shared_out(dataset: RgbdDataset) -> Iterator[RgbdDataset]:
     What it holds is the same; in any other case it is the dataset itself.
     """
     shared = None
-    if IMAGE_READERS.waiting is not None and dataset.is_random_access and len(dataset) >= LEAST_FRAMES:
-        with contextlib.suppress(*NOT_SHARED):
+    pays = dataset.is_random_access and len(dataset) >= LEAST_FRAMES and _most_readers(dataset) >= MIN_READERS
+    if pays and IMAGE_READERS.waiting is not None:
+        with contextlib.suppress(NotSharedError):
             shared = SharedOutDataset(dataset, IMAGE_READERS.take())
     if shared is None:
         yield dataset
@@ -129,21 +132,18 @@ class SharedOutDataset(Subset):
         launched: the processes, which end with this.
 
     Raises:
-        NOT_SHARED: the dataset can't be pickled, or its class not be imported there; the processes have ended.
+        NotSharedError: they can't read it; they have ended then.
     """
 
     def __init__(self, dataset: RgbdDataset, launched: LaunchedReaders) -> None:
         super().__init__(dataset)
         self._launched = launched
-        frame_bytes = self.camera.width * self.camera.height * (DEPTH_BYTES + COLOR_BYTES)
-        self.readers = min(len(launched.connections), max(MOST_BYTES // frame_bytes, 1))
-        work = ImageWork(dataset, self.readers, frame_bytes)
+        self.readers = min(len(launched.connections), max(_most_readers(dataset), 1))
+        work = ImageWork(dataset, self.readers, _frame_bytes(dataset))
         try:
-            os.ftruncate(launched.shared, self.readers * frame_bytes)
+            os.ftruncate(launched.shared, self.readers * work.frame_bytes)
             memory = np.frombuffer(mmap.mmap(launched.shared, 0), np.uint8)
-            launched.helper.connection.send_bytes(pickle.dumps(work))
-            if not launched.helper.connection.recv():
-                raise TypeError(f"{dataset.name}: its class can't be imported by another process")
+            _begin(launched.helper.connection, work)
         except BaseException:
             launched.end()
             raise
@@ -186,6 +186,29 @@ class SharedOutDataset(Subset):
             raise SpslamError(f"{what}; if memory was short, {threads} needs none") from None
         finally:
             self._free.put(reader)
+
+
+def _most_readers(dataset: RgbdDataset) -> int:
+    return MOST_BYTES // _frame_bytes(dataset)
+
+
+def _frame_bytes(dataset: RgbdDataset) -> int:
+    return dataset.camera.width * dataset.camera.height * (DEPTH_BYTES + COLOR_BYTES)
+
+
+def _begin(connection: Connection, work: ImageWork) -> None:
+    """Sends the work, and waits until the processes are there; raises NotSharedError."""
+    try:
+        content = pickle.dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise NotSharedError from error
+    try:
+        connection.send_bytes(content)
+        is_ready = connection.recv()
+    except DISCONNECTED as error:
+        raise NotSharedError from error
+    if not is_ready:
+        raise NotSharedError
 
 
 def images_in(memory: np.ndarray, number: int, work: ImageWork) -> Sequence[np.ndarray]:

@@ -36,10 +36,14 @@ def serve(socket: int, shared: int, *sockets: int) -> None:
             return
         memory = np.frombuffer(mmap.mmap(shared, 0), np.uint8)
         context = multiprocessing.get_context("fork")
-        for number, own in enumerate(connections[: work.readers]):
-            others = [connection, *(other for other in connections if other is not own)]
-            images = images_in(memory, number, work)
-            context.Process(target=_read, args=(work.dataset, own, images, others), daemon=True).start()
+        try:
+            for number, own in enumerate(connections[: work.readers]):
+                others = [connection, *(other for other in connections if other is not own)]
+                images = images_in(memory, number, work)
+                context.Process(target=_read, args=(work.dataset, own, images, others), daemon=True).start()
+        except OSError:  # no more processes, or no memory for them: threads need neither
+            connection.send(False)
+            return
         for own in connections:  # else nobody would notice that a process has ended
             own.close()
         connection.send(True)
@@ -64,17 +68,19 @@ def _read(
 def _answer(
     dataset: RgbdDataset, kind: bytes, index: int, images: Sequence[np.ndarray]
 ) -> tuple[dict[str, Any] | None, str | None]:
-    """What is said of a frame, whose images are left in memory: its other attributes, None if it can't be read; and
-    what went wrong that is not the data's fault."""
+    """What is said of a frame, whose images are left in memory: its other attributes, None if that can't be done, so
+    that whoever asks reads it and sees why; and what went wrong that is not the data's fault."""
     depth, color = images
     try:
         if kind != FRAME_REQUEST:
             depth[:] = dataset.depth(index)
             return {}, None
         frame = dataset[index]
+        if frame.depth.shape != depth.shape or frame.color.shape != color.shape:
+            return None, None
+        depth[:], color[:] = frame.depth, frame.color
     except DatasetError:
         return None, None
     except Exception:
         return None, traceback.format_exc()
-    depth[:], color[:] = frame.depth, frame.color
     return {name: getattr(frame, name) for name in ("index", "timestamp", "pose", "offsets")}, None

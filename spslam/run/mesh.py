@@ -114,15 +114,14 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
         check_textured_format(path)
         if dataset is None:
             raise OutputError(f"{path}: a texture is made of frames, and none can be read again")
-    if dataset is None or job.options.source == "neural":
-        mesh, figures = _extracted(job)
-    else:
-        with shared_out(dataset) if job.scene.device.type == "cuda" else nullcontext(dataset) as readable:
-            mesh, figures = _fused(job, readable)
-    if job.texture is None or dataset is None:
-        save_mesh(mesh, path)
-    else:
-        figures |= _write_textured(path, mesh, job, dataset, job.texture.texel_m)
+    is_fused = dataset is not None and job.options.source != "neural"
+    is_shared = job.scene.device.type == "cuda" and (is_fused or job.texture is not None)
+    with shared_out(dataset) if dataset is not None and is_shared else nullcontext(dataset) as readable:
+        mesh, figures = _fused(job, readable) if readable is not None and is_fused else _extracted(job)
+        if job.texture is None or readable is None:
+            save_mesh(mesh, path)
+        else:
+            figures |= _write_textured(path, mesh, job, readable, job.texture.texel_m)
     return mesh, {**figures, "mesh_s": time.perf_counter() - started}
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -204,9 +205,10 @@ class OutputFolder(RunFolder):
         atomic_write(self.preview_camera, json.dumps(vars(camera)) + "\n")
         if ground_truth is not None:
             ground_truth.save_tum(self.preview_ground_truth)
-        with ThreadPoolExecutor(min(usable_cores(), _PREVIEW_THREADS)) as threads:
-            for written in [threads.submit(self._write_preview, row, frame) for row, frame in frames]:
-                written.result()
+        left, count = iter(frames), min(usable_cores(), _PREVIEW_THREADS)
+        with ThreadPoolExecutor(count) as threads:
+            while several := list(itertools.islice(left, count)):  # frames are read as they are taken
+                list(threads.map(lambda preview: self._write_preview(*preview), several))
 
     def _write_preview(self, row: int, frame: RgbdFrame) -> None:
         millimeters = np.nan_to_num(np.rint(1000 * frame.depth), nan=0.0)

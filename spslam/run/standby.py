@@ -17,15 +17,15 @@ def launch_standby(config: Config, reads: bool = True, fuses: bool = False) -> N
     """
     if reads and is_probably_wanted(config.run.reader, config.device):
         READERS.prepare()
-    if fuses:
+    if fuses and config.mesh.source == "tsdf":
         launch_image_readers(config, config.device)
     if config.graph.enabled and is_probably_wanted(config.run.graph_solver, config.device):
         SOLVERS.prepare()
 
 
 def launch_image_readers(config: Config, device: str) -> None:
-    """Starts those that will probably read frames for a mesh of a run with these options on a device."""
-    if config.mesh.source == "tsdf" and is_probably_wanted(config.run.reader, device):
+    """Starts those that read frames for a mesh, if a run with these options has processes that read and a GPU."""
+    if config.run.reader != "threads" and is_probably_wanted("auto", device):
         IMAGE_READERS.prepare()
 
 

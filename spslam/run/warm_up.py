@@ -23,6 +23,8 @@ PIXELS_MB = 64
 def warm_up(config: Config, camera: Camera, device: torch.device) -> list[FrameReport]:
     """Processes a few synthetic frames of a wall with a system that is then discarded.
 
+    They come as a camera's do; a dataset's, which reading processes sample, need no more kernels than these.
+
     On CUDA the wall also vanishes and comes back, so that a frame that is lost late in a run need not wait for what
     finds it again to be loaded.
 

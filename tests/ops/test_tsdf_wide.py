@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from spslam import ops
+from spslam.ops.tsdf import missing_blocks
 from tests.ops.test_tsdf import IDENTITY, NOISE, VOXEL, planes_of, rays, wall
 from tests.ops.threads import assert_same_for_any_threads
 from tests.reference import tsdf as reference
@@ -131,3 +132,21 @@ def test_planes_are_integrated_with_the_weights_they_are_given(device):
     assert torch.equal(room.block_coords, whole.block_coords) and not room.weights.any()
     assert torch.equal(half.block_coords, whole.block_coords) and torch.equal(half.weights, 0.5 * whole.weights)
     assert torch.allclose(half.sdf, whole.sdf)
+
+
+@pytest.mark.parametrize("known", [0, 7, 1000])
+def test_missing_blocks_are_those_touched_that_a_table_lacks(device, known):
+    planes, pose = ops.measure_planes(torch.from_numpy(two_walls()).to(device), CAMERA, NOISE), POSE.to(device)
+    sizes = dict(voxel_size=VOXEL, truncation=0.1, noise=NOISE, step=1)
+    touched = ops.tsdf_touched_blocks(planes, pose, CAMERA, **sizes).unique(dim=0)
+    blocks = ops.VoxelHash(device=device)
+    blocks.add(touched[:known])
+    missing = missing_blocks("test", (blocks.hash_keys, blocks.hash_values), planes, pose, CAMERA, *sizes.values())
+    assert len(touched) > 7 and torch.equal(missing.unique(dim=0), touched[known:])
+
+
+def test_a_frame_of_another_device_is_named():
+    volume, planes = ops.TsdfVolume(VOXEL), torch.zeros(4, 5, 5, device="meta")
+    with pytest.raises(ValueError, match=r"TsdfVolume.make_room: planes must be on cpu"):
+        volume.make_room(planes, POSE.to("meta"), CAMERA)
+    assert len(volume) == 0

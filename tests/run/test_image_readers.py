@@ -8,16 +8,22 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
+from spslam import helper_process
 from spslam.errors import DatasetError, SpslamError
 from spslam.evaluation.run_data import RunData
 from spslam.helper_process import DISCONNECTED
+from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.run import image_readers
-from spslam.run.image_readers import IMAGE_READERS, LEAST_FRAMES, NOT_SHARED, SharedOutDataset, launch, shared_out
+from spslam.run.image_readers import IMAGE_READERS, LEAST_FRAMES, NotSharedError, SharedOutDataset, launch, shared_out
 from spslam.run.image_service import serve
+from spslam.run.reader_launch import READERS
+from spslam.run.standby import launch_standby
+from spslam.slam.graph.solver_launch import SOLVERS
 from tests.run.test_reader_process import PATIENCE_S, ROOT, fail_second, wait_until_ended
 from tests.run.test_reader_workers import children, refuse_some
-from tests.system.sequences import Recorded
+from tests.system.sequences import Recorded, settings
 
 FRAMES = 34
 
@@ -67,12 +73,63 @@ def test_frames_are_the_datasets():
 
 def test_large_images_are_read_by_fewer_processes(monkeypatch):
     alone = Recorded(FRAMES, is_random_access=True)
-    monkeypatch.setattr(image_readers, "MOST_BYTES", 2 * 7 * alone.camera.width * alone.camera.height)
+    monkeypatch.setattr(image_readers, "usable_cores", lambda: 8)
+    monkeypatch.setattr(image_readers, "MOST_BYTES", 5 * 7 * alone.camera.width * alone.camera.height)
     dataset = shared()
-    assert dataset.readers == len(processes_of(dataset)) - 1 == 2
-    for index in range(6):
+    assert dataset.readers == len(processes_of(dataset)) - 1 == 5
+    for index in range(12):
         assert np.array_equal(dataset[index].depth, alone[index].depth)
     dataset.close()
+    monkeypatch.setattr(image_readers, "MOST_BYTES", 3 * 7 * alone.camera.width * alone.camera.height)
+    IMAGE_READERS.prepare()
+    with shared_out(alone) as readable:  # threads read as fast
+        assert readable is alone
+    IMAGE_READERS.end()
+
+
+def test_voxels_are_the_same():
+    alone, dataset, every = Recorded(FRAMES, is_random_access=True), shared(), np.arange(0, FRAMES, 3)
+    options = FusionOptions(0.04, 256, (1e-6, 1e-6))
+    one, other = (fuse_frames(PosedFrames(each, every, each.poses()[every]), options) for each in (alone, dataset))
+    for name in ("block_coords", "sdf", "weights", "colors"):
+        assert torch.equal(getattr(one, name), getattr(other, name))
+    dataset.close()
+
+
+def test_images_of_another_kind_are_read_here():
+    dataset = shared(lose_a_channel)
+    with pytest.raises(AssertionError, match="asked here"):
+        dataset[1]
+    dataset.close()
+
+
+def lose_a_channel(frame):
+    if frame.index == 1:
+        frame.color = frame.color[..., :1]
+        assert os.getpid() != HERE, "asked here"
+
+
+HERE = os.getpid()
+
+
+@pytest.mark.parametrize(
+    ("changes", "device", "fuses", "is_launched"),
+    [
+        ((), "cuda", True, True),
+        ((), "cuda", False, False),
+        ((), "cpu", True, False),
+        (("run.reader=threads",), "cuda", True, False),
+        (("run.reader=process",), "cpu", True, False),
+        (("mesh.source=neural",), "cuda", True, False),
+    ],
+)
+def test_a_run_that_fuses_beside_a_gpu_launches_them(monkeypatch, changes, device, fuses, is_launched):
+    launched = []
+    for standby in (IMAGE_READERS, READERS, SOLVERS):
+        monkeypatch.setattr(standby, "prepare", lambda standby=standby: launched.append(standby))
+    monkeypatch.setattr(helper_process, "_GPU_DRIVERS", (ROOT,))
+    launch_standby(settings(f"device={device}", *changes), fuses=fuses)
+    assert (IMAGE_READERS in launched) == is_launched
 
 
 def test_what_can_not_be_read_is_remembered():
@@ -115,8 +172,9 @@ def test_the_processes_end_with_their_parent():
 
 
 def test_data_that_can_not_be_shared_out_is_read_as_it_is():
-    local, few = Recorded(FRAMES, lambda frame: None, is_random_access=True), Recorded(LEAST_FRAMES - 1)
-    with pytest.raises(NOT_SHARED):
+    local, few = Recorded(FRAMES, lambda frame: None, is_random_access=True), Recorded(29, is_random_access=True)
+    assert len(few) < LEAST_FRAMES <= FRAMES
+    with pytest.raises(NotSharedError):
         SharedOutDataset(local, launch())
     for dataset in (local, few, Recorded(FRAMES)):
         IMAGE_READERS.prepare()

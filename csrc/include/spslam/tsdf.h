@@ -94,11 +94,11 @@ template <class Device>
 std::int64_t tsdf_touched_blocks(Device device, const PlaneFrame& frame, const TouchOptions& options,
                                  std::int32_t* coords);
 
-// Copies to `missing` [n, 3] those of n rows of block coordinates that are blocks and not in a table, in no particular
-// order; returns how many there are, for which it waits.
 inline std::int64_t tsdf_missing_workspace_bytes(std::int64_t n) {
   return (n + 1) * static_cast<std::int64_t>(sizeof(std::int32_t));
 }
+// Copies to `missing` [n, 3] those of n rows of block coordinates that are blocks and not in a table, in no particular
+// order; returns how many there are, for which it waits.
 template <class Device>
 std::int64_t tsdf_missing_blocks(Device device, const VoxelTable& table, const std::int32_t* coords, std::int64_t n,
                                  void* workspace, std::int32_t* missing);
