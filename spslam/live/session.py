@@ -38,7 +38,7 @@ from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 
-FRAME_THREADS = 4  # that share a frame beside a GPU: its sampling, and the extraction of image features
+FRAME_THREADS = 4  # that share the extraction of a frame's image features beside a GPU
 
 
 def run_live(

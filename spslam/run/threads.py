@@ -25,7 +25,7 @@ def library_threads_limited() -> Iterator[None]:
 @contextlib.contextmanager
 def kernel_threads_limited(device: torch.device, most: int = 1) -> Iterator[None]:
     """On CUDA, restricts the CPU kernels to so many threads: they only sample frames, each reading thread one of its
-    own, or a live run one at a time with several."""
+    own, and compare image features; a live run has several for a frame."""
     threads = ops.get_num_threads()
     if device.type == "cuda":
         ops.set_num_threads(min(threads, most))
