@@ -1,6 +1,7 @@
 """Asynchronous reading: frames are read, decoded, sampled and uploaded ahead of need, here or in another process."""
 
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
@@ -22,6 +23,8 @@ from spslam.slam.upload import Uploader
 MAX_WORKERS = 16
 MIN_WORKERS = 2
 MIN_AHEAD = 8
+# Frames that are taken ahead and sent to a device at a time: one by one, between other work, each would take longer.
+SENT_TOGETHER = 4
 
 
 class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
@@ -31,8 +34,8 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
     The content of the frames depends neither on the number of threads nor on their process (`run.reader`): threads of
     another process do not compete with the frame loop for Python's GIL. If `run.reader` is `auto`, a dataset that no
     other process can read is read by threads of this one; if it is `process`, that is an error. At most
-    `run.prefetch_ahead` frames exist at the same time. Another process reads the first ones while this one loads
-    kernels; threads begin when the first one is requested.
+    `run.prefetch_ahead` frames exist at the same time, and a few more that were sent to the device. Another process
+    reads the first ones while this one loads kernels; threads begin when the first one is requested.
 
     Args:
         dataset: the frames.
@@ -62,8 +65,8 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
             with self._fallback():
                 self._process = ReaderProcess.start(dataset, config, (start, processed), workers, ahead, uploader)
         self._reader: Prefetcher[PreparedFrame] | ReaderProcess | None = None
-        # The next frame, or what is to be raised instead, where it was taken ahead.
-        self._ahead: tuple[PreparedFrame | DatasetError | None, Exception | None] | None = None
+        # The next frames, or what is to be raised instead, where they were taken ahead.
+        self._ahead: deque[PreparedFrame | DatasetError | Exception] = deque()
 
     def prepare(self) -> Iterator[PreparedFrame | DatasetError]:
         """Waits until frames can be requested; reads none. Returns the iterator over the frames."""
@@ -82,7 +85,7 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
 
     def __next__(self) -> PreparedFrame | DatasetError:
         reader = self.prepare()
-        requested, started, was_there = self._record(), time.perf_counter(), self._ahead is not None
+        requested, started, was_there = self._record(), time.perf_counter(), bool(self._ahead)
         item = self._frozen.checked(self._taken_ahead() or next(reader))  # the process has checked its frames already
         if isinstance(item, DatasetError):
             return item
@@ -95,23 +98,27 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
             self._reader.want_features(wanted)
 
     def look_ahead(self) -> None:
-        """Takes the next frame from the reading process, and sends it to the device, if it is there; does not wait.
+        """Takes the next frames from the reading process, and sends them to the device, if they are there and none is
+        left of those before; does not wait.
 
-        What is wrong with it is raised where it is requested.
+        What is wrong with one is raised where it is requested.
         """
-        if self._ahead is None and isinstance(self._reader, ReaderProcess) and self._reader.is_ready():
+        if self._ahead or not isinstance(self._reader, ReaderProcess):
+            return
+        while len(self._ahead) < SENT_TOGETHER and self._reader.is_ready():
             try:
-                self._ahead = next(self._reader), None
+                self._ahead.append(next(self._reader))
             except Exception as error:
-                self._ahead = None, error
+                self._ahead.append(error)
+                return
 
     def _taken_ahead(self) -> PreparedFrame | DatasetError | None:
-        """The frame that was taken ahead; None where none was."""
-        if self._ahead is None:
+        """The first frame that was taken ahead; None where none was."""
+        if not self._ahead:
             return None
-        (item, error), self._ahead = self._ahead, None
-        if error is not None:
-            raise error
+        item = self._ahead.popleft()
+        if isinstance(item, Exception) and not isinstance(item, DatasetError):
+            raise item
         return item
 
     @contextmanager

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import time
 from collections import deque
 from collections.abc import Callable
 
@@ -19,7 +20,10 @@ from spslam.slam.system import SlamSystem
 Progress = Callable[[int, int, FrameReport | None], None]
 
 
-MOST_PENDING = 2  # frames whose reports may wait for the next frame to be tracked
+# A GPU's fast frames are logged so many at a time, or all after so many seconds: one by one, between other work, each
+# would take twice the time. That is done while the next frame is tracked; where none is, after twice as many seconds.
+LOGGED_TOGETHER = 16
+LOGGED_WITHIN_S = 0.05
 
 
 class RunLoop:
@@ -45,7 +49,7 @@ class RunLoop:
         self.system, self.feed, self.session, self.progress = system, feed, session, progress
         self.observer = observer or RunObserver()
         self._pending: deque[tuple[int, PendingReport | None]] = deque()
-        self._logs_meanwhile = False
+        self._logs_meanwhile, self._logged = False, 0.0
 
     def run(self) -> None:
         """Processes all frames, then runs the last optimization.
@@ -78,8 +82,7 @@ class RunLoop:
         done = last_saved = self.session.start
         for done, item in enumerate(self.feed, self.session.start + 1):
             self._pending.append((done, self._submit(item, done - 1)))
-            # What is done by then is logged while the device tracks the next frame, where it tracks one.
-            if not self._logs_meanwhile or len(self._pending) > MOST_PENDING:
+            if not self._logs_meanwhile or self._is_log_due(2 * LOGGED_WITHIN_S):
                 self._flush_reports(log)
             self._update_clock(done)
             if interruption.requested:
@@ -117,11 +120,17 @@ class RunLoop:
 
     def _work_ahead(self, log: RunLog) -> None:
         """What the host does while the device tracks a frame, instead of having it wait later."""
-        self._flush_reports(log)
+        if self._is_log_due(LOGGED_WITHIN_S):
+            self._flush_reports(log)
         self.feed.look_ahead()
+
+    def _is_log_due(self, seconds: float) -> bool:
+        """Whether so many frames wait to be logged, or have waited for so long, that they are now."""
+        return len(self._pending) > LOGGED_TOGETHER or time.perf_counter() - self._logged > seconds
 
     def _flush_reports(self, log: RunLog, wait: bool = False) -> None:
         """Logs the frames that the device has finished; with `wait`, waits for all of them."""
+        self._logged = time.perf_counter()
         while self._pending and (wait or self._pending[0][1] is None or self._pending[0][1].is_done()):
             done, pending = self._pending.popleft()
             report = pending.result() if pending else None

@@ -1,6 +1,5 @@
 """What processes that read send for each frame, whose pixels they leave in memory that both sides map."""
 
-from dataclasses import replace
 from typing import NamedTuple, cast
 
 import torch
@@ -57,7 +56,8 @@ class Message(NamedTuple):
 
     def pixels(self, blank: FramePixels, buffer: torch.Tensor) -> FramePixels:
         """The frame's pixels: those of a blank frame with another buffer, int32 [words]."""
-        return replace(blank, buffer=buffer, valid_depth_share=self.valid_depth_share, features=self.features)
+        shapes = blank.thumbnail_shape, blank.depth_image_shape
+        return FramePixels(buffer, blank.capacity, *shapes, self.valid_depth_share, self.features)
 
     def frame(self, pixels: FramePixels | Upload) -> PreparedFrame:
         """The frame with these pixels."""

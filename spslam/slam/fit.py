@@ -1,6 +1,7 @@
 """How well a pose fits what is known: the measures that tracking and verification take of it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +69,7 @@ def pose_variance(mean_square: float) -> float:
     return max(mean_square, LEAST_DEVIATION_M**2) / INDEPENDENT_PIXELS
 
 
-def prediction_error(predicted: list[float], pose: list[float]) -> tuple[float, float]:
+def prediction_error(predicted: Sequence[float], pose: Sequence[float]) -> tuple[float, float]:
     """Distance (cm) and angle (degrees) between two poses of seven numbers each; NaN where one of them is.
 
     As csrc/kernels/frame_outcome.h has it on a device, where a frame that is followed is decided on.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -167,7 +167,7 @@ class FramePipeline:
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
-            self.global_mapping.after_frame(number, pixels, tracked.matrix)
+            self.global_mapping.after_frame(number, pixels, tracked.numbers)
         pose = self._pose(tracked)
         iterations, loss = self._optimize(begins_map, defer_mapping, events) if is_mapped else (0, None)
         if defer_mapping:
@@ -360,11 +360,11 @@ class FramePipeline:
             events.mapping = (events.encode[1], self._record())
         return iterations, None if losses is None else fetch(losses[0])
 
-    def _pose(self, tracked: TrackedFrame) -> np.ndarray | torch.Tensor | None:
-        """The newest frame's pose, float64 [4, 4], or float32 [7] on its way to the CPU; None where it is lost."""
+    def _pose(self, tracked: TrackedFrame) -> Sequence[float] | torch.Tensor | None:
+        """The newest frame's pose, seven numbers, or float32 [7] on its way to the CPU; None where it is lost."""
         if self.state.frames.is_lost(-1):
             return None
-        return tracked.matrix if tracked.is_on_host else fetch(self.state.frames.poses[-1])
+        return tracked.numbers if tracked.is_on_host else fetch(self.state.frames.poses[-1])
 
     def _tell(self, on_pose: PoseCallback | None, tracked: TrackedFrame, lost: bool) -> None:
         if on_pose is not None:

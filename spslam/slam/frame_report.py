@@ -1,6 +1,7 @@
 """The report of a frame, which can be created before the device has finished the frame."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -138,14 +139,14 @@ class PendingReport:
         events: of the stages.
         host_wait_ms: how long the host waited for the frame to be read.
         loss: float32 [] in page-locked memory, on its way there; None where there is none.
-        pose: float64 [4, 4] T_world_camera, or float32 [7] on its way as the loss; None where the frame is lost.
+        pose: seven numbers of T_world_camera, or float32 [7] on its way as the loss; None where the frame is lost.
     """
 
     report: FrameReport
     events: FrameEvents
     host_wait_ms: float
     loss: torch.Tensor | None
-    pose: np.ndarray | torch.Tensor | None = None
+    pose: Sequence[float] | torch.Tensor | None = None
 
     def is_done(self) -> bool:
         """Whether `result()` would return at once."""
@@ -155,15 +156,10 @@ class PendingReport:
         """The whole report; waits until the device is done with the frame."""
         self.events.finished.wait()
         loss = None if self.loss is None else float(self.loss)
+        numbers = self.pose.tolist() if isinstance(self.pose, torch.Tensor) else self.pose
+        pose = None if numbers is None else pose7_to_matrix(np.array(numbers))
         times: dict[str, Any] = {**self.events.times_ms(self.host_wait_ms)}
-        return FrameReport(**{**vars(self.report), "loss": loss, "pose": pose_matrix(self.pose), **times})
-
-
-def pose_matrix(pose: np.ndarray | torch.Tensor | None) -> np.ndarray | None:
-    """float64 [4, 4] of a pose float32 [7] on the CPU; a copy of one that is a matrix already; None of None."""
-    if isinstance(pose, torch.Tensor):
-        return pose7_to_matrix(pose.numpy().astype(np.float64))
-    return None if pose is None else pose.copy()
+        return FrameReport(**{**vars(self.report), "loss": loss, "pose": pose, **times})
 
 
 def _length_ms(stage: tuple[DeviceEvent, DeviceEvent] | None) -> float:

@@ -98,7 +98,14 @@ class FramePixels:
 
     def holding(self, buffer: torch.Tensor) -> FramePixels:
         """The same in another buffer, to which the words were copied."""
-        return replace(self, buffer=buffer)
+        return FramePixels(
+            buffer,
+            self.capacity,
+            self.thumbnail_shape,
+            self.depth_image_shape,
+            self.valid_depth_share,
+            self.features,
+        )
 
     def only_images(self, copy: Callable[[torch.Tensor], torch.Tensor]) -> FramePixels:
         """Depth and intensity image without the rest, in a buffer of their own that `copy` makes of theirs."""

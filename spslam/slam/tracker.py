@@ -112,7 +112,7 @@ class FollowedFrame:
     """A frame of a moving camera that was predicted, rectified and tracked in one call.
 
     Attributes:
-        problem: the frame, as predicted motion rectifies it.
+        asked: the frame, as predicted motion rectifies it, without that motion among its constraints.
         motion: that motion.
         outcome: of the first pass.
         estimate: by the last pass.
@@ -120,12 +120,17 @@ class FollowedFrame:
         rectified: records, depth and intensity of the frame as the motion to the estimated pose rectifies them.
     """
 
-    problem: TrackingProblem
+    asked: TrackingProblem
     motion: ops.ShutterMotion
     outcome: FrameOutcome
     estimate: PoseEstimate
     first_pose: torch.Tensor
     rectified: list[torch.Tensor]
+
+    @cached_property
+    def problem(self) -> TrackingProblem:
+        """The frame, as predicted motion rectifies it; of most frames nobody asks."""
+        return replace(self.asked, constraints=replace(self.asked.constraints, shutter=self.motion))
 
 
 class Tracker:
@@ -155,13 +160,13 @@ class Tracker:
 
         Args:
             problem: the frame.
-            meanwhile: called once the device has its work, before its result is waited for; only by Gauss-Newton.
+            meanwhile: called once the device has its work, before its result is waited for.
         """
         tracking = self.config.tracking
         first = problem.frame <= tracking.first_frames
         iterations = tracking.first_iterations if first else tracking.iterations
         if tracking.optimizer == "adam":
-            return self._track_adam(problem, iterations)
+            return self._track_adam(problem, iterations, meanwhile)
         found = self._gauss_newton(problem, problem.predicted, iterations, tracking.kernel_start_m, meanwhile)
         return self.track_on(problem, found) if found.measured.is_far_from_prediction else found
 
@@ -215,7 +220,6 @@ class Tracker:
         iterations = tracking.iterations + (AGAIN_ITERATIONS if outcome == FrameOutcome.BENT else 0)
         estimate = self._estimate(found[-size:], numbers[-size:], numbers[1:8], iterations)
         motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, found[8:head])
-        constraints = replace(constraints, shutter=motion)
         problem = TrackingProblem(scene, outputs[0], predicted, number, constraints)
         return FollowedFrame(problem, motion, outcome, estimate, found[head : head + 7], outputs[1:])
 
@@ -230,7 +234,9 @@ class Tracker:
         kernel_m = self.config.tracking.kernel_end_m
         return self._gauss_newton(replace(problem, constraints=constraints), start, AGAIN_ITERATIONS, kernel_m)
 
-    def _track_adam(self, problem: TrackingProblem, iterations: int) -> PoseEstimate:
+    def _track_adam(
+        self, problem: TrackingProblem, iterations: int, meanwhile: Callable[[], None] | None
+    ) -> PoseEstimate:
         tracking = self.config.tracking
         best, _ = ops.track_adam(
             problem.scene.view(),
@@ -245,11 +251,13 @@ class Tracker:
             graph=self._graph,
         )
         # A pose that looks away from the map has no loss either, so its fit to the surface is measured all the same.
-        return replace(self.measure(problem, best), iterations=iterations)
+        return replace(self.measure(problem, best, meanwhile), iterations=iterations)
 
-    def measure(self, problem: TrackingProblem, pose: torch.Tensor) -> PoseEstimate:
-        """How well a given pose float32 [7] fits."""
-        estimate = self._gauss_newton(problem, pose, 1, self.config.tracking.kernel_end_m)
+    def measure(
+        self, problem: TrackingProblem, pose: torch.Tensor, meanwhile: Callable[[], None] | None = None
+    ) -> PoseEstimate:
+        """How well a given pose float32 [7] fits; `meanwhile` as of `track`."""
+        estimate = self._gauss_newton(problem, pose, 1, self.config.tracking.kernel_end_m, meanwhile)
         return replace(estimate, pose=pose, iterations=0, numbers=None)
 
     def _gauss_newton(

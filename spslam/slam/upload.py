@@ -44,10 +44,13 @@ class Uploader:
     def __init__(self, device: torch.device):
         self.device = device
         self._own = threading.local()
+        self._locked = 0  # where the memory begins whose pages are locked; nowhere
 
     def send(self, pixels: FramePixels) -> Upload:
         """Starts the copy and returns."""
-        source = pixels.buffer if pixels.buffer.is_pinned() else pixels.buffer.pin_memory()
+        buffer = pixels.buffer
+        is_locked = buffer.untyped_storage().data_ptr() == self._locked or buffer.is_pinned()  # to ask takes longer
+        source = buffer if is_locked else buffer.pin_memory()
         stream = self._stream()
         with torch.cuda.stream(stream):
             buffer = torch.empty(len(source), dtype=torch.int32, device=self.device)
@@ -68,14 +71,15 @@ class Uploader:
         """
         runtime = torch.cuda.cudart()
         if runtime.cudaHostRegister(memory.data_ptr(), memory.nbytes, 0) == runtime.cudaError.success:
+            self._locked = memory.untyped_storage().data_ptr()
             return True
         with contextlib.suppress(RuntimeError):
             torch.zeros(1, device=self.device)  # clears the pending error, which the next launch would report
         return False
 
-    @staticmethod
-    def unlock_pages(memory: torch.Tensor) -> None:
+    def unlock_pages(self, memory: torch.Tensor) -> None:
         """Undoes `lock_pages` where that was done; all copies must have ended."""
+        self._locked = 0
         torch.cuda.cudart().cudaHostUnregister(memory.data_ptr())
 
 

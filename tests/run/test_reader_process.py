@@ -15,7 +15,7 @@ import torch
 from spslam import helper_process
 from spslam.errors import SpslamError
 from spslam.run import frame_feed, reader_launch
-from spslam.run.frame_feed import FrameFeed
+from spslam.run.frame_feed import SENT_TOGETHER, FrameFeed
 from spslam.run.reader_launch import READERS
 from spslam.run.reader_process import ReaderProcess
 from spslam.run.reader_service import serve
@@ -173,11 +173,13 @@ def test_slots_are_freed_when_their_uploads_are_complete(can_lock, notes):
 def look_ahead(feed):
     """Waits until there is something to look at."""
     end = time.monotonic() + PATIENCE_S
-    while not feed.prepare().is_ready():
+    while not feed._ahead:
         assert time.monotonic() < end
         time.sleep(1e-3)
-    feed.look_ahead()
-    feed.look_ahead()  # changes nothing: it is held already
+        feed.look_ahead()
+    held = list(feed._ahead)
+    feed.look_ahead()  # changes nothing: they are held already
+    assert len(held) <= SENT_TOGETHER and list(feed._ahead) == held
 
 
 def test_frames_taken_ahead_are_the_same():

@@ -131,8 +131,9 @@ def test_a_pose_stays_as_it_was_found_where_tracking_on_leads_off_the_map(datase
     assert np.linalg.norm(found.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
 
 
-def test_the_host_may_work_while_a_frame_is_tracked(dataset):
-    system, states = processed(dataset, 1), []
+@pytest.mark.parametrize("preset", ["balanced", "paper"])
+def test_the_host_may_work_while_a_frame_is_tracked(dataset, preset):
+    system, states = processed(dataset, 1, preset=preset), []
     system.while_tracking = lambda: states.append(len(system.state.frames))
     for i in range(1, 4):
         system.process(dataset[i])

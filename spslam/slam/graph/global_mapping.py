@@ -10,7 +10,6 @@ what neither changes.
 from __future__ import annotations
 
 import functools
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -25,6 +24,7 @@ from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix, 
 from spslam.prior import Prior
 from spslam.scene import SparseVolume
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
+from spslam.slam.fit import prediction_error
 from spslam.slam.graph.edges import Link, LoopDecision
 from spslam.slam.graph.host_threads import give_way, host_threads
 from spslam.slam.graph.joining import Component, find_frame
@@ -70,8 +70,8 @@ class GlobalMapping:
         self._worker.submit(self._solver.prepare)
         self._running: Future[Any] | None = None  # None also after the state was loaded
         self._abandoned = threading.Event()  # of the map that is being made again
-        # The newest keyframe's number, the state's stamp when its pose was read, and that pose.
-        self._reference: tuple[int, int, np.ndarray] | None = None
+        # The newest keyframe's number, the state's stamp when its pose was read, and that pose's seven numbers.
+        self._reference: tuple[int, int, Sequence[float]] | None = None
         self._coming: tuple[int, torch.Tensor, DeviceEvent] | None = None  # the same on its way to the host
         self._next = 0  # number of the frame at which a live run may begin another solution
         self._taken_up = 0  # number of the frame after which it took up something last
@@ -138,13 +138,13 @@ class GlobalMapping:
             pose = fetch(self._state.frames.poses[newest])
             self._coming = newest, pose, event_recorder(self._state.scene.device)()
 
-    def after_frame(self, number: int, pixels: FramePixels, pose: np.ndarray) -> None:
+    def after_frame(self, number: int, pixels: FramePixels, pose: Sequence[float]) -> None:
         """Makes the newest frame a keyframe if it is far enough from the last one; else waits for no device.
 
         Args:
             number: of the frame.
             pixels: of the frame.
-            pose: float64 [4, 4] T_world_camera of the frame.
+            pose: seven numbers of the frame's T_world_camera; every frame asks, and most need no matrix.
         """
         state, store, last = self._state, self._store, self._store.newest
         if last is None:
@@ -152,7 +152,7 @@ class GlobalMapping:
             return
         known = self._last_pose(last)
         if self._is_far(known, pose):
-            moved = inverse(known) @ pose
+            moved = inverse(pose7_to_matrix(np.array(known))) @ pose7_to_matrix(np.array(pose))
             relocalized = bool(state.frames.lost[last:number].any()) or last < state.frames.opened
             store.add(ArrivingKeyframe.of(number, pixels, store.camera), Link(moved, relocalized))
             self._reference = number, state.stamp, pose
@@ -236,24 +236,24 @@ class GlobalMapping:
             return False
         return self._reference[1] == self._state.stamp or self._config.mapping.pose_rate == 0
 
-    def _last_pose(self, newest: int) -> np.ndarray:
-        """float64 [4, 4] T_world_camera of the newest keyframe, that of frame `newest`."""
+    def _last_pose(self, newest: int) -> Sequence[float]:
+        """Seven numbers of T_world_camera of the newest keyframe, that of frame `newest`."""
         if self._reference is None or not self._knows_last_pose():
             if self._coming is not None and self._coming[0] == newest:
                 _, pose, sent = self._coming
                 sent.wait()
             else:
                 pose = self._state.frames.poses[newest].cpu()
-            self._reference = newest, self._state.stamp, pose7_to_matrix(pose.double().numpy())
+            self._reference = newest, self._state.stamp, pose.tolist()
         return self._reference[2]
 
-    def _is_far(self, known: np.ndarray, pose: np.ndarray) -> bool:
-        """Whether a pose is to be a keyframe's, `known` being that of the newest one; every frame asks."""
+    def _is_far(self, known: Sequence[float], pose: Sequence[float]) -> bool:
+        """Whether a pose is to be a keyframe's, `known` being that of the newest one."""
         graph = self._config.graph
-        cosine = (float((known[:3, :3] * pose[:3, :3]).sum()) - 1) / 2
-        if cosine < math.cos(math.radians(graph.max_rotation_deg)):
+        distance_cm, angle_deg = prediction_error(known, pose)
+        if angle_deg > graph.max_rotation_deg:
             return True
-        distance = math.dist(known[:3, 3], pose[:3, 3])
+        distance = distance_cm / 100
         if distance > graph.max_translation_m:
             return True
         return distance > NEAR_SHARE * self._store.keyframes[-1].median_m

@@ -1,6 +1,7 @@
 """A frame's pose as tracking and recovery leave it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -62,9 +63,12 @@ class TrackedFrame:
     @cached_property
     def matrix(self) -> np.ndarray:
         """The pose float64 [4, 4]; waits for the device if it was not read already."""
-        if self.on_host is not None and self.is_on_host:
-            return pose7_to_matrix(np.array(self.on_host[1]))
-        return pose7_to_matrix(self.pose.cpu().double().numpy())
+        return pose7_to_matrix(np.array(self.numbers))
+
+    @cached_property
+    def numbers(self) -> Sequence[float]:
+        """The pose's seven numbers; waits for the device if they were not read already."""
+        return self.on_host[1] if self.on_host is not None and self.is_on_host else self.pose.tolist()
 
     def after(self, first: "TrackedFrame") -> "TrackedFrame":
         """This result with what was done for another one of the same frame before."""
