@@ -65,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--without-poses", action="store_true", help="the recording comes without ground truth")
     parser.add_argument("--check-only", action="store_true", help="run nothing")
     parser.add_argument("--sound", action="store_true", help="all places, motions and sensors as they are")
+    parser.add_argument("--texture", type=float, default=1.0, help="of --sound: contrast of textures, 0 to 1")
     parser.add_argument("--late", action="store_true", help="of --sound: late colors, exposure and rolling shutter")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of --sound")
     parser.add_argument("--first-seed", type=int, default=0, help="the first of them")
@@ -73,9 +74,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _places(
-    place: str, motion: str, sensor: str, frames: int, seed: int = 0, capture: Capture = PLAIN
+    place: str, motion: str, sensor: str, frames: int, seed: int = 0, texture: float = 1.0, capture: Capture = PLAIN
 ) -> PlacesDataset:
-    dataset = PlacesDataset(place, motion, sensor, frames, seed, capture=capture)
+    dataset = PlacesDataset(place, motion, sensor, frames, seed, texture, capture)
     dataset.depth_range = DEPTH_RANGE_M
     return dataset
 
@@ -170,7 +171,8 @@ def _false_alarms(args: argparse.Namespace) -> list[dict]:
     rows = []
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for place, motion, sensor, seed in itertools.product(PLACES, MOTIONS, SENSORS, seeds):
-        dataset: RgbdDataset = _places(place, motion, sensor, 600, seed, LATE if args.late else PLAIN)
+        capture = LATE if args.late else PLAIN
+        dataset: RgbdDataset = _places(place, motion, sensor, 600, seed, args.texture, capture)
         began = time.process_time()
         row = {"name": dataset.name, **_verdict(check_first_frames(dataset)), "seconds": time.process_time() - began}
         rows.append(row)

@@ -9,7 +9,7 @@ import pytest
 from experiments.fault_injection import black_out, cover_garbage, cover_near, cover_wall
 from experiments.wrong_inputs import LATE
 from experiments.wrong_recordings import FAULTS, Fault, WrongRecording
-from spslam.datasets.base import RgbdDataset
+from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.places import Capture, PlacesDataset
 from spslam.datasets.plausibility import Finding, check_first_frames, folded, require_sound
 from spslam.datasets.plausibility.edges import TURNS, EdgeMatch
@@ -18,7 +18,7 @@ from spslam.datasets.plausibility.intrinsics import CERTAIN_SIGMAS, estimate_len
 from spslam.datasets.plausibility.lens import FOCAL, RADIAL, SHIFT_X, Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
 from spslam.datasets.plausibility.tracks import Followed, follow
-from spslam.datasets.plausibility.views import read_views
+from spslam.datasets.plausibility.views import View, read_views
 from spslam.errors import DatasetError
 
 FRAMES = 60
@@ -351,6 +351,25 @@ def test_sound_places_pass(place, sensor):
     recording = PlacesDataset(place, "walking", sensor, 300, seed=5, capture=Capture(color_noise=2))
     recording.depth_range = (0.1, 10.0)
     assert check_first_frames(recording) == []
+
+
+@pytest.mark.parametrize(("motion", "seed"), [("walking", 101), ("handheld", 103)])
+def test_a_sound_place_without_texture_passes(motion, seed):
+    """Its best corners lie on edges, along which they were followed to anywhere: the first one was refused."""
+    assert check_first_frames(PlacesDataset("stairwell", motion, "structured_light", 200, seed, texture=0.0)) == []
+
+
+def test_points_on_edges_and_of_noise_are_not_followed():
+    def view(gray):
+        return View.of(RgbdFrame(0, 0.0, np.stack([gray] * 3, -1).astype(np.uint8), np.ones(gray.shape, np.float32)))
+
+    row, column = np.mgrid[:240, :320]
+    random = np.random.default_rng(0)
+    edge = np.where(column + 0.21 * row > 200, 170.0, 90.0)
+    squares = np.where((column // 20 + row // 20) % 2, 170.0, 90.0)
+    for image, is_followed in ((edge, False), (np.full(edge.shape, 128.0), False), (squares, True)):
+        noisy = image + random.normal(0, 2, image.shape)
+        assert bool(follow([view(noisy)] * 2).segments) == is_followed
 
 
 @pytest.mark.slow

@@ -1,7 +1,10 @@
 """Points of the color images followed from view to view by optical flow.
 
 Shi and Tomasi, *Good Features to Track*, CVPR 1994; Lucas and Kanade with pyramids (J.-Y. Bouguet, Intel, 2000), each
-point also followed back, and kept if it returns.
+point also followed back, and kept if it returns. Where an image has next to no texture, its best corners are noise, or
+stairs of pixels on an edge, along which flow goes anywhere and back: so a point must be located in every direction, by
+more than the image's noise, whose deviation is taken from second differences (J. Immerkaer, *Fast Noise Variance
+Estimation*, CVIU 1996).
 """
 
 from __future__ import annotations
@@ -15,11 +18,18 @@ import numpy as np
 from spslam.datasets.plausibility.views import View
 
 _MOST_POINTS, _QUALITY, _DISTANCE_PX = 300, 0.01, 8
+_MOST_LOCATED = 0.8  # robust fits bear the others, and see more of the image with them
 # A segment needs this many points, and this share of those that it began with: what is left must still cover the image.
 _LEAST_POINTS, _KEPT_SHARE = 50, 0.35
 _MOST_STEPS = 8
 _RETURN_PX = 0.5
 _WINDOW_PX, _LEVELS = 15, 3
+# By noise, a point is followed with a deviation of at most this in every direction; and edges, whose stairs of pixels
+# stay where they are, are told from corners as by D. Lowe, *Distinctive Image Features*, IJCV 2004, section 4.1.
+_DEVIATION_PX, _LEAST_RATIO = 0.2, 0.1
+_SECOND_DIFFERENCES = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)  # noise of deviation 1 becomes one of 6
+_LEAST_NOISE = 0.3  # of a rounded image
+_MEDIAN_TO_DEVIATION = 1.4826
 _STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 15, 0.03)
 
 
@@ -46,8 +56,8 @@ class Tracks:
 
     Attributes:
         segments: one after another; each begins where the one before ends or was lost.
-        steps: number of steps from a view with enough features to the next one.
-        broken: how many of them no segment could take.
+        steps: number of steps from a view with enough features to the next one, of which most were followed or lost.
+        broken: in how many of them most were lost.
     """
 
     segments: list[Segment]
@@ -83,8 +93,9 @@ def follow(views: Sequence[View], followed: Followed | None = None) -> Tracks:
             first += 1
             continue
         segment = _longest(views, first, points, followed)
-        if segment is None:
-            steps, broken, first = steps + 1, broken + 1, first + 1
+        if segment is None:  # most points were lost, or there are few
+            is_broken = np.mean(followed.steps[first, first + 1][1]) < _KEPT_SHARE
+            steps, broken, first = steps + is_broken, broken + is_broken, first + 1
         else:
             segments.append(segment)
             steps, first = steps + segment.last - segment.first, segment.last
@@ -93,9 +104,32 @@ def follow(views: Sequence[View], followed: Followed | None = None) -> Tracks:
 
 def _points(views: Sequence[View], first: int, followed: Followed) -> np.ndarray | None:
     if first not in followed.points:
-        found = cv2.goodFeaturesToTrack(views[first].gray, _MOST_POINTS, _QUALITY, _DISTANCE_PX)
+        gray = views[first].gray
+        found = cv2.goodFeaturesToTrack(gray, _MOST_POINTS, _QUALITY, _DISTANCE_PX)
+        if found is not None:
+            are_located = _are_located(gray, found)
+            found = found if np.mean(are_located) > _MOST_LOCATED else found[are_located]
         followed.points[first] = found
     return followed.points[first]
+
+
+def _are_located(gray: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether flow can follow points [N, 1, 2] in every direction: bool [N].
+
+    Flow is the least-squares solution of gradients times displacement = difference of the images over the window, so
+    its covariance is 2 s^2 inv(T), s being the noise and T the sum of the gradients' outer products, less the s^2 / 2
+    that noise adds to each of their squares.
+    """
+    image = gray.astype(np.float32)
+    noise = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(cv2.filter2D(image, -1, _SECOND_DIFFERENCES)))) / 6
+    variance, window = max(noise, _LEAST_NOISE) ** 2, (_WINDOW_PX, _WINDOW_PX)
+    dx, dy = (cv2.Sobel(image, -1, *order, ksize=1, scale=0.5) for order in ((1, 0), (0, 1)))
+    column, row = np.rint(points[:, 0]).astype(int).T
+    xx, xy, yy = (
+        cv2.boxFilter(product, -1, window, normalize=False)[row, column] for product in (dx * dx, dx * dy, dy * dy)
+    )
+    mean, half = (xx + yy) / 2 - _WINDOW_PX**2 * variance / 2, np.hypot((xx - yy) / 2, xy)
+    return (mean - half > 2 * variance / _DEVIATION_PX**2) & (mean - half > _LEAST_RATIO * (mean + half))
 
 
 def _longest(views: Sequence[View], first: int, points: np.ndarray, followed: Followed) -> Segment | None:
