@@ -359,6 +359,18 @@ def test_a_sound_place_without_texture_passes(motion, seed):
     assert check_first_frames(PlacesDataset("stairwell", motion, "structured_light", 200, seed, texture=0.0)) == []
 
 
+def test_color_of_another_time_is_a_doubt_with_that_time():
+    arcade = PlacesDataset("arcade", "handheld", "structured_light", 60, seed=0)
+    assert check_first_frames(arcade) == []
+    late = found(WrongRecording(arcade, FAULTS["color 5 frames late"]))["pairing"]
+    assert "color images look taken 0.17 s before their depth images" in late.text and not late.certain
+
+
+def test_color_may_be_as_late_as_tracking_measures():
+    arcade = PlacesDataset("arcade", "handheld", "structured_light", 60, seed=0, capture=Capture(color_delay_ms=70))
+    assert check_first_frames(arcade) == []
+
+
 def test_points_on_edges_and_of_noise_are_not_followed():
     def view(gray):
         return View.of(RgbdFrame(0, 0.0, np.stack([gray] * 3, -1).astype(np.uint8), np.ones(gray.shape, np.float32)))

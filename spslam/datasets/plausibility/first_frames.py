@@ -28,6 +28,7 @@ from spslam.datasets.plausibility.streams import (
 )
 from spslam.datasets.plausibility.support import PREFERRED, depth_prefers, is_supported
 from spslam.datasets.plausibility.tracks import Followed, Segment, Tracks, follow
+from spslam.datasets.plausibility.turning import lag_findings
 from spslam.datasets.plausibility.views import SECONDS_BETWEEN_VIEWS, Stretch, View, read_views, stretch_of, view_stride
 from spslam.errors import DatasetError
 
@@ -128,6 +129,8 @@ def judge(dataset: RgbdDataset, views: Sequence[View], followed: Followed | None
     findings += _broken_findings(tracks)
     if estimate is not None:
         findings += _geometry_findings(stretch, segments, points, estimate, dataset)
+    if not any(finding.kind == "pairing" for finding in findings):
+        findings += lag_findings(views, lens, followed)
     return Judgment(folded(findings), estimate is not None and estimate.is_settled, estimate)
 
 

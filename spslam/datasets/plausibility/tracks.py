@@ -72,10 +72,12 @@ class Followed:
     Attributes:
         points: of a view, by its number.
         steps: where the points that began in one view came to in another, and which returned; by both numbers.
+        turns: of `lag_findings`: how the depth image of a view turned to the next one's, by its number.
     """
 
     points: dict[int, np.ndarray | None] = field(default_factory=dict)
     steps: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    turns: dict[int, np.ndarray] = field(default_factory=dict)
 
 
 def follow(views: Sequence[View], followed: Followed | None = None) -> Tracks:
@@ -100,6 +102,21 @@ def follow(views: Sequence[View], followed: Followed | None = None) -> Tracks:
             segments.append(segment)
             steps, first = steps + segment.last - segment.first, segment.last
     return Tracks(segments, steps, broken)
+
+
+def follow_once(views: Sequence[View], followed: Followed) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points followed from each view to the next one: float64 [N, 2] (u, v) in both, N may be 0; as of `follow`."""
+    pairs = []
+    for first in range(len(views) - 1):
+        points = _points(views, first, followed)
+        if points is None or len(points) == 0:
+            pairs.append((np.zeros((0, 2)), np.zeros((0, 2))))
+            continue
+        if (first, first + 1) not in followed.steps:
+            followed.steps[first, first + 1] = _step(views[first].gray, views[first + 1].gray, points)
+        there, kept = followed.steps[first, first + 1]
+        pairs.append((points[kept][:, 0].astype(np.float64), there[kept][:, 0].astype(np.float64)))
+    return pairs
 
 
 def _points(views: Sequence[View], first: int, followed: Followed) -> np.ndarray | None:
