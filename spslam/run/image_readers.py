@@ -87,20 +87,19 @@ def launch() -> LaunchedReaders:
     count = min(3 * usable_cores() // 4, MAX_READERS)
     if count < MIN_READERS:
         raise OSError(f"{usable_cores()} cores are too few for {MIN_READERS} processes")
-    with contextlib.ExitStack() as theirs:
-        pairs = [Pipe() for _ in range(count)]
+    with contextlib.ExitStack() as theirs, contextlib.ExitStack() as ours:
         shared = os.memfd_create("spslam-images")
-        for _, other in pairs:
+        ours.callback(os.close, shared)
+        own, ends = [], [shared]
+        for _ in range(count):
+            mine, other = Pipe()
+            ours.callback(mine.close)
             theirs.callback(other.close)
-        try:
-            ends = tuple(other.fileno() for _, other in pairs)
-            helper = HelperProcess.launch(SERVICE_MODULE, SERVICE_FUNCTION, READER_ENVIRONMENT, (shared, *ends))
-        except BaseException:
-            os.close(shared)
-            for own, _ in pairs:
-                own.close()
-            raise
-    return LaunchedReaders(helper, tuple(own for own, _ in pairs), shared)
+            own.append(mine)
+            ends.append(other.fileno())
+        helper = HelperProcess.launch(SERVICE_MODULE, SERVICE_FUNCTION, READER_ENVIRONMENT, tuple(ends))
+        ours.pop_all()
+    return LaunchedReaders(helper, tuple(own), shared)
 
 
 IMAGE_READERS = Standby(launch)

@@ -185,6 +185,22 @@ def test_data_that_can_not_be_shared_out_is_read_as_it_is():
         assert readable.readers == 0
 
 
+def test_what_can_not_be_started_leaves_nothing_open(monkeypatch):
+    pipes = iter([image_readers.Pipe, image_readers.Pipe])
+
+    def few_pipes():
+        try:
+            return next(pipes)()
+        except StopIteration:
+            raise OSError("too many open files") from None
+
+    monkeypatch.setattr(image_readers, "Pipe", few_pipes)
+    before = set(os.listdir("/proc/self/fd"))
+    with pytest.raises(OSError, match="too many open files"):
+        launch()
+    assert set(os.listdir("/proc/self/fd")) == before
+
+
 def test_processes_on_standby_are_used():
     IMAGE_READERS.prepare()
     waiting = IMAGE_READERS.waiting
