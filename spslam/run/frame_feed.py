@@ -97,6 +97,11 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         if isinstance(self._reader, ReaderProcess):
             self._reader.want_features(wanted)
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether the next frame of a reading process is there; False where threads read."""
+        return bool(self._ahead) or (isinstance(self._reader, ReaderProcess) and self._reader.is_ready())
+
     def look_ahead(self) -> None:
         """Takes the next frames from the reading process, and sends them to the device, if they are there and none is
         left of those before; does not wait.
@@ -105,7 +110,8 @@ class FrameFeed(Iterator[PreparedFrame | DatasetError], AbstractContextManager):
         """
         if self._ahead or not isinstance(self._reader, ReaderProcess):
             return
-        while len(self._ahead) < SENT_TOGETHER and self._reader.is_ready():
+        most = max(min(SENT_TOGETHER, self._reader.slots // 2), 1)  # the process needs some while these are held
+        while len(self._ahead) < most and self._reader.is_ready():
             try:
                 self._ahead.append(next(self._reader))
             except Exception as error:

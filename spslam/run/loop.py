@@ -21,7 +21,8 @@ Progress = Callable[[int, int, FrameReport | None], None]
 
 
 # A GPU's fast frames are logged so many at a time, or all after so many seconds: one by one, between other work, each
-# would take twice the time. That is done while the next frame is tracked; where none is, after twice as many seconds.
+# would take twice the time. That is done while the next frame is tracked; where none is, after twice as many seconds,
+# or while the next one is waited for.
 LOGGED_TOGETHER = 16
 LOGGED_WITHIN_S = 0.05
 
@@ -82,7 +83,7 @@ class RunLoop:
         done = last_saved = self.session.start
         for done, item in enumerate(self.feed, self.session.start + 1):
             self._pending.append((done, self._submit(item, done - 1)))
-            if not self._logs_meanwhile or self._is_log_due(2 * LOGGED_WITHIN_S):
+            if not self._logs_meanwhile or self._is_log_due(2 * LOGGED_WITHIN_S) or not self.feed.is_ready:
                 self._flush_reports(log)
             self._update_clock(done)
             if interruption.requested:
@@ -94,6 +95,7 @@ class RunLoop:
             if interruption.requested:
                 break
         if interruption.requested:
+            self._flush_reports(log, wait=True)
             if every > 0:
                 self._save(done, log, writer)
             raise KeyboardInterrupt

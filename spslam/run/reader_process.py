@@ -139,6 +139,11 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         """Says whether image features of frames that are read from now on will probably be asked for."""
         self._wanted[0] = wanted
 
+    @property
+    def slots(self) -> int:
+        """How many frames the shared memory holds; one's slot is free again once another is taken after its upload."""
+        return len(self._memory)
+
     def is_ready(self) -> bool:
         """Whether the next frame, or what there is instead, is there; to be asked after `wait_until_ready`."""
         return not self._has_ended and not self._connection.closed and bool(self._poll.poll(0))

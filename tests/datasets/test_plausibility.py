@@ -18,6 +18,7 @@ from spslam.datasets.plausibility.intrinsics import CERTAIN_SIGMAS, estimate_len
 from spslam.datasets.plausibility.lens import FOCAL, RADIAL, SHIFT_X, Lens
 from spslam.datasets.plausibility.pairing import pairing_findings
 from spslam.datasets.plausibility.tracks import Followed, follow
+from spslam.datasets.plausibility.turning import lag_findings
 from spslam.datasets.plausibility.views import View, read_views
 from spslam.errors import DatasetError
 
@@ -364,6 +365,15 @@ def test_color_of_another_time_is_a_doubt_with_that_time():
     assert check_first_frames(arcade) == []
     late = found(WrongRecording(arcade, FAULTS["color 5 frames late"]))["pairing"]
     assert "color images look taken 0.17 s before their depth images" in late.text and not late.certain
+
+
+@pytest.mark.parametrize("unit", [0.0, 1e3])
+def test_time_stamps_in_other_units_say_nothing_of_a_lag(unit):
+    arcade = PlacesDataset("arcade", "handheld", "structured_light", 60, seed=0)
+    late = read_views(WrongRecording(arcade, FAULTS["color 5 frames late"]), range(0, 48, 2))
+    lens = Lens(arcade.camera, 3.0)
+    assert [finding.kind for finding in lag_findings(late, lens)] == ["pairing"]
+    assert lag_findings([replace(view, timestamp=unit * view.timestamp) for view in late], lens) == []
 
 
 def test_color_may_be_as_late_as_tracking_measures():

@@ -17,10 +17,11 @@ from spslam.datasets.plausibility.flow_fit import Points, depth_at, fit_flows
 from spslam.datasets.plausibility.lens import Lens
 from spslam.datasets.plausibility.surface_fit import Surface, fit_surfaces
 from spslam.datasets.plausibility.tracks import Followed, follow_once
-from spslam.datasets.plausibility.views import SECONDS_BETWEEN_VIEWS, View
+from spslam.datasets.plausibility.views import View
 
 # As MAX_COLOR_DELAY_S of spslam/slam/color_motion.py: tracking measures smaller ones.
 _LEAST_LAG_S = 0.1
+_MOST_SECONDS = 5.0  # from view to view; larger steps come from other units
 _MOST_LAG, _LAG_STEP = 4.0, 0.25  # in views
 _LEAST_PAIRS, _LEAST_POINTS = 10, 30
 # The median difference of turns: at the lag found, as a share of what it is without, and as a share of the turns.
@@ -31,10 +32,13 @@ def lag_findings(views: Sequence[View], lens: Lens, followed: Followed | None = 
     """Whether color and depth images look taken at different times; a doubt.
 
     Args:
-        views: in order.
+        views: two or more, in order; nothing is said where their time stamps can't be seconds.
         lens: as the recording says.
         followed: as of `follow`.
     """
+    between = float(np.median(np.diff([view.timestamp for view in views])))
+    if not 0 < between < _MOST_SECONDS:
+        return []
     followed = followed or Followed()
     color, depth = _turns_of_color(views, lens, followed), _turns_of_depth(views, lens, followed)
     lags = np.arange(-_MOST_LAG, _MOST_LAG + _LAG_STEP / 2, _LAG_STEP)
@@ -42,7 +46,7 @@ def lag_findings(views: Sequence[View], lens: Lens, followed: Followed | None = 
     if not np.isfinite(apart).any():
         return []
     best, given = int(np.nanargmin(apart)), apart[len(lags) // 2]
-    seconds = lags[best] * _seconds_between(views)
+    seconds = lags[best] * between
     is_inside = 0 < best < len(lags) - 1
     turned = float(np.nanmedian(np.linalg.norm(color, axis=1)))
     is_clear = apart[best] < _BETTER * given and apart[best] < _EXPLAINED * turned
@@ -91,9 +95,3 @@ def _difference(color: np.ndarray, depth: np.ndarray, lag: float) -> float:
     apart = np.linalg.norm(color[inside] - between, axis=1)
     known = apart[np.isfinite(apart)]
     return float(np.median(known)) if len(known) >= _LEAST_PAIRS else np.nan
-
-
-def _seconds_between(views: Sequence[View]) -> float:
-    """From view to view; as they are meant to be apart where time stamps do not ascend."""
-    seconds = float(np.median(np.diff([view.timestamp for view in views])))
-    return seconds if seconds > 0 else SECONDS_BETWEEN_VIEWS
