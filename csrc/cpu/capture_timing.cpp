@@ -1,5 +1,8 @@
 #include "kernels/capture_timing.h"
 
+#include <algorithm>
+
+#include "cpu/keyframe_prefetch.h"
 #include "cpu/term_sums.h"
 
 namespace spslam {
@@ -25,9 +28,16 @@ void measure_capture_timing<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t n
     const MovingKeyframe keyframe = load_moving_keyframe(keyframes, k);
     double terms[kTimingTerms];
     const auto add = [&](std::int64_t begin, std::int64_t end, double* own) {
-      for (std::int64_t i = begin; i < end; ++i) {
-        add_timing_residuals(keyframes, keyframe, frame, unpack_pixel(pixels + kPixelWords * i), intrinsics, sensor,
-                             own);
+      for (std::int64_t first = begin; first < end; first += kPointsAhead) {
+        const std::int64_t last = std::min(first + kPointsAhead, end);
+        for (std::int64_t i = first; i < last; ++i) {
+          const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
+          prefetch_keyframe(keyframes, keyframe.keyframe, surface_point(pixel, frame.pose, intrinsics).world);
+        }
+        for (std::int64_t i = first; i < last; ++i) {
+          add_timing_residuals(keyframes, keyframe, frame, unpack_pixel(pixels + kPixelWords * i), intrinsics, sensor,
+                               own);
+        }
       }
     };
     sum_terms<kTimingTerms>(num_pixels, kPixelGrain, static_cast<double*>(workspace), terms, add);

@@ -1,6 +1,9 @@
 #include "kernels/sensor_noise.h"
 
+#include <algorithm>
+
 #include "core/parallel.h"
+#include "cpu/keyframe_prefetch.h"
 
 namespace spslam {
 namespace {
@@ -20,12 +23,21 @@ void measure_noise<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t num_pixels
   // Whole numbers: their sums do not depend on the order.
   const auto add = [counts](std::int64_t at) { __atomic_fetch_add(counts + at, kResidualCount, __ATOMIC_RELAXED); };
   parallel_for(num_pixels, kPixelGrain, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
-      if (!(pixel.depth > 0.0f)) continue;
-      const PixelPoints points =
-          pixel_points(pixel, surface_point(pixel, T_world_camera, intrinsics), color, intrinsics);
-      for (int k = 0; k < keyframes.count; ++k) count_residuals(keyframes, loaded[k], pixel, points, add);
+    Pixel ahead[kPointsAhead];
+    PixelPoints points[kPointsAhead];
+    for (std::int64_t first = begin; first < end; first += kPointsAhead) {
+      int count = 0;
+      for (std::int64_t i = first; i < std::min(first + kPointsAhead, end); ++i) {
+        const Pixel pixel = unpack_pixel(pixels + kPixelWords * i);
+        if (!(pixel.depth > 0.0f)) continue;
+        ahead[count] = pixel;
+        points[count] = pixel_points(pixel, surface_point(pixel, T_world_camera, intrinsics), color, intrinsics);
+        for (int k = 0; k < keyframes.count; ++k) prefetch_keyframe(keyframes, loaded[k], points[count].depth.world);
+        ++count;
+      }
+      for (int p = 0; p < count; ++p) {
+        for (int k = 0; k < keyframes.count; ++k) count_residuals(keyframes, loaded[k], ahead[p], points[p], add);
+      }
     }
   });
   for (int histogram = 0; histogram < kNoiseHistograms; ++histogram) {
