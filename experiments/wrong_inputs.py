@@ -66,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--check-only", action="store_true", help="run nothing")
     parser.add_argument("--sound", action="store_true", help="all places, motions and sensors as they are")
     parser.add_argument("--texture", type=float, default=1.0, help="of --sound: contrast of textures, 0 to 1")
+    parser.add_argument("--fault", choices=FAULTS, help="of --sound: what is wrong with all of them instead")
     parser.add_argument("--late", action="store_true", help="of --sound: late colors, exposure and rolling shutter")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of --sound")
     parser.add_argument("--first-seed", type=int, default=0, help="the first of them")
@@ -173,6 +174,8 @@ def _false_alarms(args: argparse.Namespace) -> list[dict]:
     for place, motion, sensor, seed in itertools.product(PLACES, MOTIONS, SENSORS, seeds):
         capture = LATE if args.late else PLAIN
         dataset: RgbdDataset = _places(place, motion, sensor, 600, seed, args.texture, capture)
+        if args.fault is not None:
+            dataset = WrongRecording(dataset, FAULTS[args.fault])
         began = time.process_time()
         row = {"name": dataset.name, **_verdict(check_first_frames(dataset)), "seconds": time.process_time() - began}
         rows.append(row)

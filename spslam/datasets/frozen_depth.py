@@ -100,9 +100,8 @@ class ArrivingFrozenDepth:
         """Whether there is depth, and the same as in the frame kept."""
         rows, kept = frame.depth[::_DEPTH_ROW_STEP], self._depth
         middle = len(rows) // 2
-        if (
-            kept is None or rows[middle].tobytes() != kept[middle].tobytes()
-        ):  # an image that is the same has the same bits
+        # An image that is the same has the same bits.
+        if kept is None or rows[middle].tobytes() != kept[middle].tobytes():
             return False
         return np.array_equal(rows, kept, equal_nan=True) and bool(rows.any())
 

@@ -112,9 +112,7 @@ def follow_once(views: Sequence[View], followed: Followed) -> list[tuple[np.ndar
         if points is None or len(points) == 0:
             pairs.append((np.zeros((0, 2)), np.zeros((0, 2))))
             continue
-        if (first, first + 1) not in followed.steps:
-            followed.steps[first, first + 1] = _step(views[first].gray, views[first + 1].gray, points)
-        there, kept = followed.steps[first, first + 1]
+        there, kept = _step(views, (first, first), points, followed)
         pairs.append((points[kept][:, 0].astype(np.float64), there[kept][:, 0].astype(np.float64)))
     return pairs
 
@@ -153,9 +151,7 @@ def _longest(views: Sequence[View], first: int, points: np.ndarray, followed: Fo
     least = max(_LEAST_POINTS, _KEPT_SHARE * len(points))
     begin, here, segment = points, points, None
     for view in range(first, min(first + _MOST_STEPS, len(views) - 1)):
-        if (first, view + 1) not in followed.steps:
-            followed.steps[first, view + 1] = _step(views[view].gray, views[view + 1].gray, here)
-        there, kept = followed.steps[first, view + 1]
+        there, kept = _step(views, (first, view), here, followed)
         if np.count_nonzero(kept) < least:
             break
         begin, here = begin[kept], there[kept]
@@ -163,7 +159,17 @@ def _longest(views: Sequence[View], first: int, points: np.ndarray, followed: Fo
     return segment
 
 
-def _step(image: np.ndarray, following: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _step(
+    views: Sequence[View], numbers: tuple[int, int], here: np.ndarray, followed: Followed
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points that began in a view come to from another one to the next, and which return; by both numbers."""
+    begin, view = numbers
+    if (begin, view + 1) not in followed.steps:
+        followed.steps[begin, view + 1] = _there_and_back(views[view].gray, views[view + 1].gray, here)
+    return followed.steps[begin, view + 1]
+
+
+def _there_and_back(image: np.ndarray, following: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     there, found = _flow(image, following, points)
     back, found_back = _flow(following, image, there)
     returned = np.abs(back - points).reshape(len(points), 2).max(axis=1) < _RETURN_PX
