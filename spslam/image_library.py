@@ -1,4 +1,4 @@
-"""Compiled functions on images and meshes, without torch, which is still being loaded when data is looked at.
+"""Compiled functions on images, poses and meshes, without torch, which is still being loaded when data is looked at.
 
 There is a library for each instruction set, of which the best that this processor has is loaded at the first call;
 `SPSLAM_CPU_ISA` (baseline, avx2 or avx512) overrides the choice, as it does for `spslam.ops`.
@@ -79,6 +79,8 @@ def _declare(library: ctypes.CDLL) -> None:
     library.spslam_hold_pose.restype = count
     library.spslam_rectify_features.argtypes = [pointer, pointer, count, *[pointer] * 4]
     library.spslam_rectify_features.restype = None
+    library.spslam_least_eigenvalue.argtypes = [ctypes.c_char_p]
+    library.spslam_least_eigenvalue.restype = number
     library.spslam_rasterize.argtypes = [pointer, pointer, count, pointer, pointer, integer, pointer, pointer]
     library.spslam_rastered_surface.argtypes = [pointer, pointer, count, *[pointer] * 7]
     library.spslam_light_pixels.argtypes = [pointer, count, *[pointer] * 3, integer, pointer]

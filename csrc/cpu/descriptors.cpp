@@ -10,14 +10,15 @@ constexpr std::int64_t kGrain = 16;
 constexpr int kOrbWords = 4;
 
 template <int Words>
-void find(const Descriptors& descriptors, const Descriptors& others, std::int32_t words, std::int64_t* nearest,
+void find(const Descriptors& descriptors, const DescriptorGroups& others, std::int32_t words, std::int64_t* nearest,
           std::int32_t* distances) {
-  parallel_for(descriptors.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(others.count * descriptors.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
-      const std::uint64_t* one = descriptors.words + i * words;
+      const Descriptors& group = others.of[i / descriptors.count];
+      const std::uint64_t* one = descriptors.words + i % descriptors.count * words;
       TwoNearest found(words);
-      for (std::int64_t m = 0; m < others.count; ++m) {
-        found.show(hamming_distance<Words>(one, others.words + m * words, words), m);
+      for (std::int64_t m = 0; m < group.count; ++m) {
+        found.show(hamming_distance<Words>(one, group.words + m * words, words), m);
       }
       nearest[i] = found.place;
       distances[2 * i] = found.first;
@@ -29,7 +30,7 @@ void find(const Descriptors& descriptors, const Descriptors& others, std::int32_
 }  // namespace
 
 template <>
-void nearest_descriptors<Cpu>(Cpu, const Descriptors& descriptors, const Descriptors& others, std::int32_t words,
+void nearest_descriptors<Cpu>(Cpu, const Descriptors& descriptors, const DescriptorGroups& others, std::int32_t words,
                               std::int64_t* nearest, std::int32_t* distances) {
   if (words == kOrbWords) return find<kOrbWords>(descriptors, others, words, nearest, distances);
   find<0>(descriptors, others, words, nearest, distances);

@@ -208,7 +208,7 @@ class LiveLoop:
 
     def _write_row(self, log: RunLog) -> None:
         if self._row is not None:
-            log.append(self._row.values())
+            log.append([self._row.values()])
             self._row = None
 
     def _dropped(self) -> int:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 # Of the tensors that tracking returns: numbers of a pose and H, of the statistics of an iteration (kFrameStatSize of
 # csrc/include/spslam/gauss_newton.h), and of what stands before both in `track_frame`.
 FOUND_NUMBERS, STATISTICS, FOLLOWED_HEAD = 43, 7, 9
+_POSE = 7
+DESCRIPTOR_GROUPS = 16  # kMaxDescriptorGroups of csrc/include/spslam/descriptors.h
 
 
 class MovingFrame(NamedTuple):
@@ -53,6 +55,33 @@ class MovingFrame(NamedTuple):
     size: tuple[int, int]
     image_intrinsics: Intrinsics
     unit: float
+
+
+class FollowedParts(NamedTuple):
+    """Views of the numbers that `track_frame` returns, float32.
+
+    Attributes:
+        predicted, first_pose, pose: [7], predicted, by the first pass and by the last.
+        readout: [1] s.
+        gain: [2] of the frame at the last pose.
+        last_size: how many of the numbers, at the end, are of the last pass.
+    """
+
+    predicted: torch.Tensor
+    readout: torch.Tensor
+    first_pose: torch.Tensor
+    pose: torch.Tensor
+    gain: torch.Tensor
+    last_size: int
+
+
+def followed_parts(found: torch.Tensor, again_iterations: int) -> FollowedParts:
+    """The parts of what `track_frame` returns, by one call: each slice for itself takes as long as all."""
+    last = FOUND_NUMBERS + STATISTICS * again_iterations
+    between = len(found) - FOLLOWED_HEAD - _POSE - last
+    sizes = [1, _POSE, 1, _POSE, between, _POSE, last - _POSE - 2, 2]
+    _, predicted, readout, first_pose, _, pose, _, gain = found.split_with_sizes(sizes)
+    return FollowedParts(predicted, readout, first_pose, pose, gain, last)
 
 
 _NO_REFERENCE: tuple[list, list] = ([], [])
@@ -270,6 +299,21 @@ def unproject_pixels(
     return torch.ops.spslam.unproject_pixels(records, normals, pose, *intrinsics)
 
 
+def nearest_in_groups(descriptors: torch.Tensor, others: torch.Tensor, sizes: Sequence[int]) -> torch.Tensor:
+    """`nearest_descriptors` in each of several groups, in one call.
+
+    Args:
+        descriptors: uint8 [N, B], as there.
+        others: uint8 [M, B] of all groups, one after the other, on the same device.
+        sizes: how many each of the G groups has, M in all; G is at most `DESCRIPTOR_GROUPS`.
+
+    Returns:
+        int64 [2, G, N], so that the host reads all in one go: the rows in the groups, and the two distances, of 32 bits
+        each, the one to the nearest in the lower half.
+    """
+    return torch.ops.spslam.nearest_in_groups(descriptors, others, sizes)
+
+
 def optimize_map_(
     scene: SceneView,
     records: torch.Tensor,
@@ -319,6 +363,11 @@ def _(scene, scene_scalars, plane_layout, frame, scalars, integers, *others):
 @torch.library.register_fake("spslam::predict_frame")
 def _(poses, last, readout, records, *_):
     return poses.new_empty(7), torch.empty_like(readout), torch.empty_like(records)
+
+
+@torch.library.register_fake("spslam::nearest_in_groups")
+def _(descriptors, _, sizes):
+    return descriptors.new_empty(2, len(sizes), len(descriptors), dtype=torch.int64)
 
 
 @torch.library.register_fake("spslam::measure_frame_")

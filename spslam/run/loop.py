@@ -133,11 +133,15 @@ class RunLoop:
     def _flush_reports(self, log: RunLog, wait: bool = False) -> None:
         """Logs the frames that the device has finished; with `wait`, waits for all of them."""
         self._logged = time.perf_counter()
-        while self._pending and (wait or self._pending[0][1] is None or self._pending[0][1].is_done()):
-            done, pending = self._pending.popleft()
-            report = pending.result() if pending else None
+        reports: list[tuple[int, FrameReport | None]] = []
+        try:
+            while self._pending and (wait or self._pending[0][1] is None or self._pending[0][1].is_done()):
+                done, pending = self._pending.popleft()
+                reports.append((done, pending.result() if pending else None))
+        finally:
+            log.append([report.log_row() for _, report in reports if report])
+        for done, report in reports:
             if report:
-                log.append(report.log_row())
                 self.observer.observe(report)
             if self.progress:
                 self.progress(done, self.session.total, report)

@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
@@ -31,7 +31,7 @@ _PREVIEW_THREADS = 4  # that encode images, one frame each
 
 
 class RunLog(contextlib.AbstractContextManager):
-    """log.jsonl, open to append rows; each is written out at once.
+    """log.jsonl, open to append rows, which are written out at once.
 
     Raises:
         OutputError: the file can't be written.
@@ -40,12 +40,14 @@ class RunLog(contextlib.AbstractContextManager):
     def __init__(self, path: Path):
         self.path = path
         with writing(path):
-            self._file = path.open("a", encoding="utf-8", buffering=1)
+            self._file = path.open("a", encoding="utf-8")
 
-    def append(self, row: dict[str, Any]) -> None:
-        """Adds a row."""
-        with writing(self.path):
-            self._file.write(json.dumps(row) + "\n")
+    def append(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Adds rows."""
+        if rows:
+            with writing(self.path):
+                self._file.write("".join(json.dumps(row) + "\n" for row in rows))
+                self._file.flush()
 
     def sync(self) -> None:
         """Returns when all rows are on the disk."""

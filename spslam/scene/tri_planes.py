@@ -165,19 +165,26 @@ class TriPlanes:
         """Initial texels [size_u, size_v, 32], N(0, 0.01): a crop of blocks at fixed world positions."""
         first_u, first_v = u // _BLOCK, v // _BLOCK
         last_u, last_v = (u + size_u - 1) // _BLOCK, (v + size_v - 1) // _BLOCK
-        columns = [
-            torch.cat([self._initial_block(plane, bu, bv) for bv in range(first_v, last_v + 1)], 1)
-            for bu in range(first_u, last_u + 1)
-        ]
+        blocks = [(bu, bv) for bu in range(first_u, last_u + 1) for bv in range(first_v, last_v + 1)]
+        uniform = torch.stack([self._uniform_block(plane, *block) for block in blocks])
+        # A CPU takes blocks one by one: the last bits of its logarithms depend on how many there are at a time.
+        texels = _normal(uniform) if uniform.is_cuda else torch.stack([_normal(block) for block in uniform])
+        rows, columns = last_u + 1 - first_u, last_v + 1 - first_v
+        grid = texels.view(rows, columns, _BLOCK, _BLOCK, FEATURES).transpose(1, 2)
         begin_u, begin_v = u - first_u * _BLOCK, v - first_v * _BLOCK
-        return torch.cat(columns)[begin_u : begin_u + size_u, begin_v : begin_v + size_v].contiguous()
+        whole = grid.reshape(rows * _BLOCK, columns * _BLOCK, FEATURES)
+        return whole[begin_u : begin_u + size_u, begin_v : begin_v + size_v].contiguous()
 
-    def _initial_block(self, plane: int, block_u: int, block_v: int) -> torch.Tensor:
-        """Texels [_BLOCK, _BLOCK, 32] of the block with these world coordinates."""
+    def _uniform_block(self, plane: int, block_u: int, block_v: int) -> torch.Tensor:
+        """Numbers [_BLOCK, _BLOCK, 2, 32] in [0, 1) that the texels of the block with these coordinates are made of."""
         count = _BLOCK * _BLOCK * 2 * FEATURES
         frame, iteration = block_u & 0xFFFFFFFF, _FIRST_KEY + 4 * block_v + plane
         stream = ops.RandomStream.INITIALIZATION
         uniform = ops.philox_uniform(self.seed, stream, frame, iteration, count, self.texels.device)
-        first, second = uniform.view(_BLOCK, _BLOCK, 2, FEATURES).unbind(2)
-        # Box-Muller transform; 1 - u lies in (0, 1].
-        return INITIAL_STD * (-2 * torch.log(1 - first)).sqrt() * torch.cos(2 * torch.pi * second)
+        return uniform.view(_BLOCK, _BLOCK, 2, FEATURES)
+
+
+def _normal(uniform: torch.Tensor) -> torch.Tensor:
+    """N(0, 0.01) [..., 32] of numbers [..., 2, 32] in [0, 1), by the Box-Muller transform."""
+    first, second = uniform.unbind(-2)
+    return INITIAL_STD * (-2 * torch.log(1 - first)).sqrt() * torch.cos(2 * torch.pi * second)  # 1 - u lies in (0, 1]

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from spslam.config import Config, read_shipped
+from spslam.config import Config
 from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
 from spslam.slam.depth_keyframes import depth_image_shape
 from spslam.slam.device_events import host_copy
-from spslam.slam.recovery.pose_confidence import MODEL_FILE
+from spslam.slam.recovery.pose_confidence import shipped_constants
 from spslam.slam.state import Moments, Segment, SlamState, UnjoinedFrames, keeps_moments
 from spslam.tensor_file import TensorFile, finite_number, load_header, load_tensors, save_tensors, whole_number
 from spslam.tensor_schema import CHECKPOINT
@@ -37,7 +37,7 @@ def fingerprint(config: Config) -> str:
     # A run that reached a limit can continue when the limit is raised.
     for limit in ("max_voxels", "max_texels"):
         content["scene"].pop(limit)
-    content["pose_confidence"] = read_shipped(MODEL_FILE)["constants"]
+    content["pose_confidence"] = dict(shipped_constants())
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -1,6 +1,7 @@
 """Tracking constraints beside the map: images of earlier frames, and the noise that they are weighed by."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -33,6 +34,11 @@ class Constraints:
     depth_keyframes: ops.DepthKeyframes | None = None
     keyframes_from_start: bool = False
     shutter: ops.ShutterMotion | None = None
+
+    @cached_property
+    def noise_numbers(self) -> list[float]:
+        """The noise, read; waits for the device. All 0 where none is known."""
+        return [0.0] * 4 if self.noise is None else self.noise.tolist()
 
     def depth_keyframes_of(self, iterations: int) -> ops.DepthKeyframes | None:
         """The depth keyframes for a call of so many iterations."""

@@ -1,10 +1,13 @@
 """Events in a device's queue: what runs asynchronously is timed without waiting for it."""
 
+import itertools
 import time
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 
 PIECE_BYTES = 1 << 20  # of page-locked memory
@@ -42,12 +45,24 @@ class HostEvent(DeviceEvent):
         return 1e3 * (self._time_s - earlier._time_s)
 
 
+# CUDA events that nobody refers to any more, by device: to make one takes longer than to record it.
+_SPARE_EVENTS: defaultdict[int, list[torch.cuda.Event]] = defaultdict(list)
+
+
 class StreamEvent(DeviceEvent):
     """A CUDA event, complete when its stream gets to this place in its queue."""
 
     def __init__(self, stream: torch.cuda.Stream):
-        self.event = torch.cuda.Event(enable_timing=True)
+        self._spare = _SPARE_EVENTS[stream.device_index]
+        try:
+            self.event = self._spare.pop()
+        except IndexError:
+            self.event = torch.cuda.Event(enable_timing=True)
         self.event.record(stream)
+
+    def __del__(self):
+        # Whoever waits for it in a queue waits for what was recorded before it waited.
+        self._spare.append(self.event)
 
     def is_complete(self) -> bool:
         return self.event.query()
@@ -90,6 +105,12 @@ def host_copy(tensor: torch.Tensor) -> torch.Tensor:
         record().wait()
         piece.copy_(staged)
     return copy
+
+
+def read_together(*tensors: torch.Tensor) -> list[np.ndarray]:
+    """float32 tensors of one device, flat; the host waits for the device once."""
+    numbers = torch.cat([tensor.reshape(-1) for tensor in tensors]).cpu().numpy()
+    return np.split(numbers, list(itertools.accumulate(tensor.numel() for tensor in tensors[:-1])))
 
 
 def fetch(numbers: torch.Tensor) -> torch.Tensor:

@@ -1,15 +1,17 @@
 """Read access to earlier frames, for tracking and recovery."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from spslam import ops
+from spslam.geometry import pose7_to_matrix
 from spslam.slam.color_motion import MAX_COLOR_DELAY_S, MAX_SHARE, ColorMotion
+from spslam.slam.device_events import read_together
 from spslam.slam.image_features import ImageFeatures
-from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.state import SlamState
 
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
@@ -164,17 +166,20 @@ class FrameHistory:
     def color_motion(self, motion: ops.FrameMotion) -> ColorMotion | None:
         """How a frame's color image moved on from its depth image; None where the two are of one moment, or nothing
         is known of the motion. Waits for the device."""
-        delay = float(self._state.noise.color_delay) + motion.color_offset
-        share = delay / motion.seconds
-        if motion.row < 0 or delay == 0 or abs(delay) > MAX_COLOR_DELAY_S or abs(share) > MAX_SHARE:
-            return None
-        return ColorMotion(pose_matrix(self.poses[motion.row]), share)
+        delay, before = read_together(self._state.noise.color_delay, self.poses[max(motion.row, 0)])
+        return _color_motion(motion, float(delay[0]), before)
 
-    def color_pose(self, row: int) -> torch.Tensor:
-        """float32 [7] where the camera took the color image of the frame in a row, on the device."""
-        motion = self.color_motion(self.own_motion(row))
-        pose = self.poses[row]
-        return pose if motion is None else pose_tensor(motion.color_pose(pose_matrix(pose)), pose.device)
+    def color_poses(self, rows: Sequence[int]) -> list[np.ndarray]:
+        """float64 [4, 4] where the camera took the color images of the frames in rows. Waits for the device, once."""
+        motions = [self.own_motion(row) for row in rows]
+        poses, before = [self.poses[row] for row in rows], [self.poses[max(motion.row, 0)] for motion in motions]
+        delay, *numbers = read_together(self._state.noise.color_delay, *poses, *before)
+        found = []
+        for pose, motion, earlier in zip(numbers, motions, numbers[len(rows) :], strict=False):
+            matrix = pose7_to_matrix(pose.astype(np.float64))
+            moved = _color_motion(motion, float(delay[0]), earlier)
+            found.append(matrix if moved is None else moved.color_pose(matrix))
+        return found
 
     def features(self, row: int) -> ImageFeatures | None:
         """Image features of the frame in a row, if they are kept or its images still are; may wait for the device."""
@@ -200,3 +205,12 @@ class FrameHistory:
             rows = torch.cat([rows[older], rows[-RECENT_COMPARED:]])
         device = self._state.frames.poses.device
         return rows if device.type == "cpu" else rows.pin_memory().to(device, non_blocking=True)
+
+
+def _color_motion(motion: ops.FrameMotion, delay_s: float, before: np.ndarray) -> ColorMotion | None:
+    """`FrameHistory.color_motion` from the pose float32 [7] of the frame that the motion begins at."""
+    delay_s += motion.color_offset
+    share = delay_s / motion.seconds
+    if motion.row < 0 or delay_s == 0 or abs(delay_s) > MAX_COLOR_DELAY_S or abs(share) > MAX_SHARE:
+        return None
+    return ColorMotion(pose7_to_matrix(before.astype(np.float64)), share)

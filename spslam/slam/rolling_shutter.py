@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from spslam import ops
 from spslam.camera import Camera
 from spslam.image_library import image_library
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_shape, depth_unit
+from spslam.slam.device_events import read_together
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.pixels import FramePixels
 
@@ -118,11 +118,12 @@ class ShutterRectifier:
 
     def features(self, features: ImageFeatures, motion: ops.ShutterMotion) -> ImageFeatures:
         """Image features of the frame as it was read, rectified; waits for the device."""
-        readout = float(motion.readout)
-        if readout == 0 or len(features) == 0:
+        if len(features) == 0:
             return features
-        poses = torch.cat([motion.before, motion.pose]).cpu().numpy()
-        moved = np.array([*poses, readout, motion.seconds], np.float32)
+        *poses, readout = read_together(motion.before, motion.pose, motion.readout)
+        if readout[0] == 0:
+            return features
+        moved = np.array([*np.concatenate(poses), readout[0], motion.seconds], np.float32)
         k = self._image_intrinsics
         camera = np.array([k.fx, k.fy, k.cx, k.cy, self._image_rows], np.float32)
         read = [np.ascontiguousarray(each, np.float32) for each in (features.positions, features.points)]

@@ -58,10 +58,11 @@ class SurfaceEquations:
     pixels: int
     variance: float
 
-    @cached_property
-    def hessian(self) -> np.ndarray:
-        """float64 [6, 6]."""
-        return np.array(self.numbers).reshape(6, 6)
+    @property
+    def information(self) -> np.ndarray:
+        """float64 [6, 6], inverse covariance of (translation m, rotation rad about the camera's center) in world axes,
+        as surface alone determines the pose."""
+        return np.array(self.numbers).reshape(6, 6) / self.variance
 
 
 @dataclass(frozen=True)
@@ -89,14 +90,7 @@ class PoseEstimate:
         """How well it fits."""
         if self.equations is None:
             return self.measured
-        hessian, pixels = self.equations.hessian, self.equations.pixels
-        return replace(self.measured, min_eigenvalue=min_eigenvalue(hessian, pixels))
-
-    @property
-    def information(self) -> np.ndarray | None:
-        """float64 [6, 6], inverse covariance of (translation m, rotation rad about the camera's center) in world axes,
-        as surface alone determines the pose; None where it was not measured."""
-        return None if self.equations is None else self.equations.hessian / self.equations.variance
+        return self.measured.having(min_eigenvalue=min_eigenvalue(self.equations.numbers, self.equations.pixels))
 
 
 class FrameOutcome(IntEnum):
@@ -214,14 +208,15 @@ class Tracker:
         )
         if meanwhile is not None:
             meanwhile()
-        head = ops.trusted.FOLLOWED_HEAD
-        numbers, size = found.tolist(), ops.trusted.FOUND_NUMBERS + ops.trusted.STATISTICS * AGAIN_ITERATIONS
-        outcome, predicted = FrameOutcome(int(numbers[0])), found[1:8]
+        parts = ops.trusted.followed_parts(found, AGAIN_ITERATIONS)
+        numbers = found.tolist()
+        outcome = FrameOutcome(int(numbers[0]))
         iterations = tracking.iterations + (AGAIN_ITERATIONS if outcome == FrameOutcome.BENT else 0)
-        estimate = self._estimate(found[-size:], numbers[-size:], numbers[1:8], iterations)
-        motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, found[8:head])
-        problem = TrackingProblem(scene, outputs[0], predicted, number, constraints)
-        return FollowedFrame(problem, motion, outcome, estimate, found[head : head + 7], outputs[1:])
+        last = numbers[-parts.last_size :]
+        estimate = self._estimate(parts.pose, parts.gain, last, numbers[1:8], iterations)
+        motion = ops.ShutterMotion(frame.poses[1], parts.predicted, frame.seconds, parts.readout)
+        problem = TrackingProblem(scene, outputs[0], parts.predicted, number, constraints)
+        return FollowedFrame(problem, motion, outcome, estimate, parts.first_pose, outputs[1:])
 
     def track_from(self, problem: TrackingProblem, start: torch.Tensor) -> PoseEstimate:
         """Optimizes the pose from another initial pose, float32 [7], by Gauss-Newton."""
@@ -285,7 +280,7 @@ class Tracker:
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
         size = found.numel()
         predicted = numbers[:7] if is_predicted else numbers[size:]
-        return self._estimate(found[7:], numbers[7:size], predicted, iterations)
+        return self._estimate(found[7:14], found[-2:], numbers[7:size], predicted, iterations)
 
     def _options(self, scene: Scene, number: int, iterations: int, kernel_start_m: float) -> ops.GaussNewtonOptions:
         tracking = self.config.tracking
@@ -305,13 +300,19 @@ class Tracker:
         )
 
     def _estimate(
-        self, found: torch.Tensor, numbers: list[float], predicted: list[float], iterations: int
+        self,
+        found: torch.Tensor,
+        gain: torch.Tensor,
+        numbers: list[float],
+        predicted: list[float],
+        iterations: int,
     ) -> PoseEstimate:
-        """What an op of tracking found: pose, H and the statistics of each iteration.
+        """What an op of tracking found.
 
         Args:
-            found: float32 [43 + 7 iterations].
-            numbers: the same, read.
+            found: the pose float32 [7].
+            gain: of the frame, the last two numbers.
+            numbers: pose, H and the statistics of each iteration, read: 43 + 7 iterations.
             predicted: pose.
             iterations: that were made.
         """
@@ -328,4 +329,4 @@ class Tracker:
         pixels = self.config.tracking.pixels
         variance = pose_variance(mean_square) * pixels
         equations = SurfaceEquations(numbers[7 : ops.trusted.FOUND_NUMBERS], pixels, variance)
-        return PoseEstimate(found[:7], iterations, fit, equations, tuple(pose), found[-2:])
+        return PoseEstimate(found, iterations, fit, equations, tuple(pose), gain)

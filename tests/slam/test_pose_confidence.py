@@ -158,9 +158,19 @@ def test_prediction_error_of_nan_is_nan():
 def test_min_eigenvalue_is_of_the_weakest_direction_per_pixel():
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
     hessian = turn @ np.diag([5.0, 7, 9, 20, 30, 40]) @ turn.T
-    assert min_eigenvalue(hessian, 10) == pytest.approx(0.5)
-    assert min_eigenvalue(np.zeros((6, 6)), 10) == 0
-    assert all(math.isnan(min_eigenvalue(np.full((6, 6), bad), 10)) for bad in (math.nan, math.inf))
+    assert min_eigenvalue(hessian.ravel().tolist(), 10) == pytest.approx(0.5)
+    assert min_eigenvalue([0.0] * 36, 10) == 0
+    assert all(math.isnan(min_eigenvalue([bad] * 36, 10)) for bad in (math.nan, math.inf))
+
+
+def test_min_eigenvalue_is_that_of_lapack():
+    random = np.random.default_rng(1)
+    for scale in 10.0 ** random.uniform(-8, 4, (200, 6)):
+        turn = np.linalg.qr(random.normal(size=(6, 6)))[0]
+        hessian = ((turn * scale) @ turn.T).astype(np.float32).astype(np.float64)
+        hessian = np.triu(hessian) + np.triu(hessian, 1).T
+        right = max(np.linalg.eigvalsh(hessian)[0], 0.0)
+        assert min_eigenvalue(hessian.ravel().tolist(), 1) == pytest.approx(right, abs=1e-14 * scale.max())
 
 
 def test_the_shipped_model_names_its_provenance():
@@ -172,6 +182,6 @@ def test_the_shipped_model_names_its_provenance():
 def test_a_model_of_other_constants_is_refused(monkeypatch, change):
     content = read_shipped(MODEL_FILE)
     constants = {name: value for name, value in {**content["constants"], **change}.items() if value is not None}
-    monkeypatch.setattr(pose_confidence, "read_shipped", lambda name: {**content, "constants": constants})
+    monkeypatch.setattr(pose_confidence, "shipped_constants", lambda: constants)
     with pytest.raises(ConfigError, match="constants that do not match the program's: (intercept|slope); reinstall"):
         PoseConfidenceModel.load()

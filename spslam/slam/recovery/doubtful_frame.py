@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
+import numpy as np
 
 from spslam.datasets.clock import LATE_S
 from spslam.slam.fit import Fit
@@ -51,19 +51,22 @@ class DoubtfulFrame:
 
     def compared(self, row: int, anchors: Sequence[int]) -> "DoubtfulFrame":
         """The frame with its matches with the last frame, in a row, and with stored ones; its speed by the former."""
-        last = self.matched([row])
-        return replace(self.with_speed(row, last), near=(*last, *self.matched(anchors)))
+        near = self._matched([row, *anchors])
+        last = [near[row]] if row in near else []
+        return replace(self.with_speed(row, last), near=tuple(near.values()))
 
     def matched(self, rows: Sequence[int]) -> list[FeatureMatches]:
         """Matches with the features of the earlier frames in rows that have some."""
+        return list(self._matched(rows).values())
+
+    def _matched(self, rows: Sequence[int]) -> dict[int, FeatureMatches]:
         if self.image is None:
-            return []
-        known = [(self.history.features(row), row) for row in rows]
-        return [
-            self.image.matches(features, self.history.color_pose(row))
-            for features, row in known
-            if features is not None
-        ]
+            return {}
+        known = {row: features for row in rows if (features := self.history.features(row)) is not None}
+        if not known:
+            return {}
+        poses = self.history.color_poses(list(known))
+        return dict(zip(known, self.image.matches_with(list(zip(known.values(), poses, strict=True))), strict=True))
 
     def with_speed(self, row: int, matches: Sequence[FeatureMatches]) -> "DoubtfulFrame":
         """The frame, with how far its image moves in `LATE_S` by the first of its matches, which are with `row`."""
@@ -73,11 +76,12 @@ class DoubtfulFrame:
         is_turn = speed_px < self.image.focal_px * math.radians(MAX_TURN_DEG_S)
         return replace(self, late_px=LATE_S * speed_px if is_turn else 0.0)
 
-    def with_features(self, fit: Fit, pose: torch.Tensor) -> Fit:
-        """The fit of a pose float32 [7] with what the matches say of it; the fit where there are no image features."""
+    def with_features(self, fit: Fit, pose: np.ndarray) -> Fit:
+        """The fit of a pose float64 [4, 4] with what the matches say of it; the fit where there are no image
+        features."""
         if self.image is None:
             return fit
-        at = self.image.color_pose(pose)
+        at = self.image.of_color(pose)
         inliers = [self.image.inliers(one, at) for one in self.matches]
         shares: list[float] = []
         if self.colors_are_registered:
@@ -85,8 +89,7 @@ class DoubtfulFrame:
             telling = [one for one in self.matches if one.agreeing > FEW_FEATURES * most]
             within = [self.image.inliers(one, at, self.late_px) for one in telling]
             shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, telling, strict=True)]
-        return replace(
-            fit,
+        return fit.having(
             feature_inliers=max(inliers, default=0),
             feature_share=min(shares, default=math.nan),
             feature_rays=max((self.image.ray_inliers(one, at) for one in self.matches), default=0),
@@ -105,8 +108,7 @@ class DoubtfulFrame:
     @property
     def colors_are_registered(self) -> bool:
         """Whether colors are where depth is, as far as was measured: neither late nor of another lens."""
-        noise = self.problem.constraints.noise
-        return noise is None or float(noise[3]) <= REGISTERED_PX**2
+        return self.problem.constraints.noise_numbers[3] <= REGISTERED_PX**2
 
 
 def preferred_by_features(found: TrackedFrame, others: Sequence[TrackedFrame], times: float = 1.0) -> TrackedFrame:

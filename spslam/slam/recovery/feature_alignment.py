@@ -47,13 +47,20 @@ class FeatureMatches(SeenPoints):
     Attributes:
         points, positions, deviations: see `SeenPoints`.
         agreeing: how many of them agree with the pose that they give.
-        motion_px: by how much they moved in the image since the earlier frame, their median; 0 without any.
+        before: float64 [M, 2], where the earlier frame showed them; None where nobody asks.
         rays: what was matched beyond the range of depth; None where that is not kept of the earlier frame.
     """
 
     agreeing: int = 0
-    motion_px: float = 0.0
+    before: np.ndarray | None = None
     rays: SeenRays | None = None
+
+    @property
+    def motion_px(self) -> float:
+        """By how much they moved in the image since the earlier frame, their median; 0 without any."""
+        if self.before is None or not len(self):
+            return 0.0
+        return float(np.median(np.linalg.norm(self.positions - self.before, axis=1)))
 
 
 class FeatureAlignment:
@@ -89,6 +96,7 @@ class FeatureAlignment:
         self._motion = motion
         k = depth_image_intrinsics(camera)
         self._matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+        self._inverse_matrix = np.linalg.inv(self._matrix)
         self._intrinsics = np.array([k.fx, k.fy, k.cx, k.cy], np.float64)
         self.focal_px = k.fx
         self.max_error_px = max(k.fx * math.tan(math.radians(MAX_ERROR_DEG)), MIN_ERROR_PX)
@@ -96,32 +104,46 @@ class FeatureAlignment:
     def matches(self, earlier: ImageFeatures, pose: torch.Tensor) -> FeatureMatches:
         """Matches with the features of an earlier frame whose color image is of a pose float32 [7]: those with depth
         among themselves, and those beyond its range among all."""
-        to_world = pose_matrix(pose)
-        measured = earlier.with_depth() if len(earlier.positions) else earlier  # of stored ones no others are kept
-        pairs = ratio_matches(self._descriptors, measured.descriptors)
-        local, positions = (
-            one.astype(np.float64) for one in (measured.points[pairs[:, 1]], self.features.positions[pairs[:, 0]])
-        )
-        before = (local @ self._matrix.T)[:, :2] / local[:, 2:]
-        moved = np.linalg.norm(positions - before, axis=1)
-        motion_px = float(np.median(moved)) if len(moved) else 0.0
-        points = local @ to_world[:3, :3].T + to_world[:3, 3]
-        z, (floor, growth) = local[:, 2:], self._depth_noise
-        deviations = np.sqrt(floor + growth * z**4) * (local / z) @ to_world[:3, :3].T
-        rays = self._rays(earlier, to_world)
-        return FeatureMatches(points, positions, deviations, motion_px=motion_px, rays=rays)
+        return self.matches_with([(earlier, pose_matrix(pose))])[0]
 
-    def _rays(self, earlier: ImageFeatures, to_world: np.ndarray) -> SeenRays | None:
-        """Matches beyond the range of an earlier frame's depth, whose color image is of a pose float64 [4, 4]."""
-        if earlier.beyond_m is None or not earlier.beyond_m.any():
-            return None
-        pairs = ratio_matches(self._descriptors, earlier.descriptors)
-        row, known = pairs[earlier.beyond_m[pairs[:, 1]] > 0].T
+    def matches_with(self, earlier: Sequence[tuple[ImageFeatures, np.ndarray]]) -> list[FeatureMatches]:
+        """`matches` with several earlier frames, by one call of the device.
+
+        Args:
+            earlier: features of each, and the pose float64 [4, 4] of its color image.
+        """
+        # Of stored ones no others are kept.
+        measured = [one.with_depth() if len(one.positions) else one for one, _ in earlier]
+        has_rays = [one.beyond_m is not None and bool(one.beyond_m.any()) for one, _ in earlier]
+        whole = [one.descriptors for (one, _), has in zip(earlier, has_rays, strict=True) if has]
+        pairs = ratio_matches(self._descriptors, [*(one.descriptors for one in measured), *whole])
+        beyond, found = iter(pairs[len(earlier) :]), []
+        for (one, to_world), near, matched, has in zip(earlier, measured, pairs, has_rays, strict=False):
+            rays = self._rays(one, to_world, next(beyond)) if has else None
+            found.append(self._points(near, to_world, matched, rays))
+        return found
+
+    def _points(
+        self, earlier: ImageFeatures, to_world: np.ndarray, pairs: np.ndarray, rays: SeenRays | None
+    ) -> FeatureMatches:
+        """Pairs of features with those of an earlier frame whose color image is of a pose float64 [4, 4]."""
+        local = earlier.points[pairs[:, 1]].astype(np.float64)
+        positions = self.features.positions[pairs[:, 0]].astype(np.float64)
+        before, turn = (local @ self._matrix.T)[:, :2] / local[:, 2:], to_world[:3, :3].T
+        z, (floor, growth) = local[:, 2:], self._depth_noise
+        deviations = np.sqrt(floor + growth * z**4) * (local / z) @ turn
+        return FeatureMatches(local @ turn + to_world[:3, 3], positions, deviations, before=before, rays=rays)
+
+    def _rays(self, earlier: ImageFeatures, to_world: np.ndarray, pairs: np.ndarray) -> SeenRays:
+        """Those of the pairs that lie beyond the range of the earlier frame's depth."""
+        ranges = earlier.beyond_m
+        if ranges is None:
+            raise ValueError("FeatureAlignment: the earlier frame's features must have ranges")
+        row, known = pairs[ranges[pairs[:, 1]] > 0].T
         before = earlier.positions[known].astype(np.float64)
-        directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ np.linalg.inv(self._matrix).T
+        directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ self._inverse_matrix.T
         positions = self.features.positions[row].astype(np.float64)
-        beyond_m = earlier.beyond_m[known].astype(np.float64)
-        return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, beyond_m)
+        return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, ranges[known].astype(np.float64))
 
     def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""
@@ -151,36 +173,44 @@ class FeatureAlignment:
         return replace(matches, agreeing=self.inliers(matches, color_pose))
 
     def held(
-        self, pose: torch.Tensor, information: np.ndarray, matches: Sequence[FeatureMatches], late_px: float = 0.0
-    ) -> torch.Tensor | None:
+        self,
+        pose: Sequence[float],
+        information: np.ndarray,
+        matches: Sequence[FeatureMatches],
+        late_px: float = 0.0,
+    ) -> np.ndarray | None:
         """The pose that surface and image features agree on best; None where fewer than `MIN_INLIERS` agree.
 
         Gauss-Newton on reprojection errors with Geman-McClure's weights, beside the equations of surface. What was seen
         beyond the range of depth takes part too: it tells how the camera has turned.
 
         Args:
-            pose: float32 [7], where surface has put the camera.
-            information: float64 [6, 6] of that pose, see `PoseEstimate`.
+            pose: seven numbers, where surface has put the camera.
+            information: float64 [6, 6] of that pose, see `SurfaceEquations`.
             matches: with earlier frames.
             late_px: by how much the features may be off, where that is more than `max_error_px`.
+
+        Returns:
+            float32 [7].
         """
         held = held_pose(
             self._intrinsics,
             _joined(matches),
             [one.rays for one in matches if one.rays is not None and len(one.rays)],
             self._motion,
-            pose.cpu().numpy().astype(np.float64),
+            np.array(pose, np.float64),
             information,
             max(self.max_error_px, late_px),
             MIN_INLIERS,
         )
-        return None if held is None else torch.from_numpy(held).to(pose.device, torch.float32)
+        return None if held is None else held.astype(np.float32)
 
     def color_pose(self, pose: torch.Tensor) -> np.ndarray:
         """Pose float64 [4, 4] of the frame's color image, of a pose float32 [7]; waits for the device."""
-        return self._of_color(pose_matrix(pose))
+        return self.of_color(pose_matrix(pose))
 
-    def _of_color(self, pose: np.ndarray) -> np.ndarray:
+    def of_color(self, pose: np.ndarray) -> np.ndarray:
+        """The same of a pose float64 [4, 4]."""
         return pose if self._motion is None else self._motion.color_pose(pose)
 
     def inliers(self, matches: FeatureMatches, color_pose: np.ndarray, late_px: float = 0.0) -> int:
@@ -203,7 +233,7 @@ class FeatureAlignment:
 
     def likeness(self, earlier: ImageFeatures) -> int:
         """How many of the strongest features match; 0 below `MIN_ALIKE`."""
-        count = len(ratio_matches(self._descriptors[:COMPARED], earlier.descriptors[:COMPARED]))
+        count = len(ratio_matches(self._descriptors[:COMPARED], [earlier.descriptors[:COMPARED]])[0])
         return count if count >= MIN_ALIKE else 0
 
     @cached_property
@@ -237,17 +267,25 @@ def _joined(matches: Sequence[FeatureMatches]) -> FeatureMatches:
     return FeatureMatches(points, positions, deviations)
 
 
-def ratio_matches(descriptors: torch.Tensor, earlier: np.ndarray) -> np.ndarray:
-    """Rows of descriptors uint8 [N, 32] that match plainly better than any others of [M, 32]: int64 [K, 2].
+def ratio_matches(descriptors: torch.Tensor, earlier: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Rows of descriptors uint8 [N, 32] that match plainly better than any others in groups of [M, 32]: int64 [K, 2]
+    for each group.
 
     The descriptors' device compares them, and is waited for.
     """
-    if len(descriptors) == 0 or len(earlier) < 2:
-        return np.zeros((0, 2), np.int64)
-    found = ops.nearest_descriptors(descriptors, _tensor(earlier).to(descriptors.device))
-    nearest, distances = (each.cpu().numpy() for each in found)
-    rows = np.flatnonzero(distances[:, 0] < MAX_RATIO * distances[:, 1])
-    return np.stack([rows, nearest[rows]], 1)
+    none = np.zeros((0, 2), np.int64)
+    compared = [i for i, group in enumerate(earlier) if len(group) > 1] if len(descriptors) else []
+    matches = [none] * len(earlier)
+    for first in range(0, len(compared), ops.trusted.DESCRIPTOR_GROUPS):
+        numbers = compared[first : first + ops.trusted.DESCRIPTOR_GROUPS]
+        others = _tensor(np.concatenate([earlier[i] for i in numbers])).to(descriptors.device)
+        found = ops.trusted.nearest_in_groups(descriptors, others, [len(earlier[i]) for i in numbers]).cpu().numpy()
+        distances = found[1].view(np.int32).reshape(len(numbers), -1, 2)
+        is_match = distances[..., 0] < MAX_RATIO * distances[..., 1]
+        for i, nearest, matched in zip(numbers, found[0], is_match, strict=True):
+            rows = np.flatnonzero(matched)
+            matches[i] = np.stack([rows, nearest[rows]], 1)
+    return matches
 
 
 def _tensor(descriptors: np.ndarray) -> torch.Tensor:

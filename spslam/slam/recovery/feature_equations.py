@@ -2,12 +2,26 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from spslam.geometry import matrix_to_pose7
 from spslam.image_library import check_memory, image_library
 from spslam.slam.color_motion import ColorMotion
+
+
+class Addresses:
+    """Where arrays lie, as a compiled function takes several, and the arrays as long as that lives.
+
+    Attributes:
+        first: where the addresses themselves lie.
+    """
+
+    def __init__(self, arrays: Sequence[np.ndarray | None]):
+        self._arrays = arrays
+        self._addresses = np.array([0 if array is None else array.ctypes.data for array in arrays], np.uintp)
+        self.first = self._addresses.ctypes.data
 
 
 @dataclass(frozen=True)
@@ -29,10 +43,15 @@ class SeenRays:
     def __len__(self) -> int:
         return len(self.positions)
 
-    @property
+    @cached_property
     def arrays(self) -> tuple[np.ndarray, ...]:
         """As compiled functions take them."""
         return tuple(map(_row_major, (self.origin, self.directions, self.positions, self.beyond_m)))
+
+    @cached_property
+    def addresses(self) -> Addresses:
+        """Where these lie."""
+        return Addresses(self.arrays)
 
 
 @dataclass(frozen=True)
@@ -52,10 +71,15 @@ class SeenPoints:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def arrays(self) -> tuple[np.ndarray, ...]:
         """As compiled functions take them."""
         return tuple(map(_row_major, (self.points, self.positions, self.deviations)))
+
+    @cached_property
+    def addresses(self) -> Addresses:
+        """Where these lie."""
+        return Addresses(self.arrays)
 
 
 def point_equations(
@@ -75,18 +99,18 @@ def point_equations(
     Returns:
         How many; float64 [6, 6] and [6]: matrix and gradient of a step of the pose (m, rad) in world axes.
     """
-    equations, pose, arrays = np.empty(42), _row_major(pose), _Arrays(seen.arrays)
+    equations, pose = np.empty(42), _row_major(pose)
     count = image_library().spslam_point_equations(
-        arrays.address, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, equations.ctypes.data
+        seen.addresses.first, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, equations.ctypes.data
     )
     return count, equations[:36].reshape(6, 6), equations[36:]
 
 
 def agreeing_points(camera: np.ndarray, seen: SeenPoints, pose: np.ndarray, error_px: float) -> int:
     """How many points agree with a pose; as `point_equations`."""
-    pose, arrays = _row_major(pose), _Arrays(seen.arrays)
+    pose = _row_major(pose)
     return image_library().spslam_point_equations(
-        arrays.address, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, None
+        seen.addresses.first, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, None
     )
 
 
@@ -104,9 +128,9 @@ def ray_equations(
         seen: the rays.
         least: each weighs at most as one of so many that agree.
     """
-    equations, pose, arrays = np.empty(42), _row_major(pose), _Arrays(seen.arrays)
+    equations, pose = np.empty(42), _row_major(pose)
     count = image_library().spslam_ray_equations(
-        arrays.address, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, least, equations.ctypes.data
+        seen.addresses.first, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, least, equations.ctypes.data
     )
     return count, equations[:36].reshape(6, 6), equations[36:]
 
@@ -141,25 +165,16 @@ def held_pose(
     """
     before = None if motion is None else matrix_to_pose7(motion.before)
     numbers = np.array([0.0 if motion is None else motion.share, error_px])
-    seen = _Arrays([*points.arrays, *(array for one in rays for array in one.arrays)])
-    frame = _Arrays([camera, pose, _row_major(information), before, numbers])
+    seen = Addresses([*points.arrays, *(array for one in rays for array in one.arrays)])
+    frame = Addresses([camera, pose, _row_major(information), before, numbers])
     counts, held = np.array([len(points), *map(len, rays)], np.int64), np.empty(7)
     agreeing = image_library().spslam_hold_pose(
-        seen.address, counts.ctypes.data, len(rays), frame.address, least, held.ctypes.data
+        seen.first, counts.ctypes.data, len(rays), frame.first, least, held.ctypes.data
     )
     if agreeing == -1:
         return None
     check_memory(agreeing)
     return held
-
-
-class _Arrays:
-    """Where arrays lie, as a compiled function takes several, and the arrays as long as that lives."""
-
-    def __init__(self, arrays: Sequence[np.ndarray | None]):
-        self._arrays = arrays
-        self._addresses = np.array([0 if array is None else array.ctypes.data for array in arrays], np.uintp)
-        self.address = self._addresses.ctypes.data
 
 
 def _row_major(array: np.ndarray) -> np.ndarray:

@@ -10,14 +10,23 @@ docs/tracking-failure.md explains the terms and how well they separate correct f
 origin are in configs/models/pose_confidence.yaml.
 """
 
+import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from types import MappingProxyType
 
 from spslam.config import read_shipped
 from spslam.errors import ConfigError
 from spslam.slam.fit import Fit
 
 MODEL_FILE = "models/pose_confidence.yaml"
+
+
+@functools.cache
+def shipped_constants() -> Mapping[str, float]:
+    """The shipped model's constants as its file has them, by name; it is read once."""
+    return MappingProxyType(read_shipped(MODEL_FILE)["constants"])
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,7 @@ class PoseConfidenceModel:
         Raises:
             ConfigError: the shipped file lacks a constant, or holds one that is none of the model's.
         """
-        constants = read_shipped(MODEL_FILE)["constants"]
+        constants = shipped_constants()
         names = {field.name for field in fields(cls)}
         if set(constants) != names:
             different = ", ".join(sorted(set(constants) ^ names))

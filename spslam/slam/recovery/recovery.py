@@ -5,10 +5,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from spslam.camera import Camera
 from spslam.config import Config
+from spslam.geometry import pose7_to_matrix
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import FrameFeatures
@@ -64,7 +66,7 @@ class Recovery:
             estimate.iterations,
             fit,
             **self._judgement(fit),
-            information=estimate.information,
+            equations=estimate.equations,
             gain=estimate.gain,
             on_host=None if numbers is None else (estimate.pose, numbers),
         )
@@ -159,7 +161,7 @@ class Recovery:
     ) -> TrackedFrame:
         """The pose held by image features in directions that surface leaves free, where there are enough of them."""
         row, image = history.last_row(), self._image(problem, history, features)
-        if row is None or image is None or tracked.information is None:
+        if row is None or image is None or tracked.equations is None:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
         held, has_matches = self._hold(frame.compared(row, self._anchors(history, row)), tracked)
@@ -173,17 +175,19 @@ class Recovery:
         """The frame at the pose that surface and image features agree on; None where they don't, and whether there are
         enough matches with the frames near it to say so."""
         image = frame.image
-        if image is None or tracked.information is None:
+        if image is None or tracked.equations is None:
             return None, False
         matches = frame.near
-        pose = image.held(tracked.pose, tracked.information, matches, frame.late_px)
-        if pose is None:
+        numbers = image.held(tracked.numbers, tracked.equations.information, matches, frame.late_px)
+        if numbers is None:
             return None, sum(map(len, matches)) >= MIN_DECIDING
+        pose = torch.from_numpy(numbers).to(tracked.pose.device)
         estimate = self._tracker.measure(frame.problem, pose)
-        at = image.color_pose(pose)
+        matrix = pose7_to_matrix(numbers.astype(np.float64))
+        at = image.of_color(matrix)
         frame = replace(frame, matches=tuple(image.counted(one, at) for one in matches))
-        held = replace(tracked, pose=pose, fit=frame.with_features(estimate.fit, pose), features=image.read)
-        held = self._judged(held)
+        fit, on_host = frame.with_features(estimate.fit, matrix), (pose, tuple(numbers.tolist()))
+        held = self._judged(replace(tracked, pose=pose, fit=fit, features=image.read, on_host=on_host))
         fits = held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted
         return held if fits else None, True
 
@@ -199,7 +203,7 @@ class Recovery:
         """The pose judged with what other frames have seen: surface, brightness and image features."""
         scene = frame.problem.scene
         fit = self._verifier.verified(tracked.fit, tracked.pose, scene, frame.pixels, frame.history)
-        return self._judged(replace(tracked, fit=frame.with_features(fit, tracked.pose)))
+        return self._judged(replace(tracked, fit=frame.with_features(fit, tracked.matrix)))
 
     def _recover(
         self,
@@ -256,8 +260,7 @@ class Recovery:
         keyframes = problem.constraints.depth_keyframes
         timing = None if keyframes is None else keyframes.timing
         motion = None if timing is None else history.color_motion(timing.frame)
-        noise = problem.constraints.noise
-        floor, growth = (0.0, 0.0) if noise is None else noise[:2].tolist()
+        floor, growth = problem.constraints.noise_numbers[:2]
         return FeatureAlignment(rectified, self._camera, motion, read, problem.predicted.device, (floor, growth))
 
     def _starts_at_last(self, frame: DoubtfulFrame, first: TrackedFrame) -> tuple[DoubtfulFrame, list[torch.Tensor]]:
@@ -317,7 +320,7 @@ class Recovery:
             seen: the pose of image features alone; as noise moves it by centimeters, it counts only where far more
                 features agree with it than with the likeliest, and a trusted one fits surface hardly better.
         """
-        candidates = [replace(one, fit=frame.with_features(one.fit, one.pose)) for one in candidates]
+        candidates = [replace(one, fit=frame.with_features(one.fit, one.matrix)) for one in candidates]
         distinct: list[TrackedFrame] = []
         kept: list[int] = []  # their numbers
         weights = [candidate.weight + MIN_GAIN * (i == 0) for i, candidate in enumerate(candidates)]

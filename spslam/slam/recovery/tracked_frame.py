@@ -11,6 +11,7 @@ import torch
 from spslam.geometry import pose7_to_matrix
 from spslam.slam.fit import Fit, prediction_error
 from spslam.slam.image_features import ImageFeatures
+from spslam.slam.tracker import SurfaceEquations
 
 SAME_CM, SAME_DEG = 1.0, 0.5  # nearer poses are one
 
@@ -31,7 +32,7 @@ class TrackedFrame:
         consistent_frames: how many lost frames up to this one had likely poses that are consistent; `pose` is the
             last of them.
         features: of the image, where they were needed.
-        information: of the pose, see `PoseEstimate`; None where it was not tracked.
+        equations: of the pose by surface alone; None where it was not tracked.
         gain: float32 [2] of the frame, on the device, as `FrameTable.gains`; None where it was not tracked.
         on_host: a pose, and its seven numbers, which were read with its fit; of the frame's if it is the same object.
     """
@@ -46,7 +47,7 @@ class TrackedFrame:
     relocalized: bool = False
     consistent_frames: int = 0
     features: ImageFeatures | None = None
-    information: np.ndarray | None = field(default=None, compare=False)
+    equations: SurfaceEquations | None = field(default=None, compare=False)
     gain: torch.Tensor | None = field(default=None, compare=False)
     on_host: tuple[torch.Tensor, tuple[float, ...]] | None = field(default=None, compare=False)
 
