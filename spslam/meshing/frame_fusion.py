@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError, SpslamError
 from spslam.geometry import matrix_to_pose7
 from spslam.meshing.blurred_edges import edges_are_blurred, without_blurred_edges
+from spslam.meshing.depth_views import DepthViews
 from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
 from spslam.meshing.ray_noise import noise_along_rays
@@ -142,6 +144,7 @@ def fuse_frames(
     options: FusionOptions,
     scene: Scene | None = None,
     device: torch.device | str = "cpu",
+    views: DepthViews | None = None,
 ) -> ops.TsdfVolume:
     """Fuses all frames into a new volume.
 
@@ -156,6 +159,7 @@ def fuse_frames(
         scene: a map of the same frames. Blocks are then also made around its surface, so that the frames carve what is
             free of it.
         device: where the volume is.
+        views: of the same frames; they are shown those that they want.
 
     Returns:
         The volume. Its voxel size is the one wanted or, where `max_memory_mb` does not hold that many, a larger one.
@@ -191,8 +195,9 @@ def fuse_frames(
         try:
             if scene is not None and cells is not None:
                 volume.add_blocks(_blocks_of_cells(cells, scene.volume.voxel_size_m, volume))
-            for each, noise in zip(images, along_rays, strict=True):
-                _fuse_part(volume, each, noise)
+            for number, (each, noise) in enumerate(zip(images, along_rays, strict=True)):
+                show = None if views is None else functools.partial(views.show, number)
+                _fuse_part(volume, each, noise, show)
             return volume
         except ops.VoxelLimitError:
             del volume
@@ -304,8 +309,13 @@ class _EdgeImages:
                     yield position, _EdgeImage(*parts)
 
 
-def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages, along_rays: tuple[float, float]) -> None:
-    """Fuses the frames of one dataset, whose depth has this noise along rays."""
+def _fuse_part(
+    volume: ops.TsdfVolume,
+    images: _EdgeImages,
+    along_rays: tuple[float, float],
+    show: Callable[[int, torch.Tensor], None] | None,
+) -> None:
+    """Fuses the frames of one dataset, whose depth has this noise along rays, and shows depth to whom it is for."""
     device, intrinsics, noise = volume.sdf.device, frame_intrinsics(images.part), images.noise
     poses = poses7_on(images.part.poses, device)
     is_blurred = images.edges is _EdgeKind.BLURRED
@@ -316,6 +326,8 @@ def _fuse_part(volume: ops.TsdfVolume, images: _EdgeImages, along_rays: tuple[fl
     for position, image in images.read():
         # Smoothed depth: neighbors have the same noise.
         depth = image.edges if is_blurred else image.depth
+        if show is not None:
+            show(position, image.depth)
         planes = ops.measure_planes(depth, intrinsics, noise, shared_noise=is_blurred)
         if is_blurred:
             planes += _ramps(image.depth, depth, intrinsics, noise)

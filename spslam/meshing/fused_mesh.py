@@ -12,14 +12,15 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.meshing.cleaning import face_support, front_facing_in_view, in_large_component
+from spslam.meshing.depth_views import DepthViews
 from spslam.meshing.extract import CHUNK_POINTS, MIN_PART_M2, MIN_SUPPORT
 from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
 from spslam.meshing.scene_filling import fill_with_scene
 from spslam.ops.tsdf_volume import march_blocks
 from spslam.scene import Scene
 
-# A voxel is known from this weight on: that of a hundredth of a frame whose depth is certain, which is one from afar.
-MIN_WEIGHT = 0.005
+# A voxel is known from this weight on, with which its mean is known to 5 cm: that of a frame from afar.
+MIN_WEIGHT = 0.003
 # And from this share of the largest weight nearby.
 MIN_SHARE = 0.01
 # A signed distance changes by no more than a voxel from one voxel to the next. Where it changes by more than the
@@ -30,6 +31,8 @@ MIN_SHARE = 0.01
 # of the largest weight nearby it counts as the side of a thing.
 FRINGE_DEPTH, FRINGE_DEVIATIONS, FRINGE_SHARE = 0.5, 0.5, 0.3
 _DEVIATION_M = 0.003
+# Where it changes by more than so many voxels, which noise makes it do too, views are asked: see `_contradicted`.
+STEEP_VOXELS = 1.5
 # From so many corners on a face is part of a fringe. With one it is the border of a surface, less than a voxel wide.
 _FRINGE_CORNERS = 2
 # A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.
@@ -42,6 +45,7 @@ def extract_fused_mesh(
     camera: Camera | None = None,
     poses: np.ndarray | None = None,
     min_part_m2: float = MIN_PART_M2,
+    views: DepthViews | None = None,
 ) -> TriangleMesh:
     """Extracts the colored mesh of a fused volume, and of a map where nothing was fused.
 
@@ -52,6 +56,7 @@ def extract_fused_mesh(
         poses: float [F, 4, 4] T_world_camera. Surface of the map that no view sees from the front is left out.
         min_part_m2: connected components with a smaller area, m^2, are removed. A part that only the removal
             of fringes cuts off stays.
+        views: of the same frames, as they were shown; faces that these contradict are left out too.
 
     Returns:
         The mesh; empty for an empty volume. The same input gives the same mesh.
@@ -70,7 +75,7 @@ def extract_fused_mesh(
     if scene is not None:
         values = fill_with_scene(volume, values, scene)
     points, faces = march_blocks(volume.block_coords, values, volume.voxel_size)
-    measured, fringes = _measured_vertices(volume, (known, behind), points)
+    measured, steep, fringes = _measured_vertices(volume, (known, behind), points)
     normals = vertex_normals(points.cpu().numpy(), faces.cpu().numpy())
     vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
     if scene is not None:
@@ -78,6 +83,8 @@ def extract_fused_mesh(
     kept = kept[in_large_component(vertices, kept, min_part_m2)]
     # Only now: a landing that was seen at a grazing angle must not go as a whole because fringes around it do.
     kept = kept[fringes.cpu().numpy()[kept].sum(1) < _FRINGE_CORNERS]
+    if views is not None:
+        kept = kept[~_contradicted(views, points, kept, (measured, steep))]
     kept, used = compact(kept, len(vertices))
     colors = _colors(volume, scene, points[torch.from_numpy(used).to(points.device)])
     return TriangleMesh(vertices[used], kept, colors, normals[used])
@@ -85,8 +92,9 @@ def extract_fused_mesh(
 
 def _measured_vertices(
     volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor], points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Two bool [K]: whether the two voxels that a vertex lies between were measured, and if so, it is a fringe's.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Three bool [K]: whether the two voxels that a vertex lies between were measured, and if so, whether the distance
+    changes by more between them than that of one surface does, and whether it is a fringe's.
 
     Args:
         volume: what the vertices are of.
@@ -95,7 +103,7 @@ def _measured_vertices(
     """
     known, behind = (each.reshape(-1) for each in voxels)
     sdf = volume.sdf.reshape(-1)
-    measured, fringes = [known[:0]], [known[:0]]
+    measured, steep, fringes = [known[:0]], [known[:0]], [known[:0]]
     for chunk in points.split(CHUNK_POINTS):
         at = (chunk / volume.voxel_size).double()
         # A coordinate along which a vertex lies on the lattice must not be rounded to the voxel beside it.
@@ -103,9 +111,40 @@ def _measured_vertices(
         rows = torch.stack([_voxel_rows(volume, end.to(torch.int32)) for end in ends])
         found, rows = rows >= 0, rows.clamp(min=0)
         measured.append((found & known[rows]).all(0))
-        steep = (sdf[rows[0]] - sdf[rows[1]]).abs() > volume.near_truncation
-        fringes.append(measured[-1] & steep & behind[rows].any(0))
-    return torch.cat(measured), torch.cat(fringes)
+        change = (sdf[rows[0]] - sdf[rows[1]]).abs()
+        steep.append(measured[-1] & (change > STEEP_VOXELS * volume.voxel_size))
+        fringes.append(measured[-1] & (change > volume.near_truncation) & behind[rows].any(0))
+    return torch.cat(measured), torch.cat(steep), torch.cat(fringes)
+
+
+def _contradicted(
+    views: DepthViews, points: torch.Tensor, faces: np.ndarray, vertices: tuple[torch.Tensor, torch.Tensor]
+) -> np.ndarray:
+    """Bool [L]: faces that no view confirms and some contradict.
+
+    Surface between two voxels that tell of different ones lies in the shadow of an edge, unless a view saw it from its
+    front where its depth is: noise alone makes voxels differ too. What the map fills in is nothing where views see
+    something farther, and none has surface near it or no depth.
+
+    Args:
+        views: of the frames.
+        points: float32 [K, 3], vertices.
+        faces: int64 [L, 3].
+        vertices: bool [K] each, see `_measured_vertices`: measured and steep.
+    """
+    corners = torch.from_numpy(faces).to(points.device)
+    measured, steep = (each[corners] for each in vertices)
+    whole = measured.all(1)
+    rows = (~whole | steep.any(1)).nonzero()[:, 0]
+    triangles = points[corners[rows]]
+    sides = triangles[:, 1:] - triangles[:, :1]
+    normals = torch.nn.functional.normalize(torch.linalg.cross(sides[:, 0], sides[:, 1]), dim=1, eps=1e-30)
+    looks = views.look_at(triangles.mean(1), normals)
+    shadow = ~looks.agreed & (looks.near | looks.through)
+    nothing = looks.through & ~looks.near & ~looks.unknown
+    out = torch.zeros(len(faces), dtype=torch.bool, device=points.device)
+    out[rows] = torch.where(whole[rows], shadow, nothing)
+    return out.cpu().numpy()
 
 
 def _voxel_rows(volume: ops.TsdfVolume, voxels: torch.Tensor) -> torch.Tensor:

@@ -18,6 +18,7 @@ from spslam.errors import OutputError
 from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
 from spslam.meshing.color_detail import ColorOptions, color_mesh, colored_every, keep_colored
+from spslam.meshing.depth_views import DepthViews
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
@@ -140,17 +141,18 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     # Colors of voxels are for a texture, or else for vertices that no frame that gives colors sees.
     color_every = colored_every(sum(map(len, frames))) if job.texture is None else 1
     fusion = FusionOptions(job.options.resolution_m, job.options.max_memory_mb, noise, color_every)
+    views = DepthViews(frames, [part.noise or noise for part in frames])
     keep_freed_memory()
     with library_threads_limited(), interpreter_shared():
-        volume = fuse_frames(frames, fusion, job.scene, job.scene.device)
-    mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job))
+        volume = fuse_frames(frames, fusion, job.scene, job.scene.device, views)
+    mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job), views=views)
     figures = {
         "mesh_source": "tsdf",
         "mesh_frames": sum(len(part) for part in frames),
         "mesh_mb": volume.nbytes / 2**20,
         "mesh_resolution_m": volume.voxel_size,
     }
-    del volume  # the largest of what is held, not needed for colors
+    del volume, views  # the largest of what is held, not needed for colors
     if job.texture is None:
         options = ColorOptions(noise, job.options.color_subdivisions)
         with library_threads_limited(), interpreter_shared():

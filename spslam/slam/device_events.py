@@ -61,8 +61,9 @@ class StreamEvent(DeviceEvent):
         self.event.record(stream)
 
     def __del__(self):
-        # Whoever waits for it in a queue waits for what was recorded before it waited.
-        self._spare.append(self.event)
+        # A queue that waits for it waits for what had been recorded when it was told to.
+        if hasattr(self, "event"):  # else it could not be made
+            self._spare.append(self.event)
 
     def is_complete(self) -> bool:
         return self.event.query()

@@ -1,0 +1,146 @@
+"""Depth images of some of the frames that are fused: they tell which faces of the mesh a camera saw from the front.
+
+A face that closes a gap between two surfaces, or the shadow of an edge, lies where frames look through it or see
+something else, and turns its back or its edge to all of them. One that was measured is where a frame's depth is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from spslam.geometry import rotation_angle
+from spslam.ops.scene_view import Intrinsics
+
+if TYPE_CHECKING:
+    from spslam.meshing.frame_fusion import PosedFrames
+
+# Between two views the camera moved so far, or turned by so much. Four times as much finds nearly the same faces.
+APART_M, APART_DEG = 0.06, 4.0
+KEPT_BYTES = 1 << 27  # at most, of all views; fewer are taken where more would be needed
+MAX_COLUMNS = 640  # of an image
+# Depth that differs from a face's by more, m and deviations of the noise, is of another surface.
+NEAR_M, NEAR_DEVIATIONS = 0.02, 3.0
+# Depth agrees with a face up to so much, and half a pixel's size on the face, which may lie anywhere in the pixel.
+AGREEING_M, AGREEING_DEVIATIONS, AGREEING_PIXELS = 0.005, 2.0, 0.5
+_LEAST_COSINE = 0.05  # flatter faces count as this steep for the size of a pixel
+_NEAREST_M = 0.1
+
+
+class Looks(NamedTuple):
+    """What views saw of faces, bool [N] each.
+
+    Attributes:
+        agreed: one saw the face from its front where its depth is.
+        near: one saw surface near it.
+        through: one saw something farther.
+        unknown: one has no depth there.
+    """
+
+    agreed: torch.Tensor
+    near: torch.Tensor
+    through: torch.Tensor
+    unknown: torch.Tensor
+
+
+class _View(NamedTuple):
+    """Depth float16 [h, w], m, of pixels with these intrinsics; pose float64 [4, 4] T_world_camera; noise."""
+
+    depth: torch.Tensor
+    intrinsics: Intrinsics
+    pose: np.ndarray
+    noise: tuple[float, float]
+
+
+class DepthViews:
+    """The views of a fusion, chosen by where the camera was; their images come as they are fused.
+
+    Args:
+        parts: the frames that are fused.
+        noises: of the depth of each part, floor (m^2) and growth (1/m^2) of the variance.
+    """
+
+    def __init__(self, parts: Sequence[PosedFrames], noises: Sequence[tuple[float, float]]):
+        self._parts, self._noises = parts, noises
+        chosen = [(number, row) for number, part in enumerate(parts) for row in _apart(part.poses)]
+        sizes = [_bytes_of(parts[number]) for number, _ in chosen]
+        most = max(KEPT_BYTES // max(sizes, default=1), 1)
+        rows = np.unique(np.linspace(0, len(chosen) - 1, min(most, len(chosen))).round().astype(int)).tolist()
+        self._wanted = {chosen[row] for row in rows}
+        self._views: dict[tuple[int, int], _View] = {}
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def show(self, part: int, position: int, depth: torch.Tensor) -> None:
+        """Keeps the depth image float32 [H, W] (m, 0 where unknown) of a frame, if it is one of the views."""
+        if (part, position) not in self._wanted:
+            return
+        step, k = _step(self._parts[part]), self._parts[part].dataset.camera
+        intrinsics = Intrinsics(k.fx / step, k.fy / step, k.cx / step, k.cy / step)
+        image = depth[::step, ::step].half().contiguous()
+        self._views[part, position] = _View(image, intrinsics, self._parts[part].poses[position], self._noises[part])
+
+    def look_at(self, points: torch.Tensor, normals: torch.Tensor) -> Looks:
+        """What the views saw of faces at points float32 [N, 3] (m) with normals float32 [N, 3] to their front."""
+        looks = Looks(*(torch.zeros(len(points), dtype=torch.bool, device=points.device) for _ in Looks._fields))
+        points, normals = points.T.contiguous(), normals.T.contiguous()
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # the steps are short: where cores are shared, threads would wait for one another
+        try:
+            for _, view in sorted(self._views.items(), key=lambda item: item[0]):
+                _look(view, points, normals, looks)
+        finally:
+            torch.set_num_threads(threads)
+        return looks
+
+
+def _look(view: _View, points: torch.Tensor, normals: torch.Tensor, looks: Looks) -> None:
+    """Adds what a view saw of points float32 [3, N] with normals float32 [3, N]."""
+    rotation, center = view.pose[:3, :3].tolist(), view.pose[:3, 3].tolist()
+    k, (height, width) = view.intrinsics, view.depth.shape
+    ray = [points[axis] - center[axis] for axis in range(3)]
+    # Not @, whose sums depend on how many points there are.
+    x, y, z = (rotation[0][i] * ray[0] + rotation[1][i] * ray[1] + rotation[2][i] * ray[2] for i in range(3))
+    ahead = z.clamp(min=_NEAREST_M)
+    u, v = (k.fx * x / ahead + k.cx).round(), (k.fy * y / ahead + k.cy).round()
+    rows = ((z >= _NEAREST_M) & (u >= 0) & (v >= 0) & (u < width) & (v < height)).nonzero()[:, 0]
+    z, measured = z[rows], view.depth[v[rows].long(), u[rows].long()].float()
+    floor, growth = view.noise
+    deviation, behind = (floor + growth * z**4).sqrt(), measured - z
+    near_m = NEAR_M + NEAR_DEVIATIONS * deviation
+    toward = -sum(ray[axis][rows] * normals[axis][rows] for axis in range(3))
+    cosine = toward / sum(ray[axis][rows] ** 2 for axis in range(3)).sqrt()
+    pixel_m = z / k.fx / cosine.clamp(min=_LEAST_COSINE)
+    agreeing_m = AGREEING_M + AGREEING_DEVIATIONS * deviation + AGREEING_PIXELS * pixel_m
+    known, off = measured > 0, behind.abs()
+    looks.agreed[rows] |= known & (cosine > 0) & (off <= torch.minimum(agreeing_m, near_m))
+    looks.near[rows] |= known & (off <= near_m)
+    looks.through[rows] |= known & (behind > near_m)
+    looks.unknown[rows] |= ~known
+
+
+def _apart(poses: np.ndarray) -> list[int]:
+    """Rows of poses float64 [F, 4, 4] that are apart from the one before, the first among them."""
+    rows: list[int] = []
+    for row, pose in enumerate(poses):
+        if rows:
+            last = poses[rows[-1]]
+            turn_deg = np.degrees(rotation_angle(last[:3, :3].T @ pose[:3, :3]))
+            if turn_deg < APART_DEG and np.linalg.norm(pose[:3, 3] - last[:3, 3]) < APART_M:
+                continue
+        rows.append(row)
+    return rows
+
+
+def _step(part: PosedFrames) -> int:
+    return -(-part.dataset.camera.width // MAX_COLUMNS)
+
+
+def _bytes_of(part: PosedFrames) -> int:
+    """Of a view's image."""
+    step, camera = _step(part), part.dataset.camera
+    return 2 * -(-camera.width // step) * -(-camera.height // step)
