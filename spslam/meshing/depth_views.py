@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from spslam.geometry import rotation_angle
+from spslam.geometry import matrix_to_pose7
 from spslam.ops.scene_view import Intrinsics
 
 if TYPE_CHECKING:
     from spslam.meshing.frame_fusion import PosedFrames
 
-# Between two views the camera moved so far, or turned by so much. Four times as much finds nearly the same faces.
-APART_M, APART_DEG = 0.06, 4.0
+# So far any two views are apart, or turned by so much. Half and twice as much find nearly the same faces.
+APART_M, APART_DEG = 0.08, 5.0
 KEPT_BYTES = 1 << 27  # at most, of all views; fewer are taken where more would be needed
 MAX_COLUMNS = 640  # of an image
 # Depth that differs from a face's by more, m and deviations of the noise, is of another surface.
@@ -124,15 +124,16 @@ def _look(view: _View, points: torch.Tensor, normals: torch.Tensor, looks: Looks
 
 
 def _apart(poses: np.ndarray) -> list[int]:
-    """Rows of poses float64 [F, 4, 4] that are apart from the one before, the first among them."""
-    rows: list[int] = []
-    for row, pose in enumerate(poses):
-        if rows:
-            last = poses[rows[-1]]
-            turn_deg = np.degrees(rotation_angle(last[:3, :3].T @ pose[:3, :3]))
-            if turn_deg < APART_DEG and np.linalg.norm(pose[:3, 3] - last[:3, 3]) < APART_M:
-                continue
-        rows.append(row)
+    """Rows of poses float64 [F, 4, 4] that are apart from all rows before them that are, the first among them."""
+    numbers, rows = matrix_to_pose7(poses), list[int]()
+    kept = np.zeros_like(numbers)
+    least = np.cos(np.radians(APART_DEG) / 2)
+    for row, pose in enumerate(numbers):
+        others = kept[: len(rows)]
+        is_near = np.linalg.norm(others[:, 4:] - pose[4:], axis=1) < APART_M
+        if not (is_near & (np.abs(others[:, :4] @ pose[:4]) > least)).any():
+            kept[len(rows)] = pose
+            rows.append(row)
     return rows
 
 

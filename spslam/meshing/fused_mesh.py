@@ -32,7 +32,7 @@ MIN_SHARE = 0.01
 FRINGE_DEPTH, FRINGE_DEVIATIONS, FRINGE_SHARE = 0.5, 0.5, 0.3
 _DEVIATION_M = 0.003
 # Where it changes by more than so many voxels, which noise makes it do too, views are asked: see `_contradicted`.
-STEEP_VOXELS = 1.5
+STEEP_VOXELS = 1.25
 # From so many corners on a face is part of a fringe. With one it is the border of a surface, less than a voxel wide.
 _FRINGE_CORNERS = 2
 # A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.

@@ -81,7 +81,8 @@ def test_large_images_are_kept_by_every_other_pixel():
 
 def test_views_are_apart_and_within_their_memory(monkeypatch):
     still, turned = np.eye(4), pose_from(rotation_matrices(np.array([0.0, 0.1, 0.0])), np.zeros(3))
-    moved = [pose_from(np.eye(3), np.array([0.6 * APART_M * i, 0, 0])) for i in range(21)]
+    there = [*range(21), *range(20, -1, -1)]  # and back
+    moved = [pose_from(np.eye(3), np.array([0.61 * APART_M * i, 0, 0])) for i in there]
     parts = [frames_at([still, still, turned, turned]), frames_at(moved)]
 
     def kept():
