@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from spslam import ops
+from spslam.ops import trusted
 from tests.ops.threads import assert_same_for_any_threads
 from tests.reference import descriptors as reference
 
@@ -60,3 +61,24 @@ def test_sizes_that_are_not_words(size):
     bytes_ = torch.zeros(2, size, dtype=torch.uint8)
     with pytest.raises(ValueError, match="nearest_descriptors: descriptors must have a multiple of 8 bytes each"):
         ops.nearest_descriptors(bytes_, bytes_)
+
+
+def test_groups_are_compared_each_for_itself(device):
+    a, groups = drawn(150, 32, 0, 3), [drawn(rows, 32, 1 + rows, 3) for rows in (40, 0, 1, 300)]
+    others = torch.from_numpy(np.concatenate(groups)).to(device)
+    found = trusted.nearest_in_groups(torch.from_numpy(a).to(device), others, [len(group) for group in groups]).cpu()
+    for rows, distances, group in zip(*found.numpy(), groups, strict=True):
+        want_rows, want = nearest(a, group, device)
+        assert (rows == want_rows).all() and (distances.view(np.int32).reshape(-1, 2) == want).all()
+    none = trusted.nearest_in_groups(torch.from_numpy(a).to(device), others, [])
+    assert none.shape == (2, 0, 150)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [([3, 3], "as many rows as sizes"), ([-1], "as many rows as sizes"), ([0] * 17, "be 16 at most")],
+)
+def test_groups_that_are_not_there_are_refused(sizes, message):
+    five = torch.zeros(5, 32, dtype=torch.uint8)
+    with pytest.raises(RuntimeError, match=message):
+        trusted.nearest_in_groups(five, five, sizes)

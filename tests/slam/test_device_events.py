@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from spslam.slam import device_events
-from spslam.slam.device_events import host_copy
+from spslam.slam.device_events import event_recorder, host_copy, read_together
 
 
 @pytest.mark.parametrize(
@@ -35,3 +35,22 @@ def test_pieces_meet(monkeypatch, device, count):
     monkeypatch.setattr(device_events, "PIECE_BYTES", 16)
     tensor = torch.arange(count, dtype=torch.int32)
     assert torch.equal(host_copy(tensor.to(device)), tensor)
+
+
+def test_tensors_that_are_read_together_come_apart(device):
+    tensors = [torch.arange(6.0).view(2, 3), torch.tensor(7.0), torch.zeros(0), torch.arange(8.0, 10.0)]
+    found = read_together(*(tensor.to(device) for tensor in tensors))
+    assert [part.tolist() for part in found] == [[0, 1, 2, 3, 4, 5], [7], [], [8, 9]]
+
+
+def test_events_that_nobody_refers_to_are_used_again(device):
+    if device.type != "cuda":
+        pytest.skip("events of a CPU are the time")
+    record = event_recorder(device)
+    first = record()
+    kept = first.event
+    del first
+    again, other = record(), record()
+    assert again.event is kept and other.event is not kept
+    other.wait()
+    assert again.is_complete() and other.ms_since(again) >= 0
