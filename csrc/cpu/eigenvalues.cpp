@@ -1,31 +1,33 @@
-// Eigenvalues of small symmetric matrices.
-#pragma once
+// Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5).
+#include "spslam/eigenvalues.h"
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
 
 namespace spslam {
+namespace {
 
-// The least eigenvalue of a symmetric matrix [N, N] by cyclic Jacobi rotations (Golub and Van Loan, Matrix
-// Computations, 8.5), to the last bits of the largest one; NaN where an entry is not finite.
-template <int N>
-double least_eigenvalue(const double* matrix) {
-  constexpr int kMostSweeps = 20;  // six do for a 6 x 6 matrix: they converge quadratically
-  double a[N][N];
-  for (int i = 0; i < N * N; ++i) {
+constexpr int kSize = 6;
+constexpr int kMostSweeps = 20;  // six do: they converge quadratically
+
+}  // namespace
+
+double least_eigenvalue(Cpu, const double* matrix) {
+  double a[kSize][kSize];
+  for (int i = 0; i < kSize * kSize; ++i) {
     if (!std::isfinite(matrix[i])) return std::numeric_limits<double>::quiet_NaN();
-    a[i / N][i % N] = matrix[i];
+    a[i / kSize][i % kSize] = matrix[i];
   }
   for (int sweep = 0; sweep < kMostSweeps; ++sweep) {
     double off = 0.0, most = 0.0;
-    for (int p = 0; p < N; ++p) {
+    for (int p = 0; p < kSize; ++p) {
       most = std::max(most, std::fabs(a[p][p]));
-      for (int q = p + 1; q < N; ++q) off = std::max(off, std::fabs(a[p][q]));
+      for (int q = p + 1; q < kSize; ++q) off = std::max(off, std::fabs(a[p][q]));
     }
     if (off <= std::numeric_limits<double>::epsilon() * 0.01 * most) break;
-    for (int p = 0; p < N; ++p) {
-      for (int q = p + 1; q < N; ++q) {
+    for (int p = 0; p < kSize; ++p) {
+      for (int q = p + 1; q < kSize; ++q) {
         if (a[p][q] == 0.0) continue;
         // The rotation by the smaller angle that makes a[p][q] zero.
         const double slope = 0.5 * (a[q][q] - a[p][p]) / a[p][q];
@@ -34,7 +36,7 @@ double least_eigenvalue(const double* matrix) {
         a[p][p] -= t * a[p][q];
         a[q][q] += t * a[p][q];
         a[p][q] = a[q][p] = 0.0;
-        for (int i = 0; i < N; ++i) {
+        for (int i = 0; i < kSize; ++i) {
           if (i == p || i == q) continue;
           const double ip = a[i][p], iq = a[i][q];
           a[i][p] = a[p][i] = c * ip - s * iq;
@@ -44,7 +46,7 @@ double least_eigenvalue(const double* matrix) {
     }
   }
   double least = a[0][0];
-  for (int i = 1; i < N; ++i) least = std::min(least, a[i][i]);
+  for (int i = 1; i < kSize; ++i) least = std::min(least, a[i][i]);
   return least;
 }
 
