@@ -35,6 +35,7 @@ from spslam.evaluation.run_output import RunOutput
 from spslam.geometry import transform_points
 from spslam.meshing import TriangleMesh
 from spslam.meshing.color_detail import ColorOptions, color_mesh
+from spslam.meshing.depth_views import DepthViews
 from spslam.meshing.frame_fusion import FusionOptions, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.render import rasterize, render_colors
@@ -79,7 +80,9 @@ def measure(run: RunOutput, args: argparse.Namespace) -> tuple[int, dict[str, di
     ):
         meshes[f"Open3D {1e3 * args.voxels[0]:g} mm, weights {threshold}"] = mesh
     for voxel in args.voxels:
-        mesh = extract_fused_mesh(fuse_frames(frames, FusionOptions(voxel, MEMORY_MB, noise)))
+        shown = DepthViews([frames], [noise])
+        volume = fuse_frames(frames, FusionOptions(voxel, MEMORY_MB, noise), views=shown)
+        mesh = extract_fused_mesh(volume, views=shown)
         size = f"{1e3 * voxel:g} mm"
         meshes[f"voxels {size}"] = mesh
         for number in args.subdivisions:
