@@ -18,7 +18,7 @@ from spslam.ops.scene_view import Intrinsics
 if TYPE_CHECKING:
     from spslam.meshing.frame_fusion import PosedFrames
 
-# So far any two views are apart, or turned by so much. Half and twice as much find nearly the same faces.
+# So far any two views of a part are apart, or turned by so much. Half and twice as much find nearly the same faces.
 APART_M, APART_DEG = 0.08, 5.0
 KEPT_BYTES = 1 << 27  # at most, of all views; fewer are taken where more would be needed
 MAX_COLUMNS = 640  # of an image
@@ -76,7 +76,13 @@ class DepthViews:
         return len(self._views)
 
     def show(self, part: int, position: int, depth: torch.Tensor) -> None:
-        """Keeps the depth image float32 [H, W] (m, 0 where unknown) of a frame, if it is one of the views."""
+        """Keeps the depth image of a frame, if it is one of the views.
+
+        Args:
+            part: number of the part.
+            position: of the frame in it.
+            depth: float32 [H, W], m, 0 where unknown; the device on which faces are looked at.
+        """
         if (part, position) not in self._wanted:
             return
         step, k = _step(self._parts[part]), self._parts[part].dataset.camera
@@ -85,7 +91,12 @@ class DepthViews:
         self._views[part, position] = _View(image, intrinsics, self._parts[part].poses[position], self._noises[part])
 
     def look_at(self, points: torch.Tensor, normals: torch.Tensor) -> Looks:
-        """What the views saw of faces at points float32 [N, 3] (m) with normals float32 [N, 3] to their front."""
+        """What the views saw of faces.
+
+        Args:
+            points: float32 [N, 3] on them, m, on the device of the images.
+            normals: float32 [N, 3] of them, unit vectors to their front.
+        """
         looks = Looks(*(torch.zeros(len(points), dtype=torch.bool, device=points.device) for _ in Looks._fields))
         points, normals = points.T.contiguous(), normals.T.contiguous()
         threads = torch.get_num_threads()

@@ -19,7 +19,7 @@ from spslam.meshing.scene_filling import fill_with_scene
 from spslam.ops.tsdf_volume import march_blocks
 from spslam.scene import Scene
 
-# A voxel is known from this weight on, with which its mean is known to 5 cm: that of a frame from afar.
+# A voxel is known from this weight on, with which its mean is known to some 5 cm (`_DEVIATION_M` over its root).
 MIN_WEIGHT = 0.003
 # And from this share of the largest weight nearby.
 MIN_SHARE = 0.01

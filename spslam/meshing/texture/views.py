@@ -13,6 +13,7 @@ from spslam.datasets.base import RgbdFrame
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
 from spslam.geometry import inverse
+from spslam.meshing.depth_views import NEAR_DEVIATIONS, NEAR_M
 from spslam.meshing.frame_fusion import PosedFrames
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.reading import reading_threads
@@ -20,8 +21,6 @@ from spslam.meshing.reading import reading_threads
 NEAREST_M = 0.05
 # A surface seen flatter than this is not taken: cosine of the angle of incidence.
 LEAST_COSINE = 0.15
-# A vertex is visible where it is at most so many deviations of the noise, and these meters, from the depth measured.
-_SAME_DEVIATIONS, _SAME_M = 3.0, 0.02
 # Side of the cells of the coarse depth image by which a vertex is hidden where nothing was measured, px.
 _CELL_PX = 4
 # A depth step of this share is an edge; colors count fully from so many pixels away from one, and from the border.
@@ -122,10 +121,10 @@ def seen_vertices(mesh: TriangleMesh, view: ColorView) -> SeenVertices:
     front = coarse[y // _CELL_PX, x // _CELL_PX]
     measured = view.frame.depth[y, x]
     known = measured > 0
-    tolerance = _SAME_M + _SAME_DEVIATIONS * np.sqrt(view.noise[0] + view.noise[1] * z**4) + slope
+    tolerance = NEAR_M + NEAR_DEVIATIONS * np.sqrt(view.noise[0] + view.noise[1] * z**4) + slope
     apart = np.abs(measured - z) / tolerance
     agreement = np.where(known, np.maximum(1 - apart**2, 0) ** 2, np.float32(_UNMEASURED))
-    visible = (cosine > LEAST_COSINE) & (agreement > 0) & (z < front + _SAME_M + 2 * _CELL_PX * slope)
+    visible = (cosine > LEAST_COSINE) & (agreement > 0) & (z < front + NEAR_M + 2 * _CELL_PX * slope)
     # How well?
     edges = _edge_distance(view.frame.depth)[y, x]
     border = np.minimum(np.minimum(u, camera.width - 1 - u), np.minimum(v, camera.height - 1 - v)) + 1
