@@ -86,7 +86,7 @@ def _declare(library: ctypes.CDLL) -> None:
     library.spslam_light_pixels.argtypes = [pointer, count, *[pointer] * 3, integer, pointer]
     library.spslam_vertex_normals.argtypes = [pointer, count, count, pointer, pointer]
     library.spslam_vertex_normals.restype = count
-    library.spslam_component_areas.argtypes = [pointer, count, count, pointer, pointer]
+    library.spslam_component_areas.argtypes = [pointer, count, count, pointer, pointer, pointer]
     library.spslam_component_areas.restype = count
     library.spslam_mesh_edges.argtypes = [pointer, count, count, pointer, pointer]
     library.spslam_mesh_edges.restype = count

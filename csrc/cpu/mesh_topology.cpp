@@ -94,7 +94,7 @@ void vertex_normals(Cpu, const Triangles& faces, const float* points, float* nor
   }
 }
 
-void component_areas(Cpu, const Triangles& faces, const float* points, double* areas) {
+void component_areas(Cpu, const Triangles& faces, const float* points, const bool* counted, double* areas) {
   std::vector<std::int32_t> parents(faces.num_vertices);
   std::iota(parents.begin(), parents.end(), 0);
   for (std::int64_t face = 0; face < faces.count; ++face) {
@@ -108,6 +108,7 @@ void component_areas(Cpu, const Triangles& faces, const float* points, double* a
   }
   std::vector<double> sums(faces.num_vertices);
   for (std::int64_t face = 0; face < faces.count; ++face) {
+    if (counted && !counted[face]) continue;
     const Vec3<double> normal = face_normal(faces, points, face);
     sums[root_of(parents.data(), faces.corners[3 * face])] += 0.5 * std::sqrt(dot(normal, normal));
   }

@@ -26,6 +26,8 @@ MAX_COLUMNS = 640  # of an image
 NEAR_M, NEAR_DEVIATIONS = 0.02, 3.0
 # Depth agrees with a face up to so much, and half a pixel's size on the face, which may lie anywhere in the pixel.
 AGREEING_M, AGREEING_DEVIATIONS, AGREEING_PIXELS = 0.005, 2.0, 0.5
+# Faces times views that are looked at together: on a CPU as many as its cache holds, on a GPU for few steps.
+_AT_ONCE_CPU, _AT_ONCE_CUDA = 1 << 18, 1 << 22
 _LEAST_COSINE = 0.05  # flatter faces count as this steep for the size of a pixel
 _NEAREST_M = 0.1
 
@@ -99,39 +101,52 @@ class DepthViews:
         """
         looks = Looks(*(torch.zeros(len(points), dtype=torch.bool, device=points.device) for _ in Looks._fields))
         points, normals = points.T.contiguous(), normals.T.contiguous()
+        most = (_AT_ONCE_CUDA if points.is_cuda else _AT_ONCE_CPU) // max(len(looks.agreed), 1)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # the steps are short: where cores are shared, threads would wait for one another
         try:
-            for _, view in sorted(self._views.items(), key=lambda item: item[0]):
-                _look(view, points, normals, looks)
+            for views in self._alike():
+                for first in range(0, len(views), max(most, 1)):
+                    _look(views[first : first + max(most, 1)], points, normals, looks)
         finally:
             torch.set_num_threads(threads)
         return looks
 
+    def _alike(self) -> list[list[_View]]:
+        """The views in groups of one shape, of which a tensor can be made."""
+        groups: dict[torch.Size, list[_View]] = {}
+        for _, view in sorted(self._views.items(), key=lambda item: item[0]):
+            groups.setdefault(view.depth.shape, []).append(view)
+        return list(groups.values())
 
-def _look(view: _View, points: torch.Tensor, normals: torch.Tensor, looks: Looks) -> None:
-    """Adds what a view saw of points float32 [3, N] with normals float32 [3, N]."""
-    rotation, center = view.pose[:3, :3].tolist(), view.pose[:3, 3].tolist()
-    k, (height, width) = view.intrinsics, view.depth.shape
-    ray = [points[axis] - center[axis] for axis in range(3)]
+
+def _look(views: Sequence[_View], points: torch.Tensor, normals: torch.Tensor, looks: Looks) -> None:
+    """Adds what views of one shape saw of points float32 [3, N] with normals float32 [3, N]."""
+    of_views = [[*view.pose[:3].ravel().tolist(), *view.intrinsics, *view.noise] for view in views]
+    columns = torch.tensor(of_views, dtype=torch.float32, device=points.device).T[..., None]  # [18, V, 1]
+    pose, (fx, fy, cx, cy, floor, growth) = columns[:12].unflatten(0, (3, 4)), columns[12:]
+    height, width = views[0].depth.shape
+    ray = [points[axis] - pose[axis, 3] for axis in range(3)]  # float32 [V, N], as what follows
     # Not @, whose sums depend on how many points there are.
-    x, y, z = (rotation[0][i] * ray[0] + rotation[1][i] * ray[1] + rotation[2][i] * ray[2] for i in range(3))
+    x, y, z = (pose[0, i] * ray[0] + pose[1, i] * ray[1] + pose[2, i] * ray[2] for i in range(3))
     ahead = z.clamp(min=_NEAREST_M)
-    u, v = (k.fx * x / ahead + k.cx).round(), (k.fy * y / ahead + k.cy).round()
-    rows = ((z >= _NEAREST_M) & (u >= 0) & (v >= 0) & (u < width) & (v < height)).nonzero()[:, 0]
-    z, measured = z[rows], view.depth[v[rows].long(), u[rows].long()].float()
-    floor, growth = view.noise
+    u, v = (fx * x / ahead + cx).round(), (fy * y / ahead + cy).round()
+    view, row = ((z >= _NEAREST_M) & (u >= 0) & (v >= 0) & (u < width) & (v < height)).nonzero().unbind(1)
+    fx, floor, growth = (each[view, 0] for each in (fx, floor, growth))
+    seen = view, row
+    z, depths = z[seen], torch.stack([each.depth for each in views])
+    measured = depths[view, v[seen].long(), u[seen].long()].float()
     deviation, behind = (floor + growth * z**4).sqrt(), measured - z
     near_m = NEAR_M + NEAR_DEVIATIONS * deviation
-    toward = -sum(ray[axis][rows] * normals[axis][rows] for axis in range(3))
-    cosine = toward / sum(ray[axis][rows] ** 2 for axis in range(3)).sqrt()
-    pixel_m = z / k.fx / cosine.clamp(min=_LEAST_COSINE)
+    toward = -sum(ray[axis][seen] * normals[axis][row] for axis in range(3))
+    cosine = toward / sum(ray[axis][seen] ** 2 for axis in range(3)).sqrt()
+    pixel_m = z / fx / cosine.clamp(min=_LEAST_COSINE)
     agreeing_m = AGREEING_M + AGREEING_DEVIATIONS * deviation + AGREEING_PIXELS * pixel_m
     known, off = measured > 0, behind.abs()
-    looks.agreed[rows] |= known & (cosine > 0) & (off <= torch.minimum(agreeing_m, near_m))
-    looks.near[rows] |= known & (off <= near_m)
-    looks.through[rows] |= known & (behind > near_m)
-    looks.unknown[rows] |= ~known
+    looks.agreed[row[known & (cosine > 0) & (off <= torch.minimum(agreeing_m, near_m))]] = True
+    looks.near[row[known & (off <= near_m)]] = True
+    looks.through[row[known & (behind > near_m)]] = True
+    looks.unknown[row[~known]] = True
 
 
 def _apart(poses: np.ndarray) -> list[int]:
@@ -142,7 +157,8 @@ def _apart(poses: np.ndarray) -> list[int]:
     for row, pose in enumerate(numbers):
         others = kept[: len(rows)]
         is_near = np.linalg.norm(others[:, 4:] - pose[4:], axis=1) < APART_M
-        if not (is_near & (np.abs(others[:, :4] @ pose[:4]) > least)).any():
+        # Not @: for such thin products BLAS would start threads on all cores.
+        if not (is_near & (np.abs((others[:, :4] * pose[:4]).sum(1)) > least)).any():
             kept[len(rows)] = pose
             rows.append(row)
     return rows

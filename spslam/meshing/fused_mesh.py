@@ -6,15 +6,17 @@ map is moved to agree with them: the difference, averaged over its cells, is add
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
 from spslam.meshing.cleaning import face_support, front_facing_in_view, in_large_component
-from spslam.meshing.depth_views import DepthViews
+from spslam.meshing.depth_views import DepthViews, Looks
 from spslam.meshing.extract import CHUNK_POINTS, MIN_PART_M2, MIN_SUPPORT
-from spslam.meshing.mesh import TriangleMesh, compact, vertex_normals
+from spslam.meshing.mesh import TriangleMesh, compact, component_areas, vertex_normals
 from spslam.meshing.scene_filling import fill_with_scene
 from spslam.ops.tsdf_volume import march_blocks
 from spslam.scene import Scene
@@ -33,6 +35,8 @@ FRINGE_DEPTH, FRINGE_DEVIATIONS, FRINGE_SHARE = 0.5, 0.5, 0.3
 _DEVIATION_M = 0.003
 # Where it changes by more than so many voxels, which noise makes it do too, views are asked: see `_contradicted`.
 STEEP_VOXELS = 1.25
+# A small part stays if so much of its area is known to a voxel, and seen by views.
+CONFIRMED_SHARE = 0.3
 # From so many corners on a face is part of a fringe. With one it is the border of a surface, less than a voxel wide.
 _FRINGE_CORNERS = 2
 # A coordinate this close to a whole number of voxels is one: float32, at 100 m of 1 cm.
@@ -54,8 +58,8 @@ def extract_fused_mesh(
         scene: a map of the same frames in the same world; None leaves holes where nothing was measured.
         camera: intrinsics of the views at `poses`.
         poses: float [F, 4, 4] T_world_camera. Surface of the map that no view sees from the front is left out.
-        min_part_m2: connected components with a smaller area, m^2, are removed. A part that only the removal
-            of fringes cuts off stays.
+        min_part_m2: connected components with a smaller area, m^2, are removed, unless they are known well and views
+            confirm them. A part that only the removal of fringes cuts off stays.
         views: of the same frames, as they were shown; faces that these contradict are left out too.
 
     Returns:
@@ -75,26 +79,42 @@ def extract_fused_mesh(
     if scene is not None:
         values = fill_with_scene(volume, values, scene)
     points, faces = march_blocks(volume.block_coords, values, volume.voxel_size)
-    measured, steep, fringes = _measured_vertices(volume, (known, behind), points)
+    of_voxels = _vertices(volume, (known, behind), points)
     normals = vertex_normals(points.cpu().numpy(), faces.cpu().numpy())
     vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
     if scene is not None:
-        kept = kept[_supported(scene, points, faces, measured, normals, (camera, poses))]
-    kept = kept[in_large_component(vertices, kept, min_part_m2)]
-    # Only now: a landing that was seen at a grazing angle must not go as a whole because fringes around it do.
-    kept = kept[fringes.cpu().numpy()[kept].sum(1) < _FRINGE_CORNERS]
+        kept = kept[_supported(scene, points, faces, of_voxels.measured, normals, (camera, poses))]
+    stays = in_large_component(vertices, kept, min_part_m2)
     if views is not None:
-        kept = kept[~_contradicted(views, points, kept, (measured, steep))]
+        stays[~stays] = _confirmed_parts(views, points, kept[~stays], of_voxels.firm)
+    kept = kept[stays]
+    # Only now: a landing that was seen at a grazing angle must not go as a whole because fringes around it do.
+    kept = kept[of_voxels.fringes.cpu().numpy()[kept].sum(1) < _FRINGE_CORNERS]
+    if views is not None:
+        kept = kept[~_contradicted(views, points, kept, of_voxels)]
     kept, used = compact(kept, len(vertices))
     colors = _colors(volume, scene, points[torch.from_numpy(used).to(points.device)])
     return TriangleMesh(vertices[used], kept, colors, normals[used])
 
 
-def _measured_vertices(
-    volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor], points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Three bool [K]: whether the two voxels that a vertex lies between were measured, and if so, whether the distance
-    changes by more between them than that of one surface does, and whether it is a fringe's.
+class _Vertices(NamedTuple):
+    """What the two voxels that a vertex lies between say of it, bool [K] each.
+
+    Attributes:
+        measured: both were.
+        firm: both are known to a voxel.
+        steep: measured, and the distance changes by more between them than that of one surface does.
+        fringes: it is a fringe's.
+    """
+
+    measured: torch.Tensor
+    firm: torch.Tensor
+    steep: torch.Tensor
+    fringes: torch.Tensor
+
+
+def _vertices(volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor], points: torch.Tensor) -> _Vertices:
+    """What is known of vertices.
 
     Args:
         volume: what the vertices are of.
@@ -102,24 +122,45 @@ def _measured_vertices(
         points: float32 [K, 3], vertices.
     """
     known, behind = (each.reshape(-1) for each in voxels)
-    sdf = volume.sdf.reshape(-1)
-    measured, steep, fringes = [known[:0]], [known[:0]], [known[:0]]
+    sdf, weights = volume.sdf.reshape(-1), volume.weights.reshape(-1)
+    firm_weight = (_DEVIATION_M / volume.voxel_size) ** 2
+    chunks = [_Vertices(*(known[:0] for _ in _Vertices._fields))]
     for chunk in points.split(CHUNK_POINTS):
         at = (chunk / volume.voxel_size).double()
         # A coordinate along which a vertex lies on the lattice must not be rounded to the voxel beside it.
         ends = ((at + _LATTICE).floor(), (at - _LATTICE).ceil())
         rows = torch.stack([_voxel_rows(volume, end.to(torch.int32)) for end in ends])
         found, rows = rows >= 0, rows.clamp(min=0)
-        measured.append((found & known[rows]).all(0))
+        measured = (found & known[rows]).all(0)
+        firm = measured & (weights[rows] >= firm_weight).all(0)
         change = (sdf[rows[0]] - sdf[rows[1]]).abs()
-        steep.append(measured[-1] & (change > STEEP_VOXELS * volume.voxel_size))
-        fringes.append(measured[-1] & (change > volume.near_truncation) & behind[rows].any(0))
-    return torch.cat(measured), torch.cat(steep), torch.cat(fringes)
+        steep = measured & (change > STEEP_VOXELS * volume.voxel_size)
+        fringes = measured & (change > volume.near_truncation) & behind[rows].any(0)
+        chunks.append(_Vertices(measured, firm, steep, fringes))
+    return _Vertices(*map(torch.cat, zip(*chunks, strict=True)))
 
 
-def _contradicted(
-    views: DepthViews, points: torch.Tensor, faces: np.ndarray, vertices: tuple[torch.Tensor, torch.Tensor]
-) -> np.ndarray:
+def _confirmed_parts(views: DepthViews, points: torch.Tensor, faces: np.ndarray, firm: torch.Tensor) -> np.ndarray:
+    """Bool [L]: faces of parts of which `CONFIRMED_SHARE` is known to a voxel, and seen from its front by views.
+
+    Small parts are noise as a rule; the slats of a blind or the rungs of a chair that a camera saw from afar are not.
+
+    Args:
+        views: of the frames.
+        points: float32 [K, 3], vertices.
+        faces: int64 [L, 3].
+        firm: bool [K], see `_Vertices`.
+    """
+    corners = torch.from_numpy(faces).to(points.device)
+    known = firm[corners].all(1).nonzero()[:, 0]
+    agreed = torch.zeros(len(faces), dtype=torch.bool, device=points.device)
+    agreed[known] = _looks(views, points[corners[known]]).agreed
+    vertices = points.cpu().numpy()
+    confirmed = component_areas(vertices, faces, agreed.cpu().numpy())
+    return confirmed > CONFIRMED_SHARE * component_areas(vertices, faces)
+
+
+def _contradicted(views: DepthViews, points: torch.Tensor, faces: np.ndarray, vertices: _Vertices) -> np.ndarray:
     """Bool [L]: faces that no view confirms and some contradict.
 
     Surface between two voxels that tell of different ones lies in the shadow of an edge, unless a view saw it from its
@@ -130,21 +171,24 @@ def _contradicted(
         views: of the frames.
         points: float32 [K, 3], vertices.
         faces: int64 [L, 3].
-        vertices: bool [K] each, see `_measured_vertices`: measured and steep.
+        vertices: what their voxels say of them.
     """
     corners = torch.from_numpy(faces).to(points.device)
-    measured, steep = (each[corners] for each in vertices)
-    whole = measured.all(1)
-    rows = (~whole | steep.any(1)).nonzero()[:, 0]
-    triangles = points[corners[rows]]
-    sides = triangles[:, 1:] - triangles[:, :1]
-    normals = torch.nn.functional.normalize(torch.linalg.cross(sides[:, 0], sides[:, 1]), dim=1, eps=1e-30)
-    looks = views.look_at(triangles.mean(1), normals)
+    whole = vertices.measured[corners].all(1)
+    rows = (~whole | vertices.steep[corners].any(1)).nonzero()[:, 0]
+    looks = _looks(views, points[corners[rows]])
     shadow = ~looks.agreed & (looks.near | looks.through)
     nothing = looks.through & ~looks.near & ~looks.unknown
     out = torch.zeros(len(faces), dtype=torch.bool, device=points.device)
     out[rows] = torch.where(whole[rows], shadow, nothing)
     return out.cpu().numpy()
+
+
+def _looks(views: DepthViews, triangles: torch.Tensor) -> Looks:
+    """What views saw of triangles float32 [N, 3, 3]."""
+    sides = triangles[:, 1:] - triangles[:, :1]
+    normals = torch.nn.functional.normalize(torch.linalg.cross(sides[:, 0], sides[:, 1]), dim=1, eps=1e-30)
+    return views.look_at(triangles.mean(1), normals)
 
 
 def _voxel_rows(volume: ops.TsdfVolume, voxels: torch.Tensor) -> torch.Tensor:

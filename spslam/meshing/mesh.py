@@ -107,8 +107,13 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals
 
 
-def component_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def component_areas(vertices: np.ndarray, faces: np.ndarray, counted: np.ndarray | None = None) -> np.ndarray:
     """The area, float64 [L], m^2, of the connected component of each face; faces that share a vertex are connected.
+
+    Args:
+        vertices: float32 [K, 3], m.
+        faces: integers [L, 3].
+        counted: bool [L]; the area of other faces does not count. None counts all.
 
     Raises:
         ValueError: a face of other indices than those of vertices.
@@ -116,9 +121,15 @@ def component_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     points, faces = np.ascontiguousarray(vertices, np.float32), indexed(faces, len(vertices))
     areas = np.empty(len(faces))
+    flags = None if counted is None else np.ascontiguousarray(counted, bool)
     check_memory(
         image_library().spslam_component_areas(
-            faces.ctypes.data, len(faces), len(points), points.ctypes.data, areas.ctypes.data
+            faces.ctypes.data,
+            len(faces),
+            len(points),
+            points.ctypes.data,
+            None if flags is None else flags.ctypes.data,
+            areas.ctypes.data,
         )
     )
     return areas

@@ -121,6 +121,30 @@ def test_a_face_that_no_view_confirms_goes_where_one_sees_past_it():
     assert wall_of(both) == 9 * 16
 
 
+def _plate(weight, device):
+    """What is known around 3 x 3 cm of a floor at z = 1.5 cm, of voxels of 1 cm."""
+    volume = ops.TsdfVolume(0.01, device=device)
+    volume.add_blocks(torch.cartesian_prod(*[torch.arange(2, dtype=torch.int32, device=device)] * 3))
+    local = torch.cartesian_prod(*[torch.arange(8, device=device)] * 3)
+    x, y, z = (volume.block_coords[:, None] * 8 + local[None]).unbind(-1)
+    volume.sdf.copy_(0.01 * (z - 1.5).clamp(-2, 2))
+    volume.weights.copy_(weight * (((x - 7.5).abs() < 2) & ((y - 7.5).abs() < 2)))
+    return volume
+
+
+@pytest.mark.parametrize(
+    ("weight", "sees", "stays"), [(1.0, 0.015, True), (1.0, -0.2, False), (0.05, 0.015, False), (1.0, None, False)]
+)
+def test_a_small_part_stays_where_it_is_known_well_and_a_view_confirms_it(device, weight, sees, stays):
+    above = _looking((0.075, 0.075, 0.6), (0.075, 0.0751, 0.0))
+    views = None
+    if sees is not None:
+        depth = (sees - above[2, 3]) / (CAMERA.ray_directions() @ above[:3, :3].T)[..., 2]
+        views = shown(depth, above, device=device)
+    assert (len(extract_fused_mesh(_plate(weight, device), views=views).faces) > 0) == stays
+    assert len(extract_fused_mesh(_plate(weight, device), min_part_m2=0).faces) == 18
+
+
 @pytest.mark.parametrize(("sees", "stays"), [("nothing", True), ("it", True), ("through", False)])
 def test_what_the_map_fills_in_goes_where_views_look_through_it(device, sees, stays):
     scene = _scene(_slab, (0.5, 0.5, 0.03), device)

@@ -82,6 +82,7 @@ def test_two_components_are_told_apart():
     vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (5, 0, 0), (7, 0, 0), (5, 2, 0)], np.float32)
     faces = np.array([(0, 1, 2), (3, 4, 5), (3, 5, 4)], np.int32)
     assert component_areas(vertices, faces).tolist() == [0.5, 4.0, 4.0]
+    assert component_areas(vertices, faces, np.array([False, True, False])).tolist() == [0.0, 2.0, 2.0]
 
 
 def test_nothing_of_no_faces():

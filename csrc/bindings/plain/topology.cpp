@@ -16,9 +16,10 @@ SPS_EXPORT std::int64_t spslam_vertex_normals(const std::int32_t* faces, std::in
 }
 
 SPS_EXPORT std::int64_t spslam_component_areas(const std::int32_t* faces, std::int64_t num_faces,
-                                               std::int64_t num_vertices, const float* points, double* areas) {
+                                               std::int64_t num_vertices, const float* points, const bool* counted,
+                                               double* areas) {
   try {
-    spslam::component_areas(spslam::Cpu{}, {num_vertices, num_faces, faces}, points, areas);
+    spslam::component_areas(spslam::Cpu{}, {num_vertices, num_faces, faces}, points, counted, areas);
   } catch (const std::bad_alloc&) {
     return -1;
   }

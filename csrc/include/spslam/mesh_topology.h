@@ -18,8 +18,8 @@ struct Triangles {
 void vertex_normals(Cpu device, const Triangles& faces, const float* points, float* normals);
 
 // Writes the area of the connected component of each face [count], in the unit of `points` float32 [num_vertices, 3]
-// squared. Faces that share a vertex are connected.
-void component_areas(Cpu device, const Triangles& faces, const float* points, double* areas);
+// squared. Faces that share a vertex are connected. Where `counted` [count] is not null, other faces connect alone.
+void component_areas(Cpu device, const Triangles& faces, const float* points, const bool* counted, double* areas);
 
 // The edges of faces, each once, in ascending order of their ends. Writes those, the lower first, [3 count, 2] at most,
 // and which edges each face has [count, 3]: from its first corner to the second, to the third, and back. Returns how
