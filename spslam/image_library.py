@@ -73,6 +73,8 @@ def _declare(library: ctypes.CDLL) -> None:
     number = ctypes.c_double
     library.spslam_point_equations.argtypes = [pointer, count, pointer, pointer, number, pointer]
     library.spslam_point_equations.restype = count
+    library.spslam_agreeing_points.argtypes = [pointer, count, pointer, pointer, number, pointer]
+    library.spslam_agreeing_points.restype = None
     library.spslam_ray_equations.argtypes = [pointer, count, pointer, pointer, number, count, pointer]
     library.spslam_ray_equations.restype = count
     library.spslam_hold_pose.argtypes = [pointer, pointer, count, pointer, count, pointer]

@@ -29,14 +29,14 @@ Pose<double> pose_of(const double* m) {
   return {{{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]}}, {m[3], m[7], m[11]}};
 }
 
-// Calls f(shown) for each point before the camera.
+// Calls f(i, shown) for each point before the camera.
 template <class F>
 void for_each_point(const SeenPoints& seen, const FeatureCamera& k, const Pose<double>& pose, const F& f) {
   for (std::int64_t i = 0; i < seen.count; ++i) {
     const Point point = to_camera(pose.rotation, load_point(seen.points + 3 * i) - pose.translation);
     if (!(point.z > kMinFeatureDepth)) continue;
     const Point moved = kDepthDeviations * to_camera(pose.rotation, load_point(seen.deviations + 3 * i));
-    f(shown_feature(k, point, 1.0 / point.z, seen.positions + 2 * i, moved));
+    f(i, shown_feature(k, point, 1.0 / point.z, seen.positions + 2 * i, moved));
   }
 }
 
@@ -49,7 +49,7 @@ void for_each_ray(const SeenRays& seen, const FeatureCamera& k, const Pose<doubl
     const Point point = to_camera(pose.rotation, load_point(seen.directions + 3 * i)) + inverse_depth * moved;
     if (!(point.z > kMinFeatureDepth)) continue;
     const Point off = kInverseDepthDeviations * inverse_depth * moved;
-    f(shown_feature(k, point, inverse_depth / point.z, seen.positions + 2 * i, off));
+    f(i, shown_feature(k, point, inverse_depth / point.z, seen.positions + 2 * i, off));
   }
 }
 
@@ -93,14 +93,14 @@ struct FeatureSums {
 FeatureEquations equations_of(const SeenPoints& seen, const FeatureCamera& camera, const Pose<double>& pose,
                               double error_px) {
   FeatureSums sums{camera, error_px};
-  for_each_point(seen, camera, pose, [&](const ShownFeature& shown) { sums.add(shown); });
+  for_each_point(seen, camera, pose, [&](std::int64_t, const ShownFeature& shown) { sums.add(shown); });
   return sums.equations(pose.rotation, 0);
 }
 
 FeatureEquations equations_of(const SeenRays& seen, const FeatureCamera& camera, const Pose<double>& pose,
                               double error_px, std::int64_t least) {
   FeatureSums sums{camera, error_px};
-  for_each_ray(seen, camera, pose, [&](const ShownFeature& shown) { sums.add(shown); });
+  for_each_ray(seen, camera, pose, [&](std::int64_t, const ShownFeature& shown) { sums.add(shown); });
   return sums.equations(pose.rotation, least);
 }
 
@@ -144,13 +144,12 @@ FeatureEquations point_equations(Cpu, const SeenPoints& seen, const FeatureCamer
   return equations_of(seen, camera, pose_of(pose), error_px);
 }
 
-std::int64_t agreeing_points(Cpu, const SeenPoints& seen, const FeatureCamera& camera, const double* pose,
-                             double error_px) {
-  std::int64_t agreeing = 0;
-  for_each_point(seen, camera, pose_of(pose), [&](const ShownFeature& shown) {
-    agreeing += feature_error(camera, shown, error_px).square() < error_px * error_px;
+void agreeing_points(Cpu, const SeenPoints& seen, const FeatureCamera& camera, const double* pose, double error_px,
+                     bool* agrees) {
+  std::fill(agrees, agrees + seen.count, false);
+  for_each_point(seen, camera, pose_of(pose), [&](std::int64_t i, const ShownFeature& shown) {
+    agrees[i] = feature_error(camera, shown, error_px).square() < error_px * error_px;
   });
-  return agreeing;
 }
 
 FeatureEquations ray_equations(Cpu, const SeenRays& seen, const FeatureCamera& camera, const double* pose,

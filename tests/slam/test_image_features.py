@@ -59,12 +59,12 @@ def pose_of(dataset, frame):
 
 
 def some_of(matches, rows):
-    return FeatureMatches(matches.points[rows], matches.positions[rows], matches.deviations[rows])
+    return FeatureMatches(matches.points[rows], matches.positions[rows], matches.deviations[rows], matches.rows[rows])
 
 
 def exact(points, positions):
     """Matches of points whose depth has no noise."""
-    return FeatureMatches(points, positions, np.zeros_like(points))
+    return FeatureMatches(points, positions, np.zeros_like(points), np.arange(len(points)))
 
 
 def random_features(count, seed):
@@ -181,6 +181,10 @@ def test_matches_with_several_frames_give_a_pose_together(dataset, features):
     error = inverse(dataset.poses()[4]) @ pose_matrix(alignment.pose(together, CPU))
     assert np.linalg.norm(error[:3, 3]) < BASIN_M
     assert alignment.pose(joined_too([halves[0], halves[0]])[-1], CPU) is None
+    color_pose = dataset.poses()[4]
+    counts = [alignment.inliers(matches, color_pose) for matches in halves]
+    assert alignment.inliers(together, color_pose) == sum(counts) > MIN_INLIERS
+    assert alignment.inliers(joined_too([halves[0], halves[0]])[-1], color_pose) == counts[0]
     assert joined_too(halves[:1]) == halves[:1]
     assert joined_too([]) == []
 

@@ -124,6 +124,17 @@ def test_features_that_hold_a_pose_speak_for_it():
     assert error_probability(GOOD, **anywhere, **held) > 0.5
 
 
+def test_of_poses_that_features_hold_the_nearer_one_to_the_prediction_is_likelier():
+    """Alone, both are as likely as where they were predicted."""
+    held = replace(GOOD, feature_inliers=100, feature_share=0.9)
+    near, far = (
+        replace(held, prediction_error_cm=cm, prediction_error_deg=deg) for cm, deg in ((0.9, 0.1), (7.1, 0.7))
+    )
+    assert MODEL.error_probability(near) == MODEL.error_probability(far)
+    assert MODEL.error_probability(near, compares=True) < MODEL.error_probability(far, compares=True)
+    assert MODEL.error_probability(near, compares=True) > MODEL.error_probability(near)
+
+
 def test_an_unknown_measure_counts_between_right_and_wrong():
     for name, wrong in (("free_space_violation", 0.3), ("prediction_error_cm", 50.0)):
         unknown = error_probability(GOOD, **{name: math.nan})

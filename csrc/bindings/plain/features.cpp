@@ -34,13 +34,19 @@ SPS_EXPORT std::int64_t spslam_orb_features(const std::uint8_t* intensity, const
   }
 }
 
-// seen: points, positions, deviations. camera: fx, fy, cx, cy. equations: hessian and gradient [42]; null counts alone.
-// Returns how many points agree.
+// seen: points, positions, deviations. camera: fx, fy, cx, cy. equations: hessian and gradient [42]. Returns how many
+// points agree.
 SPS_EXPORT std::int64_t spslam_point_equations(const double* const* seen, std::int64_t count, const double* camera,
                                                const double* pose, double error_px, double* equations) {
   const spslam::SeenPoints points{seen[0], seen[1], seen[2], count};
-  if (!equations) return spslam::agreeing_points(spslam::Cpu{}, points, camera_of(camera), pose, error_px);
   return store(spslam::point_equations(spslam::Cpu{}, points, camera_of(camera), pose, error_px), equations);
+}
+
+// agrees: bool [count].
+SPS_EXPORT void spslam_agreeing_points(const double* const* seen, std::int64_t count, const double* camera,
+                                       const double* pose, double error_px, bool* agrees) {
+  const spslam::SeenPoints points{seen[0], seen[1], seen[2], count};
+  spslam::agreeing_points(spslam::Cpu{}, points, camera_of(camera), pose, error_px, agrees);
 }
 
 // seen: origin, directions, positions, range.

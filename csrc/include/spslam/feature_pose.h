@@ -41,9 +41,9 @@ struct FeatureEquations {
 FeatureEquations point_equations(Cpu device, const SeenPoints& seen, const FeatureCamera& camera, const double* pose,
                                  double error_px);
 
-// How many points agree, alone.
-std::int64_t agreeing_points(Cpu device, const SeenPoints& seen, const FeatureCamera& camera, const double* pose,
-                             double error_px);
+// Which points agree, alone: `agrees` [count].
+void agreeing_points(Cpu device, const SeenPoints& seen, const FeatureCamera& camera, const double* pose,
+                     double error_px, bool* agrees);
 
 // The same of rays beyond the range z of depth: at an inverse depth n = 1/2z, give or take 4 n. The derivative d of a
 // position by the inverse depth says how far it may be off along its epipolar line: errors there count by

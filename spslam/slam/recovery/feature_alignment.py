@@ -46,11 +46,14 @@ class FeatureMatches(SeenPoints):
 
     Attributes:
         points, positions, deviations: see `SeenPoints`.
-        agreeing: how many of them agree with the pose that they give.
+        rows: int64 [M], the frame's features that they are matched with; the same one several times where they are of
+            several earlier frames.
+        agreeing: how many of the frame's features agree with the pose that they give.
         before: float64 [M, 2], where the earlier frame showed them; None where nobody asks.
         rays: what was matched beyond the range of depth; None where that is not kept of the earlier frame.
     """
 
+    rows: np.ndarray
     agreeing: int = 0
     before: np.ndarray | None = None
     rays: SeenRays | None = None
@@ -132,7 +135,8 @@ class FeatureAlignment:
         before, turn = (local @ self._matrix.T)[:, :2] / local[:, 2:], to_world[:3, :3].T
         z, (floor, growth) = local[:, 2:], self._depth_noise
         deviations = np.sqrt(floor + growth * z**4) * (local / z) @ turn
-        return FeatureMatches(local @ turn + to_world[:3, 3], positions, deviations, before=before, rays=rays)
+        points = local @ turn + to_world[:3, 3]
+        return FeatureMatches(points, positions, deviations, pairs[:, 0], before=before, rays=rays)
 
     def _rays(self, earlier: ImageFeatures, to_world: np.ndarray, pairs: np.ndarray) -> SeenRays:
         """Those of the pairs that lie beyond the range of the earlier frame's depth."""
@@ -156,7 +160,7 @@ class FeatureAlignment:
         if not is_found or inliers is None:
             return None
         rows = inliers[:, 0]
-        if len(np.unique(matches.positions[rows], axis=0)) < MIN_INLIERS:
+        if _count_distinct(matches.rows[rows]) < MIN_INLIERS:
             return None
         rotation, translation = cv2.solvePnPRefineLM(
             matches.points[rows], matches.positions[rows], self._matrix, None, rotation, translation
@@ -214,15 +218,16 @@ class FeatureAlignment:
         return pose if self._motion is None else self._motion.color_pose(pose)
 
     def inliers(self, matches: FeatureMatches, color_pose: np.ndarray, late_px: float = 0.0) -> int:
-        """How many matches agree with a pose: their points reproject to within `max_error_px`, and what the noise of
-        their depth may add along their epipolar lines.
+        """How many of the frame's features agree with a pose: a point that one is matched with reprojects to within
+        `max_error_px`, and what the noise of its depth may add along its epipolar line.
 
         Args:
-            matches: with an earlier frame.
+            matches: with earlier frames; a feature that several of them have counts once.
             color_pose: of this frame, see `color_pose`.
             late_px: or to within so much, which the image may have moved since depth was measured.
         """
-        return agreeing_points(self._intrinsics, matches, color_pose, max(self.max_error_px, late_px))
+        agrees = agreeing_points(self._intrinsics, matches, color_pose, max(self.max_error_px, late_px))
+        return _count_distinct(matches.rows[agrees])
 
     def ray_inliers(self, matches: FeatureMatches, color_pose: np.ndarray) -> int:
         """How many rays agree with a pose, see `inliers`: reprojected, what lies on them beyond the range of depth may
@@ -264,7 +269,13 @@ def _joined(matches: Sequence[FeatureMatches]) -> FeatureMatches:
         np.concatenate([np.zeros((0, columns)), *(getattr(one, name) for one in matches)])
         for name, columns in (("points", 3), ("positions", 2), ("deviations", 3))
     )
-    return FeatureMatches(points, positions, deviations)
+    rows = np.concatenate([np.zeros(0, np.int64), *(one.rows for one in matches)])
+    return FeatureMatches(points, positions, deviations, rows)
+
+
+def _count_distinct(rows: np.ndarray) -> int:
+    """How many different ones there are among rows int64 [N] of a frame's features, hundreds."""
+    return int(np.count_nonzero(np.bincount(rows)))
 
 
 def ratio_matches(descriptors: torch.Tensor, earlier: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -106,12 +106,13 @@ def point_equations(
     return count, equations[:36].reshape(6, 6), equations[36:]
 
 
-def agreeing_points(camera: np.ndarray, seen: SeenPoints, pose: np.ndarray, error_px: float) -> int:
-    """How many points agree with a pose; as `point_equations`."""
-    pose = _row_major(pose)
-    return image_library().spslam_point_equations(
-        seen.addresses.first, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, None
+def agreeing_points(camera: np.ndarray, seen: SeenPoints, pose: np.ndarray, error_px: float) -> np.ndarray:
+    """Bool [M]: which points agree with a pose; as `point_equations`."""
+    agrees, pose = np.empty(len(seen), bool), _row_major(pose)
+    image_library().spslam_agreeing_points(
+        seen.addresses.first, len(seen), camera.ctypes.data, pose.ctypes.data, error_px, agrees.ctypes.data
     )
+    return agrees
 
 
 def ray_equations(

@@ -90,8 +90,14 @@ class PoseConfidenceModel:
             raise ConfigError(f"{MODEL_FILE}: constants that do not match the program's: {different}; reinstall spslam")
         return cls(**{name: float(value) for name, value in constants.items()})
 
-    def error_probability(self, fit: Fit) -> float:
-        """Probability in [0, 1] that the pose is wrong; NaN where it was not tracked."""
+    def error_probability(self, fit: Fit, compares: bool = False) -> float:
+        """Probability in [0, 1] that the pose is wrong; NaN where it was not tracked.
+
+        Args:
+            fit: of the pose.
+            compares: with other poses of the frame: then the motion model counts even where image features hold it, as
+                they may hold several.
+        """
         if math.isnan(fit.mean_robust_weight) or math.isnan(fit.min_eigenvalue):
             return math.nan
         violation = fit.free_space_violation
@@ -100,7 +106,7 @@ class PoseConfidenceModel:
             self.intercept
             + self.per_mean_robust_weight * self._weight_where_mapped(fit)
             + self.per_log10_min_eigenvalue * self._log10_min_eigenvalue(fit)
-            + self.per_prediction_error * self._prediction_error(fit)
+            + self.per_prediction_error * self._prediction_error(fit, compares)
             + self.per_free_space_violation * min(violation, self.max_free_space_violation)
             + self.per_missing_correlation * self._missing_correlation(fit)
             + self.per_missing_feature_share * self._missing_feature_share(fit)
@@ -151,14 +157,14 @@ class PoseConfidenceModel:
         lg = math.log10(max(fit.min_eigenvalue, least))
         return lg + (self.weak_eigenvalue_factor - 1) * min(lg - math.log10(self.firm_eigenvalue), 0.0)
 
-    def _prediction_error(self, fit: Fit) -> float:
+    def _prediction_error(self, fit: Fit, compares: bool) -> float:
         error = math.log1p(
             fit.prediction_error_cm / self.prediction_error_scale_cm
             + fit.prediction_error_deg / self.prediction_error_scale_deg
         )
         if math.isnan(error):
             return self.unknown_prediction_error
-        if self.is_held(fit) and fit.inlier_share > 0:
+        if self.is_held(fit) and fit.inlier_share > 0 and not compares:
             return 0.0
         # Features that agree with the pose say nothing of the motion model, which may then be wrong.
         is_confirmed = fit.feature_inliers >= self.min_feature_inliers

@@ -349,7 +349,7 @@ class Recovery:
         fit = tracked.fit
         if anywhere:
             fit = replace(fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
-        probability = self._confidence.error_probability(fit)
+        probability = self._confidence.error_probability(fit, compares=True)
         return math.inf if math.isnan(probability) else probability
 
     def _relocalize(self, frame: DoubtfulFrame, candidates: list[TrackedFrame]) -> TrackedFrame:
