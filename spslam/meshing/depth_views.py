@@ -27,7 +27,7 @@ NEAR_M, NEAR_DEVIATIONS = 0.02, 3.0
 # Depth agrees with a face up to so much, and half a pixel's size on the face, which may lie anywhere in the pixel.
 AGREEING_M, AGREEING_DEVIATIONS, AGREEING_PIXELS = 0.005, 2.0, 0.5
 # Faces times views that are looked at together: on a CPU as many as its cache holds, on a GPU for few steps.
-_AT_ONCE_CPU, _AT_ONCE_CUDA = 1 << 18, 1 << 22
+_AT_ONCE_CPU, _AT_ONCE_CUDA = 1 << 18, 1 << 21
 _LEAST_COSINE = 0.05  # flatter faces count as this steep for the size of a pixel
 _NEAREST_M = 0.1
 

@@ -116,10 +116,12 @@ def component_areas(vertices: np.ndarray, faces: np.ndarray, counted: np.ndarray
         counted: bool [L]; the area of other faces does not count. None counts all.
 
     Raises:
-        ValueError: a face of other indices than those of vertices.
+        ValueError: a face of other indices than those of vertices, or `counted` of another length.
         MemoryError: there is not enough.
     """
     points, faces = np.ascontiguousarray(vertices, np.float32), indexed(faces, len(vertices))
+    if counted is not None and np.shape(counted) != (len(faces),):
+        raise ValueError(f"component_areas: counted must have shape ({len(faces)},), got {np.shape(counted)}")
     areas = np.empty(len(faces))
     flags = None if counted is None else np.ascontiguousarray(counted, bool)
     check_memory(

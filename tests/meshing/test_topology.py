@@ -83,6 +83,8 @@ def test_two_components_are_told_apart():
     faces = np.array([(0, 1, 2), (3, 4, 5), (3, 5, 4)], np.int32)
     assert component_areas(vertices, faces).tolist() == [0.5, 4.0, 4.0]
     assert component_areas(vertices, faces, np.array([False, True, False])).tolist() == [0.0, 2.0, 2.0]
+    with pytest.raises(ValueError, match=r"counted must have shape \(3,\), got \(2,\)"):
+        component_areas(vertices, faces, np.ones(2, bool))
 
 
 def test_nothing_of_no_faces():
