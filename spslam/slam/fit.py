@@ -58,6 +58,10 @@ class Fit:
         other.__dict__.update(self.__dict__, **measures)
         return other
 
+    def unpredicted(self) -> "Fit":
+        """The same of a camera that may be anywhere: nothing says how far it is from where it was expected."""
+        return self.having(prediction_error_cm=math.nan, prediction_error_deg=math.nan)
+
     @property
     def is_far_from_prediction(self) -> bool:
         """Whether the motion model was wrong by so much that tracking may have stopped half-way, or slid."""

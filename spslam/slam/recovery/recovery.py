@@ -346,9 +346,7 @@ class Recovery:
         return candidates[i].agreement * (1 + MIN_GAIN * (i == 0))
 
     def _rank(self, tracked: TrackedFrame, anywhere: bool) -> float:
-        fit = tracked.fit
-        if anywhere:
-            fit = replace(fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
+        fit = tracked.fit.unpredicted() if anywhere else tracked.fit
         probability = self._confidence.error_probability(fit, compares=True)
         return math.inf if math.isnan(probability) else probability
 
@@ -382,7 +380,7 @@ class Recovery:
         only the former counts, and many image features must agree.
         """
         was_near = is_consistent(tracked.fit)
-        fit = replace(tracked.fit, prediction_error_cm=math.nan, prediction_error_deg=math.nan)
+        fit = tracked.fit.unpredicted()
         tracked = self._judged(replace(tracked, fit=fit))
         is_firm = fit.min_eigenvalue >= WEAK_EIGENVALUE
         is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
