@@ -88,8 +88,8 @@ test-asan: $(ENVIRONMENT) ## the tests of compiled functions on the CPU with add
 	$(RUN) cmake --install build/asan --component images --prefix build/asan-site > /dev/null
 	cd build/asan-site && LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(abspath $(PYTHON)) -m pytest --capture=sys -m "not cuda" tests/ops \
-	  tests/datasets/test_image_kernels.py tests/datasets/test_png.py tests/meshing/test_render.py tests/slam/test_orb_features.py \
-	  tests/slam/test_feature_equations.py tests/slam/test_pose_confidence.py tests/slam/test_rolling_shutter.py
+	  tests/datasets/test_image_kernels.py tests/datasets/test_png.py tests/meshing/test_render.py tests/meshing/test_topology.py \
+	  tests/slam/test_orb_features.py tests/slam/test_feature_equations.py tests/slam/test_pose_confidence.py tests/slam/test_rolling_shutter.py
 
 fuzz: dev ## read corrupted files of every format for MINUTES (60), in JOBS processes; see docs/reliability.md
 	$(PYTHON) -m tests.fuzz --minutes $(or $(MINUTES),60) --jobs $(JOBS)
