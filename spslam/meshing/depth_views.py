@@ -28,6 +28,7 @@ NEAR_M, NEAR_DEVIATIONS = 0.02, 3.0
 AGREEING_M, AGREEING_DEVIATIONS, AGREEING_PIXELS = 0.005, 2.0, 0.5
 # Faces times views that are looked at together: on a CPU as many as its cache holds, on a GPU for few steps.
 _AT_ONCE_CPU, _AT_ONCE_CUDA = 1 << 18, 1 << 21
+_VIEWS_AT_ONCE = 16  # at most: their images are copied for it
 _LEAST_COSINE = 0.05  # flatter faces count as this steep for the size of a pixel
 _NEAREST_M = 0.1
 
@@ -101,13 +102,14 @@ class DepthViews:
         """
         looks = Looks(*(torch.zeros(len(points), dtype=torch.bool, device=points.device) for _ in Looks._fields))
         points, normals = points.T.contiguous(), normals.T.contiguous()
-        most = (_AT_ONCE_CUDA if points.is_cuda else _AT_ONCE_CPU) // max(len(looks.agreed), 1)
+        wanted = (_AT_ONCE_CUDA if points.is_cuda else _AT_ONCE_CPU) // max(len(looks.agreed), 1)
+        count = min(max(wanted, 1), _VIEWS_AT_ONCE)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # the steps are short: where cores are shared, threads would wait for one another
         try:
             for views in self._alike():
-                for first in range(0, len(views), max(most, 1)):
-                    _look(views[first : first + max(most, 1)], points, normals, looks)
+                for first in range(0, len(views), count):
+                    _look(views[first : first + count], points, normals, looks)
         finally:
             torch.set_num_threads(threads)
         return looks
@@ -121,7 +123,7 @@ class DepthViews:
 
 
 def _look(views: Sequence[_View], points: torch.Tensor, normals: torch.Tensor, looks: Looks) -> None:
-    """Adds what views of one shape saw of points float32 [3, N] with normals float32 [3, N]."""
+    """Adds what views of one shape saw of points float32 [3, N], m, with unit normals float32 [3, N]."""
     of_views = [[*view.pose[:3].ravel().tolist(), *view.intrinsics, *view.noise] for view in views]
     columns = torch.tensor(of_views, dtype=torch.float32, device=points.device).T[..., None]  # [18, V, 1]
     pose, (fx, fy, cx, cy, floor, growth) = columns[:12].unflatten(0, (3, 4)), columns[12:]

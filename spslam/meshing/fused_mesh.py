@@ -13,7 +13,7 @@ import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.meshing.cleaning import face_support, front_facing_in_view, in_large_component
+from spslam.meshing.cleaning import face_support, front_facing_in_view
 from spslam.meshing.depth_views import DepthViews, Looks
 from spslam.meshing.extract import CHUNK_POINTS, MIN_PART_M2, MIN_SUPPORT
 from spslam.meshing.mesh import TriangleMesh, compact, component_areas, vertex_normals
@@ -84,9 +84,12 @@ def extract_fused_mesh(
     vertices, kept = points.cpu().numpy(), faces.cpu().numpy()
     if scene is not None:
         kept = kept[_supported(scene, points, faces, of_voxels.measured, normals, (camera, poses))]
-    stays = in_large_component(vertices, kept, min_part_m2)
+    areas = component_areas(vertices, kept)
+    stays = areas >= min_part_m2
     if views is not None:
-        stays[~stays] = _confirmed_parts(views, points, kept[~stays], of_voxels.firm)
+        small = kept[~stays]
+        agreed = _firmly_seen(views, points, small, of_voxels.firm)
+        stays[~stays] = component_areas(vertices, small, agreed) > CONFIRMED_SHARE * areas[~stays]
     kept = kept[stays]
     # Only now: a landing that was seen at a grazing angle must not go as a whole because fringes around it do.
     kept = kept[of_voxels.fringes.cpu().numpy()[kept].sum(1) < _FRINGE_CORNERS]
@@ -102,7 +105,7 @@ class _Vertices(NamedTuple):
 
     Attributes:
         measured: both were.
-        firm: both are known to a voxel.
+        firm: the standard deviation of both is a voxel's edge at most.
         steep: measured, and the distance changes by more between them than that of one surface does.
         fringes: it is a fringe's.
     """
@@ -140,14 +143,14 @@ def _vertices(volume: ops.TsdfVolume, voxels: tuple[torch.Tensor, torch.Tensor],
     return _Vertices(*map(torch.cat, zip(*chunks, strict=True)))
 
 
-def _confirmed_parts(views: DepthViews, points: torch.Tensor, faces: np.ndarray, firm: torch.Tensor) -> np.ndarray:
-    """Bool [L]: faces of parts of which `CONFIRMED_SHARE` is known to a voxel, and seen from its front by views.
+def _firmly_seen(views: DepthViews, points: torch.Tensor, faces: np.ndarray, firm: torch.Tensor) -> np.ndarray:
+    """Bool [L]: faces that are known to a voxel, and that views saw from their front where their depth is.
 
-    Small parts are noise as a rule; the slats of a blind or the rungs of a chair that a camera saw from afar are not.
+    Small parts are noise as a rule; the slats of a blind that a camera saw from afar, for one, are not.
 
     Args:
         views: of the frames.
-        points: float32 [K, 3], vertices.
+        points: float32 [K, 3], vertices, m.
         faces: int64 [L, 3].
         firm: bool [K], see `_Vertices`.
     """
@@ -155,9 +158,7 @@ def _confirmed_parts(views: DepthViews, points: torch.Tensor, faces: np.ndarray,
     known = firm[corners].all(1).nonzero()[:, 0]
     agreed = torch.zeros(len(faces), dtype=torch.bool, device=points.device)
     agreed[known] = _looks(views, points[corners[known]]).agreed
-    vertices = points.cpu().numpy()
-    confirmed = component_areas(vertices, faces, agreed.cpu().numpy())
-    return confirmed > CONFIRMED_SHARE * component_areas(vertices, faces)
+    return agreed.cpu().numpy()
 
 
 def _contradicted(views: DepthViews, points: torch.Tensor, faces: np.ndarray, vertices: _Vertices) -> np.ndarray:
@@ -185,7 +186,7 @@ def _contradicted(views: DepthViews, points: torch.Tensor, faces: np.ndarray, ve
 
 
 def _looks(views: DepthViews, triangles: torch.Tensor) -> Looks:
-    """What views saw of triangles float32 [N, 3, 3]."""
+    """What views saw of triangles float32 [N, 3, 3], m."""
     sides = triangles[:, 1:] - triangles[:, :1]
     normals = torch.nn.functional.normalize(torch.linalg.cross(sides[:, 0], sides[:, 1]), dim=1, eps=1e-30)
     return views.look_at(triangles.mean(1), normals)

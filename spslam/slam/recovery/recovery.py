@@ -184,7 +184,8 @@ class Recovery:
         pose = torch.from_numpy(numbers).to(tracked.pose.device)
         estimate = self._tracker.measure(frame.problem, pose)
         matrix = pose7_to_matrix(numbers.astype(np.float64))
-        frame = replace(frame, matches=tuple(image.counted(one, image.of_color(matrix)) for one in matches))
+        at = image.of_color(matrix)
+        frame = replace(frame, matches=tuple(image.counted(one, at) for one in matches))
         fit, on_host = frame.with_features(estimate.fit, matrix), (pose, tuple(numbers.tolist()))
         held = self._judged(replace(tracked, pose=pose, fit=fit, features=image.read, on_host=on_host))
         fits = held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted
