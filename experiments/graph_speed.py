@@ -24,9 +24,9 @@ from spslam.run.device import resolve_device
 from spslam.run_folder import RunFolder
 from spslam.scene import SparseVolume
 from spslam.slam.graph.archive import KeyframeArchive
-from spslam.slam.graph.host_threads import host_threads
 from spslam.slam.graph.registration import Registrar
 from spslam.slam.graph.remap import encode_keyframes, own_stream
+from spslam.slam.host_threads import host_threads
 from spslam.slam.opened_map import load_archive
 from spslam.slam.poses import pose_tensor
 

@@ -1,4 +1,5 @@
-// One block runs all iterations: summing a few thousand points takes less time than a barrier between blocks.
+// One block runs all iterations of a cloud: summing a few thousand points takes less time than a barrier between
+// blocks.
 #include "cuda/warp_sums.cuh"
 #include "kernels/projective_icp.h"
 
@@ -9,8 +10,11 @@ constexpr int kWarps = 16;
 constexpr int kThreads = kWarps * kWarp;
 static_assert(kTrackingTerms <= kWarp, "one lane per term");
 
-__global__ void __launch_bounds__(kThreads) icp_kernel(const float* points, std::int64_t num_points, SurfaceMaps target,
-                                                       IcpOptions options, float* pose, float* stats, float* hessian) {
+__global__ void __launch_bounds__(kThreads) icp_kernel(PointClouds sources, SurfaceMaps target, IcpOptions options,
+                                                       float* poses, float* stats, float* hessians) {
+  const std::int64_t cloud = blockIdx.x, num_points = sources.size;
+  const float* points = sources.points + 3 * num_points * cloud;
+  float* pose = poses + kPoseSize * cloud;
   __shared__ float sums[kWarps][kWarp];
   __shared__ double terms[kWarp];
   __shared__ float own_pose[kPoseSize], own_hessian[36];
@@ -32,27 +36,29 @@ __global__ void __launch_bounds__(kThreads) icp_kernel(const float* points, std:
       terms[lane] = sum;
     }
     __syncthreads();
-    float* own_stats = stats + kTrackingStatSize * iteration;
+    float* own_stats = stats + kTrackingStatSize * (options.iterations * cloud + iteration);
     if (threadIdx.x == 0) tracking_step(terms, terms, options.damping, 0.0, own_pose, own_stats + 2, own_hessian);
     if (threadIdx.x == kWarp) tracking_fit(terms, num_points, own_stats);
     __syncthreads();
   }
   if (threadIdx.x < kPoseSize) pose[threadIdx.x] = own_pose[threadIdx.x];
-  if (threadIdx.x < 36) hessian[threadIdx.x] = own_hessian[threadIdx.x];
+  if (threadIdx.x < 36) hessians[36 * cloud + threadIdx.x] = own_hessian[threadIdx.x];
 }
 
 }  // namespace
 
 template <>
-std::int64_t projective_icp_workspace_size<Cuda>(Cuda, std::int64_t) {
+std::int64_t projective_icp_workspace_size<Cuda>(Cuda, const PointClouds&) {
   return 0;
 }
 
 template <>
-void projective_icp<Cuda>(Cuda device, const float* points, std::int64_t num_points, const SurfaceMaps& target,
-                          const IcpOptions& options, void*, float* pose, float* stats, float* hessian) {
-  icp_kernel<<<1, kThreads, 0, static_cast<cudaStream_t>(device.stream)>>>(points, num_points, target, options, pose,
-                                                                           stats, hessian);
+void projective_icp<Cuda>(Cuda device, const PointClouds& sources, const SurfaceMaps& target, const IcpOptions& options,
+                          void*, float* poses, float* stats, float* hessians) {
+  if (sources.count == 0) return;
+  const unsigned blocks = static_cast<unsigned>(sources.count);
+  icp_kernel<<<blocks, kThreads, 0, static_cast<cudaStream_t>(device.stream)>>>(sources, target, options, poses, stats,
+                                                                                hessians);
 }
 
 }  // namespace spslam

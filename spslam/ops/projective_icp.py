@@ -27,7 +27,7 @@ def projective_icp(
     kernel_end: float = 0.03,
     damping: float = 1e-4,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Aligns a point cloud with the vertex and normal maps of a camera.
+    """Aligns a point cloud with the vertex and normal maps of a camera, or several with the same, each by itself.
 
     All iterations run in one call, on CUDA in one kernel. Each iteration updates the associations, solves
     (H + damping diag(H) + (1e-6 tr(H) + 1e-8) I) delta = -g, and limits the norm of the step to 0.15 (m and rad). The
@@ -35,10 +35,11 @@ def projective_icp(
     the last.
 
     Args:
-        points: float32 [N, 3] source points, m, in the source camera's axes.
+        points: float32 [N, 3] source points, m, in the source camera's axes; or [B, N, 3], of several.
         vertices: float32 [H, W, 3] target points, m, in the target camera's axes; z = 0 where there is none.
         normals: float32 [H, W, 3] their unit normals; pixels with normal 0 are ignored.
-        pose: float32 [7] initial pose, unit quaternion (w, x, y, z) and translation (m), T_target_source.
+        pose: float32 [7] initial pose, unit quaternion (w, x, y, z) and translation (m), T_target_source; [B, 7] for
+            points [B, N, 3].
         intrinsics: of the maps, in their pixels: a map of every s-th pixel has focal lengths f / s and principal point
             (c + 1/2) / s - 1/2.
         iterations: number of iterations.
@@ -50,9 +51,10 @@ def projective_icp(
     Returns:
         float32 [7] pose; float32 [iterations, 5] with the weighted mean squared residual (m^2), the share of points
         with an association, the norms of the step in translation (m) and rotation (rad), and the mean weight over all
-        points, each before the step of the iteration; float32 [6, 6] H of the last iteration. The same bits in every
-        run on one device, and for any number of CPU threads. N = 0 or an empty map does not change the pose. Points,
-        vertices and normals that are not finite are ignored; all are ignored if the pose is not finite.
+        points, each before the step of the iteration; float32 [6, 6] H of the last iteration; each [B, ...] for points
+        [B, N, 3]. The same bits in every run on one device, for any number of CPU threads, alone or among others. N = 0
+        or an empty map does not change the pose. Points, vertices and normals that are not finite are ignored; all are
+        ignored if the pose is not finite.
 
     Raises:
         TypeError, ValueError: a tensor of another dtype, shape or device, or a number out of range.
@@ -67,21 +69,22 @@ def projective_icp(
         True
     """
     name = "projective_icp"
-    check_tensor(name, "points", points, ("N", 3), torch.float32)
+    several = torch.is_tensor(points) and points.dim() == 3
+    check_tensor(name, "points", points, ("B", "N", 3) if several else ("N", 3), torch.float32)
     check_tensor(name, "vertices", vertices, ("H", "W", 3), torch.float32, like=points)
     check_tensor(name, "normals", normals, tuple(vertices.shape), torch.float32, like=points)
-    check_tensor(name, "pose", pose, (7,), torch.float32, like=points)
+    check_tensor(name, "pose", pose, (len(points), 7) if several else (7,), torch.float32, like=points)
     check_intrinsics(name, intrinsics)
     check_count(name, "iterations", iterations)
     check(max_distance > 0, name, "max_distance", "be positive", max_distance)
     kernels = (kernel_start, kernel_end)
     check(min(kernels) > 0, name, "kernel_start and kernel_end", "be positive", kernels)
     check(damping >= 0, name, "damping", "be at least 0", damping)
-    return torch.ops.spslam.projective_icp(
-        points,
+    found = torch.ops.spslam.projective_icp(
+        points if several else points[None],
         vertices,
         normals,
-        pose,
+        pose if several else pose[None],
         list(intrinsics),
         iterations,
         max_distance,
@@ -89,8 +92,10 @@ def projective_icp(
         kernel_end,
         damping,
     )
+    return found if several else tuple(each[0] for each in found)
 
 
 @torch.library.register_fake("spslam::projective_icp")
 def _(points, vertices, normals, pose, intrinsics, iterations, *_):
-    return pose.new_empty(7), pose.new_empty((iterations, 5)), pose.new_empty((6, 6))
+    count = len(pose)
+    return pose.new_empty((count, 7)), pose.new_empty((count, iterations, 5)), pose.new_empty((count, 6, 6))

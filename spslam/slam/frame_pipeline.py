@@ -89,7 +89,7 @@ class FramePipeline:
         self._measures_timing = tracking.depth_keyframes and tracking.color and tracking.capture_timing
         confidence = PoseConfidenceModel.load()
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
-        self.recovery = Recovery(config, camera, self.tracker, confidence)
+        self.recovery = Recovery(config, camera, self.tracker, confidence, self.device)
         self._localizer = Localizer(self.tracker, self.recovery, self._rectifier)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
         self.first_pose = np.eye(4)

@@ -116,6 +116,19 @@ def test_same_bits_every_time(device):
         assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
+def test_clouds_are_aligned_each_by_itself(device):
+    points, vertices, normals, _ = problem(0.05, 4.0, device)
+    clouds = torch.stack([points, points * 0.99, points[:1].expand_as(points)])
+    starts = torch.stack([START, pose7(motion(0.02, 1.0)), START]).to(device)
+    together = ops.projective_icp(clouds, vertices, normals, starts, INTRINSICS, **OPTIONS)
+    assert [tuple(each.shape) for each in together] == [(3, 7), (3, 15, 5), (3, 6, 6)]
+    for i in range(3):
+        alone = ops.projective_icp(clouds[i], vertices, normals, starts[i], INTRINSICS, **OPTIONS)
+        assert all(torch.equal(several[i], one) for several, one in zip(together, alone, strict=True))
+    none = ops.projective_icp(clouds[:0], vertices, normals, starts[:0], INTRINSICS, iterations=2)
+    assert [tuple(each.shape) for each in none] == [(0, 7), (0, 2, 5), (0, 6, 6)]
+
+
 def test_strided_input(device):
     points, vertices, normals, _ = problem(0.05, 4.0, device)
     wide = torch.stack([points, points], 2)[..., 0]
@@ -147,9 +160,14 @@ def test_arguments_are_named():
         ops.projective_icp(points, vertices, normals[:1], START, INTRINSICS)
     with pytest.raises(TypeError, match="projective_icp: pose must be float32, got float64"):
         ops.projective_icp(points, vertices, normals, START.double(), INTRINSICS)
+    with pytest.raises(ValueError, match=r"projective_icp: pose must have shape \[2, 7\], got \[7\]"):
+        ops.projective_icp(torch.stack([points, points]), vertices, normals, START, INTRINSICS)
+    with pytest.raises(TypeError, match=r"projective_icp: points must be a torch.Tensor, got list"):
+        ops.projective_icp([], vertices, normals, START, INTRINSICS)
 
 
 def test_opcheck(device):
     points, vertices, normals, _ = problem(0.0, 0.0)
-    arguments = (points, vertices, normals, START, list(INTRINSICS), 2, 0.3, 0.1, 0.03, 1e-4)
+    clouds, starts = torch.stack([points, points]), torch.stack([START, START])
+    arguments = (clouds, vertices, normals, starts, list(INTRINSICS), 2, 0.3, 0.1, 0.03, 1e-4)
     opcheck(torch.ops.spslam.projective_icp.default, arguments, device)

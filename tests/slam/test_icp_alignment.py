@@ -84,8 +84,14 @@ def test_a_frame_without_normals_has_empty_maps(dataset, pixels):
 @pytest.mark.parametrize(("shift_m", "angle_deg"), [(0.0, 0.0), (0.05, 5.0), (0.1, 10.0)])
 def test_icp_leads_to_where_tracking_finds_the_pose(dataset, system, pixels, shift_m, angle_deg):
     ground_truth = dataset.poses()[10]
-    found = IcpAlignment(pixels, dataset.camera).pose(earlier(system), moved(ground_truth, shift_m, angle_deg))
-    assert_near(found, ground_truth, distance_m=0.02, angle_deg=2.0)
+    alignment, start = IcpAlignment(pixels, dataset.camera), moved(ground_truth, shift_m, angle_deg)
+    found = alignment.poses(
+        [(earlier(system), start), (earlier(system), pose_tensor(ground_truth, torch.device("cpu")))]
+    )
+    for pose in found:
+        assert_near(pose, ground_truth, distance_m=0.02, angle_deg=2.0)
+    assert torch.equal(alignment.poses([(earlier(system), start)])[0], found[0])
+    assert alignment.poses([]) == []
 
 
 @pytest.mark.parametrize(("shift_m", "angle_deg"), [(0.15, 12.0), (50.0, 90.0)])

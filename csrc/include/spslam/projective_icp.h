@@ -8,6 +8,12 @@
 
 namespace spslam {
 
+// Points in the axes of source cameras, as many of each.
+struct PointClouds {
+  const float* points;  // [count, size, 3] m
+  std::int64_t count, size;
+};
+
 // A surface seen by a camera: a point and its unit normal at each pixel, in camera axes.
 struct SurfaceMaps {
   const float* vertices;  // [height, width, 3] m; z = 0 where there is none
@@ -24,12 +30,12 @@ struct IcpOptions {
 };
 
 template <class Device>
-std::int64_t projective_icp_workspace_size(Device device, std::int64_t num_points);
+std::int64_t projective_icp_workspace_size(Device device, const PointClouds& sources);
 
-// points [num_points, 3] in the source camera's axes; pose [7] T_target_source is read and overwritten; stats
-// [iterations, kTrackingStatSize], shares being of num_points; hessian [36] of the last iteration, before damping.
+// Each cloud by itself: poses [count, 7] T_target_source are read and overwritten; stats [count, iterations,
+// kTrackingStatSize], shares being of a cloud's size; hessians [count, 36] of the last iteration, before damping.
 template <class Device>
-void projective_icp(Device device, const float* points, std::int64_t num_points, const SurfaceMaps& target,
-                    const IcpOptions& options, void* workspace, float* pose, float* stats, float* hessian);
+void projective_icp(Device device, const PointClouds& sources, const SurfaceMaps& target, const IcpOptions& options,
+                    void* workspace, float* poses, float* stats, float* hessians);
 
 }  // namespace spslam

@@ -26,7 +26,6 @@ from spslam.scene import SparseVolume
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.fit import prediction_error
 from spslam.slam.graph.edges import Link, LoopDecision
-from spslam.slam.graph.host_threads import give_way, host_threads
 from spslam.slam.graph.joining import Component, find_frame
 from spslam.slam.graph.keyframe import NEAR_SHARE, ArrivingKeyframe, Keyframe
 from spslam.slam.graph.keyframe_graph import GraphUpdate
@@ -42,6 +41,7 @@ from spslam.slam.graph.remap import (
 )
 from spslam.slam.graph.solver import GraphProblem, GraphSolution
 from spslam.slam.graph.solver_process import make_solver
+from spslam.slam.host_threads import give_way, host_threads
 from spslam.slam.pixels import FramePixels
 from spslam.slam.state import SlamState
 

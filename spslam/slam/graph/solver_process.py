@@ -20,11 +20,11 @@ import torch
 from spslam.config import Config
 from spslam.errors import SpslamError, brief
 from spslam.helper_process import DISCONNECTED, NOT_STARTED, HelperProcess, describe_exit
-from spslam.slam.graph.host_threads import give_way
 from spslam.slam.graph.keyframe import Keyframe
 from spslam.slam.graph.solver import GraphProblem, GraphSolution, GraphSolver, is_begin, kept
 from spslam.slam.graph.solver_launch import SOLVERS
 from spslam.slam.graph.solver_message import Answer, Request
+from spslam.slam.host_threads import give_way
 
 _EXIT_TIMEOUT_S = 5.0
 

@@ -13,10 +13,10 @@ import torch
 
 from spslam import ops
 from spslam.helper_process import DISCONNECTED
-from spslam.slam.graph.host_threads import host_thread_count
 from spslam.slam.graph.keyframe import Keyframe
 from spslam.slam.graph.solver import GraphSolver, kept
 from spslam.slam.graph.solver_message import Answer, Request
+from spslam.slam.host_threads import host_thread_count
 
 
 def serve(socket: int) -> None:

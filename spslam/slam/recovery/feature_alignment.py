@@ -6,6 +6,7 @@ three-point solver within RANSAC (OpenCV's `solvePnPRansac` by USAC, Raguram et 
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -148,6 +149,14 @@ class FeatureAlignment:
         directions = np.concatenate([before, np.ones((len(before), 1))], 1) @ self._inverse_matrix.T
         positions = self.features.positions[row].astype(np.float64)
         return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, ranges[known].astype(np.float64))
+
+    def poses(
+        self, several: Sequence[FeatureMatches], device: torch.device, threads: ThreadPoolExecutor | None = None
+    ) -> list[torch.Tensor | None]:
+        """`pose` of several matches, each by itself; on threads, where there are some."""
+        if threads is None or len(several) < 2:
+            return [self.pose(one, device) for one in several]
+        return list(threads.map(self.pose, several, [device] * len(several)))
 
     def pose(self, matches: FeatureMatches, device: torch.device) -> torch.Tensor | None:
         """Pose float32 [7] of the frame; None where fewer than `MIN_INLIERS` matches agree on one."""

@@ -1,16 +1,17 @@
 """Further initial poses for tracking, from projective ICP against earlier frames; needs no map."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
+import numpy as np
 import torch
 
 from spslam import ops
 from spslam.camera import Camera
-from spslam.geometry import compose, inverse
+from spslam.geometry import compose, inverse, matrix_to_pose7, pose7_to_matrix
 from spslam.slam.cell_grid import CellGrid
 from spslam.slam.frame_history import EarlierFrame
 from spslam.slam.pixels import FramePixels, unpack_points
-from spslam.slam.poses import pose_matrix, pose_tensor
 
 POINTS = 4096  # pixels of the earlier frame that are aligned
 ITERATIONS = 20  # converge from 10 cm and 10 degrees; 15 do not always
@@ -27,16 +28,31 @@ class IcpAlignment:
         """The frame's `surface_maps`, made where they are first asked for: few doubtful frames need them."""
         return surface_maps(self._pixels, self._camera)
 
-    def pose(self, earlier: EarlierFrame, start: torch.Tensor) -> torch.Tensor:
-        """Pose float32 [7] of the frame, found from `start` float32 [7]; `start` itself where nothing overlaps."""
-        earlier_to_world = pose_matrix(earlier.pose)
-        earlier_to_frame = pose_tensor(compose(inverse(pose_matrix(start)), earlier_to_world), start.device)
-        points = unpack_points(earlier.records[:POINTS], self._camera)
+    def poses(self, starts: Sequence[tuple[EarlierFrame, torch.Tensor]]) -> list[torch.Tensor]:
+        """Poses of the frame, each against an earlier frame: together, as a device is waited for twice.
+
+        Args:
+            starts: earlier frames, and the poses float32 [7] to begin at.
+
+        Returns:
+            float32 [7] each; that to begin at where nothing overlaps.
+        """
+        if not starts:
+            return []
+        earlier, begin = zip(*starts, strict=True)
+        numbers = torch.stack([*(frame.pose for frame in earlier), *begin])
+        to_world, from_frame = np.split(pose7_to_matrix(_on_host(numbers)), 2)
+        to_frame = torch.from_numpy(matrix_to_pose7(compose(inverse(from_frame), to_world))).to(numbers)
+        records = torch.cat([frame.records[:POINTS] for frame in earlier])
+        points = unpack_points(records, self._camera).unflatten(0, (len(starts), -1))
         vertices, normals, intrinsics = self.maps
-        earlier_to_frame, _, _ = ops.projective_icp(
-            points, vertices, normals, earlier_to_frame, intrinsics, iterations=ITERATIONS
-        )
-        return pose_tensor(compose(earlier_to_world, inverse(pose_matrix(earlier_to_frame))), start.device)
+        to_frame, _, _ = ops.projective_icp(points, vertices, normals, to_frame, intrinsics, iterations=ITERATIONS)
+        found = compose(to_world, inverse(pose7_to_matrix(_on_host(to_frame))))
+        return list(torch.from_numpy(matrix_to_pose7(found)).to(numbers))
+
+
+def _on_host(poses: torch.Tensor) -> np.ndarray:
+    return poses.cpu().double().numpy()
 
 
 def surface_maps(pixels: FramePixels, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, ops.Intrinsics]:

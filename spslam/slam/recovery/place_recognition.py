@@ -20,6 +20,7 @@ TURNED_CANDIDATES = 32  # the best are also compared as if the camera had turned
 TURN_COLUMNS, TURN_ROWS = 0.15, 0.2  # share of the image by which it may have turned, or twice that to the side
 MIN_OVERLAP = 0.4  # share of an image that must remain to be compared
 MIN_DEPTH_M = 0.05
+_OUTSIDE = -1.0
 # Of a frame's image features those of so many stored frames are compared: the newest, and others in turn, so that
 # while a camera is lost all are.
 NEWEST_COMPARED, OTHERS_COMPARED = 16, 32
@@ -91,18 +92,18 @@ def thumbnail_difference(depth_thumbnail: torch.Tensor, others: torch.Tensor) ->
     """Mean difference of the logarithms of depth between depth thumbnails, clamped to `MAX_LOG_DIFFERENCE`.
 
     Args:
-        depth_thumbnail: float16 [h, w], m, 0 where unknown.
-        others: float16 [F, h, w].
+        depth_thumbnail: float16 [..., h, w], m, 0 where unknown, `_OUTSIDE` where the image does not reach.
+        others: float16 [..., h, w]; leading dimensions are broadcast.
 
     Returns:
-        float32 [F]; cells that neither image knows do not count.
+        float32 [...]; cells that neither image knows do not count, nor those that the first does not reach.
     """
     one, known = depth_thumbnail.float().clamp(min=MIN_DEPTH_M).log(), depth_thumbnail > 0
     other, others_known = others.float().clamp(min=MIN_DEPTH_M).log(), others > 0
     difference = (one - other).abs().clamp(max=MAX_LOG_DIFFERENCE)
     difference = torch.where(known & others_known, difference, ONE_SIDED_DIFFERENCE)
-    either = known | others_known
-    return (difference * either).sum((1, 2)) / either.sum((1, 2)).clamp(min=1)
+    either = (known | others_known) & (depth_thumbnail >= 0)
+    return (difference * either).sum((-2, -1)) / either.sum((-2, -1)).clamp(min=1)
 
 
 def turned_differences(
@@ -121,15 +122,10 @@ def turned_differences(
     down, right = max(round(TURN_ROWS * height), 1), max(round(TURN_COLUMNS * width), 1)
     shifts = [(y, x) for y in (0, -down, down) for x in (0, -right, right, -2 * right, 2 * right)]
     shifts = [(y, x) for y, x in shifts if (height - abs(y)) * (width - abs(x)) >= MIN_OVERLAP * height * width]
-    differences = [thumbnail_difference(_part(depth_thumbnail, -y, -x), _part(others, y, x)) for y, x in shifts]
-    return shifts, torch.stack(differences)
-
-
-def _part(thumbnails: torch.Tensor, down: int, right: int) -> torch.Tensor:
-    """Images [..., h, w] without the first rows and columns, or the last where negative."""
-    height, width = thumbnails.shape[-2:]
-    rows = slice(max(down, 0), height + min(down, 0))
-    return thumbnails[..., rows, max(right, 0) : width + min(right, 0)]
+    margin = 2 * right
+    padded = F.pad(depth_thumbnail, (margin, margin, down, down), value=_OUTSIDE)
+    shifted = [padded[down - y :, margin - x :][:height, :width] for y, x in shifts]
+    return shifts, thumbnail_difference(torch.stack(shifted)[:, None], others)
 
 
 def turned(pose: torch.Tensor, shift: tuple[int, int], camera: Camera) -> torch.Tensor:

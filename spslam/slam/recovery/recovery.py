@@ -13,6 +13,7 @@ from spslam.config import Config
 from spslam.geometry import pose7_to_matrix
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
+from spslam.slam.host_threads import host_threads
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.doubtful_frame import (
@@ -51,11 +52,20 @@ class Recovery:
         camera: of all frames.
         tracker: optimizes the pose from other initial poses.
         confidence: computes the probability that a pose is wrong.
+        device: of the map.
     """
 
-    def __init__(self, config: Config, camera: Camera, tracker: Tracker, confidence: PoseConfidenceModel):
+    def __init__(
+        self,
+        config: Config,
+        camera: Camera,
+        tracker: Tracker,
+        confidence: PoseConfidenceModel,
+        device: torch.device,
+    ):
         self._config, self._camera, self._tracker, self._confidence = config, camera, tracker, confidence
         self._verifier = Verifier(config, camera, confidence)
+        self._threads = host_threads(device)
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
 
     def judge(self, estimate: PoseEstimate) -> TrackedFrame:
@@ -274,7 +284,7 @@ class Recovery:
         frame = frame.compared(row, self._anchors(history, row))
         frame, by_features = self._match(frame, frame.near)
         from_poses = (*by_features, frame.problem.predicted, last.pose)
-        return frame, [*by_features, *(frame.alignment.pose(last, start) for start in from_poses)]
+        return frame, [*by_features, *frame.alignment.poses([(last, start) for start in from_poses])]
 
     def _anchors(self, history: FrameHistory, row: int) -> list[int]:
         """Rows of the newest stored frames with image features before `row`: from frame to frame a pose may slide."""
@@ -285,8 +295,9 @@ class Recovery:
         if frame.image is None:
             return frame, []
         matches, starts = list(frame.matches), []
-        for matched in joined_too(found):
-            start = frame.image.pose(matched, frame.problem.predicted.device)
+        several = joined_too(found)
+        poses = frame.image.poses(several, frame.problem.predicted.device, self._threads)
+        for matched, start in zip(several, poses, strict=True):
             if start is not None:
                 matches.append(frame.image.counted(matched, frame.image.color_pose(start)))
                 starts.append(start)
@@ -358,7 +369,7 @@ class Recovery:
         """
         count, known = self._config.tracking.relocalization_candidates, len(candidates)
         alike = retrieve(frame.history, frame.pixels, count, self._camera)
-        starts = [frame.alignment.pose(candidate.earlier, candidate.start) for candidate in alike]
+        starts = frame.alignment.poses([(candidate.earlier, candidate.start) for candidate in alike])
         if frame.image is not None and count:
             rows = retrieve_by_features(frame.history, frame.image, frame.problem.frame)
             frame, by_features = self._match(frame, frame.matched(rows))

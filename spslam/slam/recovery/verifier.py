@@ -29,6 +29,7 @@ class Verifier:
     def __init__(self, config: Config, camera: Camera, confidence: PoseConfidenceModel):
         self._config, self._camera, self._confidence = config, camera, confidence
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
+        self._covered: tuple[FramePixels, Scene, float] | None = None  # the coverage as a frame found it
 
     def verified(
         self,
@@ -51,18 +52,23 @@ class Verifier:
         """
         rows = history.compared_rows()
         counts, best = surface_counts(pixels, pose, history.poses, history.depth_thumbnails, rows, self._camera)
-        brightness = [self._brightness_sums(pixels, pose, rows[best], history)] if compares_brightness else []
+        asked = [self._brightness_sums(pixels, pose, rows[best], history)] if compares_brightness else []
+        known = self._covered
+        is_known = known is not None and known[0] is pixels and known[1] is scene
+        if not is_known:
+            asked.append(self._map_coverage(scene, history))
         # Waits for the device, once.
-        numbers = torch.cat([counts, self._map_coverage(scene, history), *brightness]).tolist()
-        seen, through, occluded = numbers[:3]
+        seen, through, occluded, *numbers = torch.cat([counts, *asked]).tolist()
+        coverage = known[2] if known is not None and is_known else numbers.pop()
+        self._covered = pixels, scene, coverage
         unknown = self._confidence.unknown_free_space_violation
         violation, occluded_share = surface_shares(seen, through, occluded, unknown)
         return replace(
             fit,
             free_space_violation=violation,
             occluded_share=occluded_share,
-            map_coverage=numbers[3],
-            brightness_correlation=brightness_correlation(*numbers[4:]) if brightness else math.nan,
+            map_coverage=coverage,
+            brightness_correlation=brightness_correlation(*numbers) if compares_brightness else math.nan,
         )
 
     def _brightness_sums(

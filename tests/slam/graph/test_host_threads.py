@@ -9,11 +9,11 @@ import torch
 from spslam.prior import load_prior
 from spslam.scene import SparseVolume
 from spslam.slam.graph.edges import Link
-from spslam.slam.graph.host_threads import host_threads
 from spslam.slam.graph.keyframe_graph import GraphContent, KeyframeGraph
 from spslam.slam.graph.overlap import Surfaces
 from spslam.slam.graph.registration import Registrar
 from spslam.slam.graph.remap import encode_keyframe, encode_keyframes
+from spslam.slam.host_threads import host_threads
 from tests.slam.graph.worlds import NOISE, keyframes, place, relative
 
 NUMBERS = tuple(range(0, 96, 8))

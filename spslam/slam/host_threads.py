@@ -1,4 +1,4 @@
-"""Threads for what the keyframe graph has the host do beside a GPU: image features, and pixels drawn of keyframes."""
+"""Threads for what the host does beside a GPU: poses by image features; features and pixels of keyframes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def host_threads(device: torch.device) -> ThreadPoolExecutor | None:
     """A pool of half the cores, 8 at most; None where the kernels run on the CPU, as tracking needs the cores there."""
     if device.type != "cuda":
         return None
-    return ThreadPoolExecutor(host_thread_count(), thread_name_prefix="spslam-keyframes")
+    return ThreadPoolExecutor(host_thread_count(), thread_name_prefix="spslam-host")
 
 
 def host_thread_count() -> int:
