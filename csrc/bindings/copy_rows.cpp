@@ -73,7 +73,14 @@ void copy_rows(std::vector<Tensor> tables, std::vector<std::int64_t> rows, std::
   DeviceScope scope(tables[0]);
   values = all_contiguous(values);
   CopyBatch batch(scope.context);
-  for (std::size_t i = 0; i < tables.size(); ++i) batch.add(row_copy(tables[i], rows[i], values[i]));
+  for (std::size_t i = 0; i < tables.size(); ++i) {
+    RowCopy copy = row_copy(tables[i], rows[i], values[i]);
+    if (copy.from != copy.to && overlap(copy.from, copy.bytes, copy.to, copy.bytes)) {
+      values[i] = torch::stable::clone(values[i]);
+      copy.from = values[i].const_data_ptr();
+    }
+    batch.add(copy);
+  }
   batch.flush();
 }
 

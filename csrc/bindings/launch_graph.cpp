@@ -41,7 +41,8 @@ void delete_launch_graph(std::int64_t number) {
 }
 
 std::int64_t launch_graph_builds_op(std::int64_t number) {
-  return launch_graph_builds(find_launch_graph(number));
+  const LaunchGraph* const graph = find_launch_graph(number);
+  return graph ? launch_graph_builds(graph) : 0;
 }
 
 }  // namespace

@@ -77,7 +77,8 @@ class Moments {
   std::size_t next_ = 0;
 };
 
-// The frames on the kernel's device. The driver stages so small a copy at once: nothing waits.
+// The frames on the kernel's device. The driver stages so small a copy of pageable memory at once, so nothing waits,
+// and the list may change afterwards.
 Tensor frames_on_device(const Tensor& frames, const Tensor& like, std::int64_t rows, const Context& context) {
   Tensor list = as_contiguous(frames);
 #ifdef SPS_CUDA
@@ -88,8 +89,9 @@ Tensor frames_on_device(const Tensor& frames, const Tensor& like, std::int64_t r
     SPS_CHECK(at[i] >= 0 && at[i] < rows, kName, ": frames must be in [0, ", rows, "), got ", at[i]);
   }
 #ifdef SPS_CUDA
+  const std::vector<std::int64_t> pageable(at, at + list.numel());
   Tensor copy = empty(like, {list.numel()}, ScalarType::Long);
-  STD_CUDA_CHECK(cudaMemcpyAsync(copy.mutable_data_ptr(), at, list.numel() * sizeof(std::int64_t),
+  STD_CUDA_CHECK(cudaMemcpyAsync(copy.mutable_data_ptr(), pageable.data(), pageable.size() * sizeof(std::int64_t),
                                  cudaMemcpyHostToDevice, static_cast<cudaStream_t>(context.stream)));
   return copy;
 #else

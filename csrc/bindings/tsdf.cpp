@@ -147,6 +147,7 @@ struct ReadField {
             data<float>(sdf),
             data<float>(weights),
             data<std::uint16_t>(colors),
+            sdf.size(0),
             static_cast<float>(voxel_size),
             static_cast<float>(min_weight)};
   }

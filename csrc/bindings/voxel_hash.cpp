@@ -147,8 +147,9 @@ std::tuple<Tensor, Tensor> voxel_hash_lookup(Tensor hash_keys, Tensor hash_value
   dispatch_floating(name, points, [&](auto zero) {
     using T = decltype(zero);
     spslam::voxel_hash_lookup(scope.context, data<std::int64_t>(hash_keys), data<std::int32_t>(hash_values), capacity,
-                              data<std::int32_t>(corner_ids), data<T>(points), n, static_cast<T>(voxel_size),
-                              mutable_data<std::int32_t>(rows), mutable_data<T>(local_coords));
+                              data<std::int32_t>(corner_ids), corner_ids.size(0), data<T>(points), n,
+                              static_cast<T>(voxel_size), mutable_data<std::int32_t>(rows),
+                              mutable_data<T>(local_coords));
   });
   return {local_coords, rows};
 }

@@ -43,13 +43,13 @@ class FixedPoint {
 };
 
 namespace detail {
-template <class T>
-__global__ void max_abs_kernel(std::int64_t n, const T* values, std::int64_t* bits) {
+template <class Value>
+__global__ void max_abs_kernel(std::int64_t n, Value value, std::int64_t* bits) {
   double largest = 0;
   const std::int64_t stride = static_cast<std::int64_t>(gridDim.x) * blockDim.x;
   for (std::int64_t i = blockIdx.x * static_cast<std::int64_t>(blockDim.x) + threadIdx.x; i < n; i += stride) {
-    const double a = fabs(static_cast<double>(values[i]));
-    largest = a <= largest ? largest : a;  // keeps a NaN
+    const double a = fabs(static_cast<double>(value(i)));
+    largest = a <= largest || largest != largest ? largest : a;  // keeps a NaN
   }
   for (int offset = 16; offset; offset /= 2) {
     const double other = __shfl_xor_sync(0xffffffffu, largest, offset);
@@ -59,14 +59,19 @@ __global__ void max_abs_kernel(std::int64_t n, const T* values, std::int64_t* bi
 }
 }  // namespace detail
 
-// *bits (zero before) becomes the bit pattern of the largest |value| as a double.
-template <class T>
-void max_abs(Cuda device, std::int64_t n, const T* values, std::int64_t* bits) {
+// *bits (zero before) becomes the bit pattern of the largest |value(i)| as a double, NaN where one is.
+template <class Value>
+void max_abs_of(Cuda device, std::int64_t n, const Value& value, std::int64_t* bits) {
   if (n == 0) return;
   constexpr int kThreads = 256, kMaxBlocks = 1024;
   const std::int64_t blocks = (n + kThreads - 1) / kThreads;
   detail::max_abs_kernel<<<static_cast<int>(blocks < kMaxBlocks ? blocks : kMaxBlocks), kThreads, 0,
-                           static_cast<cudaStream_t>(device.stream)>>>(n, values, bits);
+                           static_cast<cudaStream_t>(device.stream)>>>(n, value, bits);
+}
+
+template <class T>
+void max_abs(Cuda device, std::int64_t n, const T* values, std::int64_t* bits) {
+  max_abs_of(device, n, [=] __device__(std::int64_t i) { return values[i]; }, bits);
 }
 
 }  // namespace spslam

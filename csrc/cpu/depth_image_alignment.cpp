@@ -8,7 +8,7 @@ namespace {
 // Pixels that are added up before their sums are added to the others', in order.
 constexpr std::int64_t kPixelGrain = 128;
 
-// Calls f(i, pair, target, pose) for each pair that exists, on any thread, `target` being what the source is measured
+// Calls f(i, pair, target) for each pair that exists, on any thread, `target` being what the source is measured
 // against.
 template <class F>
 void for_each_pair(const PixelSets& pixels, const ImagePairs& pairs, std::int64_t images,

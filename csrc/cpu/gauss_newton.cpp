@@ -47,7 +47,7 @@ class DrawnPixels {
       if (ids_[i] != kNoVoxel) __builtin_prefetch(scene.corner_ids + std::int64_t{kCellCorners} * ids_[i]);
     }
     for (std::int64_t i = 0; i < size; ++i) {
-      cells[i] = cell_of_voxel(scene.corner_ids, ids_[i], cells[i].local);
+      cells[i] = cell_of_voxel(scene.corner_ids, scene.num_voxels, ids_[i], cells[i].local);
       if (!cells[i].corner_ids) continue;
       for (int k = 0; k < kCellCorners; ++k) {
         __builtin_prefetch(scene.embeddings + kEmbeddingChannels * std::int64_t{cells[i].corner_ids[k]});

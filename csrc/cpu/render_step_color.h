@@ -153,7 +153,7 @@ inline void decode_color(const PackedMlp<float>& net, Chunk& chunk) {
   }
 }
 
-// The same of the color decoder's input.
+// Adds to the samples the gradients that come by their colors.
 inline void add_color_gradients(const float* grad_x, std::int64_t first, std::int64_t rows, Chunk& chunk) {
   for (std::int64_t r = 0; r < rows; ++r) {
     const float* slopes = chunk.color_slopes + (first + r) * kColorSlopes;

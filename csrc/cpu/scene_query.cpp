@@ -41,7 +41,7 @@ void query_sdf<Cpu>(Cpu, const SceneView& scene, const float* points, std::int64
     std::int64_t rows[kTileRows];
     for (std::int64_t i = begin; i < end; ++i) {
       const Vec3<float> point = load_point(points, i);
-      const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point);
+      const Cell<float> cell = find_cell(scene.table, scene.corner_ids, scene.num_voxels, inverse_voxel * point);
       valid[i] = cell.corner_ids != nullptr;
       sdf[i] = 1.0f;
       if (gradient) gradient[3 * i] = gradient[3 * i + 1] = gradient[3 * i + 2] = 0.0f;

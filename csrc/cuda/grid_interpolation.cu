@@ -175,8 +175,19 @@ void row_scatter(Device device, const RowLists& lists, const T* grad, const T* w
   std::int64_t* const largest = workspace + size;
   std::int64_t* const largest_weight = largest + 1;
   fill_zero(device, size + 2, workspace);
-  max_abs(device, l.num_lists * l.channels, grad, largest);
-  max_abs(device, pairs, weights, largest_weight);
+  // Of rows in the table: gradients and weights of others, which may be no numbers, go nowhere.
+  max_abs_of(
+      device, l.num_lists * l.channels,
+      [=] __device__(std::int64_t i) {
+        const std::int64_t n = i / l.channels;
+        bool any = false;
+        for (std::int64_t at = n * l.length; at < (n + 1) * l.length; ++at) any |= valid_row(l.rows[at], l.num_rows);
+        return any ? grad[i] : T(0);
+      },
+      largest);
+  max_abs_of(
+      device, pairs, [=] __device__(std::int64_t i) { return valid_row(l.rows[i], l.num_rows) ? weights[i] : T(0); },
+      largest_weight);
   // Unlike those of interpolation, weights may be of any size, so the bound of a term is a product.
   for_each(device, 1, [=] __device__(std::int64_t) {
     const double bound = __longlong_as_double(*largest) * __longlong_as_double(*largest_weight);

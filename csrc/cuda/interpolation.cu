@@ -70,7 +70,14 @@ struct InterpolationLoops<Cuda> {
     std::int64_t* const sums = workspace;
     std::int64_t* const largest = workspace + size;
     fill_zero(device, size + 1, workspace);
-    max_abs(device, num_points * channels, grad, largest);
+    // Of points that have a value: the gradient of another, which may be no number, goes nowhere.
+    max_abs_of(
+        device, num_points * channels,
+        [=] __device__(std::int64_t i) {
+          typename Field::Stencil stencil;
+          return field.load(i / channels, stencil) ? grad[i] : T(0);
+        },
+        largest);
     for_each(device, num_points * kLanes, [=] __device__(std::int64_t i) {
       const std::int64_t n = i / kLanes;
       typename Field::Stencil stencil;

@@ -72,9 +72,9 @@ class LaunchGraph {
   void update(const KernelLaunches& launches) {
     for (std::size_t i = 0; i < launches.size(); ++i) {
       if (launches[i].arguments == launches_[i].arguments) continue;
-      launches_[i] = launches[i];
-      Node node(launches_[i]);
+      Node node(launches[i]);
       SPS_CUDA_CHECK(cudaGraphExecKernelNodeSetParams(executable_, nodes_[i], &node.parameters));
+      launches_[i] = launches[i];
     }
   }
 

@@ -11,7 +11,8 @@ void query_sdf<Cuda>(Cuda device, const SceneView& view, const float* points, st
   const SceneView scene = view;
   for_each(device, n, [=] __device__(std::int64_t i) {
     const Vec3<float> point{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-    const Cell<float> cell = find_cell(scene.table, scene.corner_ids, (1.0f / scene.voxel_size) * point);
+    const Cell<float> cell =
+        find_cell(scene.table, scene.corner_ids, scene.num_voxels, (1.0f / scene.voxel_size) * point);
     Vec3<float> slope{0.0f, 0.0f, 0.0f};
     valid[i] = cell.corner_ids != nullptr;
     sdf[i] = valid[i] ? geometry_element(scene, point, cell, gradient ? &slope : nullptr) : 1.0f;

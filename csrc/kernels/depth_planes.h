@@ -15,7 +15,6 @@
 namespace spslam {
 
 constexpr int kPlaneRadius = 2;
-constexpr int kPlaneWindow = 2 * kPlaneRadius + 1;
 // A pixel whose inverse depth differs from the plane through the middle by more than this share, and by more than so
 // many deviations of the noise, is of another surface.
 constexpr float kPlaneGate = 0.015f, kPlaneGateDeviations = 4.0f;

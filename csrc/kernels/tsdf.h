@@ -199,12 +199,13 @@ SPS_INLINE TsdfObservation observe_voxel(float plane_distance, float plane_weigh
           (plane_weight > 0.0f) & near ? weight * (fall < 1.0f ? fall : 1.0f) : 0.0f};
 }
 
-// The running mean of a voxel's distances.
+// The running mean of a voxel's distances; one that is not seen stays as it is.
 SPS_INLINE void update_voxel(const TsdfObservation& seen, float max_weight, float& sdf, float& weight) {
   const float total = weight + seen.weight;
   const float share = total > 0.0f ? seen.weight / total : 0.0f;
   sdf += share * (seen.sdf - sdf);
-  weight = total < max_weight ? total : max_weight;
+  const float most = total < max_weight ? total : max_weight;
+  weight = seen.weight > 0.0f ? most : weight;
 }
 
 // Colors are taken up to kColorBand voxels from the surface, however short the truncation is.

@@ -22,10 +22,10 @@ struct TsdfSample {
 };
 
 // A voxel's place in the arrays, or -1.
-SPS_INLINE std::int64_t voxel_place(const VoxelTable& table, VoxelCoord voxel) {
+SPS_INLINE std::int64_t voxel_place(const TsdfView& view, VoxelCoord voxel) {
   constexpr int kMask = kTsdfBlockSide - 1;
-  const std::int32_t block = find_voxel(table, {voxel.x >> 3, voxel.y >> 3, voxel.z >> 3});
-  if (block == kNoVoxel) return -1;
+  const std::int32_t block = find_voxel(view.table, {voxel.x >> 3, voxel.y >> 3, voxel.z >> 3});
+  if (block < 0 || block >= view.count) return -1;
   return static_cast<std::int64_t>(kTsdfBlockVoxels) * block +
          ((voxel.x & kMask) * kTsdfBlockSide + (voxel.y & kMask)) * kTsdfBlockSide + (voxel.z & kMask);
 }
@@ -42,7 +42,7 @@ SPS_INLINE TsdfSample sample_tsdf(const TsdfView& view, const Vec3<float>& world
   const Vec3<float> local = at - base;
   float colored = 0.0f;
   for (int c = 0; c < kCellCorners; ++c) {
-    const std::int64_t place = voxel_place(view.table, cell_corner(corner, c));
+    const std::int64_t place = voxel_place(view, cell_corner(corner, c));
     if (place < 0 || !(view.weights[place] >= view.min_weight)) return {0.0f, {0.0f, 0.0f, 0.0f}, false};
     const float weight = ((c & 1) ? local.x : 1.0f - local.x) * ((c & 2) ? local.y : 1.0f - local.y) *
                          ((c & 4) ? local.z : 1.0f - local.z);

@@ -107,10 +107,13 @@ SPS_INLINE std::int64_t cell_key(const Vec3<T>& base) {
       {static_cast<std::int32_t>(base.x), static_cast<std::int32_t>(base.y), static_cast<std::int32_t>(base.z)});
 }
 
-// The cell whose lowest corner has that id, which may be kNoVoxel, around a point that is at `local` in it.
+// The cell whose lowest corner has that id, which may be kNoVoxel, around a point that is at `local` in it. A vertex
+// beyond the rows of corner ids, as of rows from before an insertion, has none.
 template <class T>
-SPS_INLINE Cell<T> cell_of_voxel(const std::int32_t* corner_ids, std::int32_t id, const Vec3<T>& local) {
-  const std::int32_t* row = id == kNoVoxel ? nullptr : corner_ids + static_cast<std::int64_t>(kCellCorners) * id;
+SPS_INLINE Cell<T> cell_of_voxel(const std::int32_t* corner_ids, std::int64_t rows, std::int32_t id,
+                                 const Vec3<T>& local) {
+  const bool known = id >= 0 && id < rows;
+  const std::int32_t* row = known ? corner_ids + static_cast<std::int64_t>(kCellCorners) * id : nullptr;
   if (!row || row[0] == kNoVoxel) return {nullptr, {T(0), T(0), T(0)}};
   return {row, local};
 }
@@ -123,11 +126,12 @@ SPS_INLINE Vec3<T> rounded_down(const Vec3<T>& v) {
 // The cell around a point given in voxel units (world point / voxel size). One probe: the row beside the lowest corner
 // names the other seven. NaN and far away points are outside.
 template <class T>
-SPS_INLINE Cell<T> find_cell(const VoxelTable& table, const std::int32_t* corner_ids, const Vec3<T>& point_vox) {
+SPS_INLINE Cell<T> find_cell(const VoxelTable& table, const std::int32_t* corner_ids, std::int64_t rows,
+                             const Vec3<T>& point_vox) {
   const Vec3<T> base = rounded_down(point_vox);
   const std::int64_t key = cell_key(base);
   const std::int32_t id = key == kEmptyVoxelKey ? kNoVoxel : find_voxel_key(table, key);
-  return cell_of_voxel(corner_ids, id, point_vox - base);
+  return cell_of_voxel(corner_ids, rows, id, point_vox - base);
 }
 
 }  // namespace spslam

@@ -65,7 +65,7 @@ struct RenderStepLaunch {
     for_each(device_, n_, [=] SPS_HOST_DEVICE(std::int64_t i) {
       const std::int64_t ray = i / samples;
       const Vec3<float> point = b.origin[ray] + b.t[i] * b.direction[ray];
-      const Cell<float> cell = find_cell(scene.table, scene.corner_ids, inverse_voxel * point);
+      const Cell<float> cell = find_cell(scene.table, scene.corner_ids, scene.num_voxels, inverse_voxel * point);
       const bool valid = cell.corner_ids && b.depth[ray] > 0 && complete_cell(cell.corner_ids, scene.num_voxels);
       b.points[i] = point;
       b.valid[i] = valid;

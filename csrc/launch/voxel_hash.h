@@ -66,13 +66,14 @@ void voxel_hash_update_corner_ids(Device device, const std::int64_t* hash_keys, 
 
 template <class Device, class T>
 void voxel_hash_lookup(Device device, const std::int64_t* hash_keys, const std::int32_t* hash_values,
-                       std::int64_t capacity, const std::int32_t* corner_ids, const T* points, std::int64_t n,
-                       T voxel_size, std::int32_t* cell_corner_ids, T* local_coords) {
+                       std::int64_t capacity, const std::int32_t* corner_ids, std::int64_t num_voxels, const T* points,
+                       std::int64_t n, T voxel_size, std::int32_t* cell_corner_ids, T* local_coords) {
   const VoxelTable table{hash_keys, hash_values, capacity - 1};
   const T inverse = T(1) / voxel_size;
   for_each(device, n, [=] SPS_HOST_DEVICE(std::int64_t i) {
-    const Cell<T> cell = find_cell(
-        table, corner_ids, Vec3<T>{points[3 * i] * inverse, points[3 * i + 1] * inverse, points[3 * i + 2] * inverse});
+    const Cell<T> cell =
+        find_cell(table, corner_ids, num_voxels,
+                  Vec3<T>{points[3 * i] * inverse, points[3 * i + 1] * inverse, points[3 * i + 2] * inverse});
     for (int k = 0; k < kCellCorners; ++k) {
       cell_corner_ids[kCellCorners * i + k] = cell.corner_ids ? cell.corner_ids[k] : kNoVoxel;
     }
@@ -82,18 +83,18 @@ void voxel_hash_lookup(Device device, const std::int64_t* hash_keys, const std::
   });
 }
 
-#define SPS_INSTANTIATE_VOXEL_HASH(Device)                                                                            \
-  template void voxel_hash_pack<Device>(Device, const std::int32_t*, std::int64_t, std::int64_t*);                    \
-  template void voxel_hash_unpack<Device>(Device, const std::int64_t*, std::int64_t, std::int32_t*);                  \
-  template void voxel_hash_find<Device>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,               \
-                                        const std::int32_t*, std::int64_t, std::int32_t*);                            \
-  template void voxel_hash_update_corner_ids<Device>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,  \
-                                                     const std::int32_t*, std::int64_t, std::int64_t, std::int32_t*); \
-  template void voxel_hash_lookup<Device, float>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,      \
-                                                 const std::int32_t*, const float*, std::int64_t, float,              \
-                                                 std::int32_t*, float*);                                              \
-  template void voxel_hash_lookup<Device, double>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,     \
-                                                  const std::int32_t*, const double*, std::int64_t, double,           \
-                                                  std::int32_t*, double*);
+#define SPS_INSTANTIATE_VOXEL_HASH(Device)                                                                             \
+  template void voxel_hash_pack<Device>(Device, const std::int32_t*, std::int64_t, std::int64_t*);                     \
+  template void voxel_hash_unpack<Device>(Device, const std::int64_t*, std::int64_t, std::int32_t*);                   \
+  template void voxel_hash_find<Device>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,                \
+                                        const std::int32_t*, std::int64_t, std::int32_t*);                             \
+  template void voxel_hash_update_corner_ids<Device>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,   \
+                                                     const std::int32_t*, std::int64_t, std::int64_t, std::int32_t*);  \
+  template void voxel_hash_lookup<Device, float>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,       \
+                                                 const std::int32_t*, std::int64_t, const float*, std::int64_t, float, \
+                                                 std::int32_t*, float*);                                               \
+  template void voxel_hash_lookup<Device, double>(Device, const std::int64_t*, const std::int32_t*, std::int64_t,      \
+                                                  const std::int32_t*, std::int64_t, const double*, std::int64_t,      \
+                                                  double, std::int32_t*, double*);
 
 }  // namespace spslam

@@ -69,7 +69,7 @@ class ReferenceImage(NamedTuple):
             check_tensor(function, "reference.log_gain", self.log_gain, (1,), torch.float32, like=like)
 
     def arguments(self) -> tuple[list[torch.Tensor], list[float]]:
-        """What the schema takes: the enum ReferenceScalar in csrc/bindings/gauss_newton.cpp."""
+        """What the schema takes: the enum ReferenceScalar in csrc/bindings/tracking_arguments.h."""
         tensors = [self.cells, self.pose]
         if self.log_gain is not None:
             tensors.append(self.log_gain)

@@ -115,7 +115,8 @@ class GaussNewtonOptions:
                 check(value >= bounds["at_least"], function, name, f"be at least {bounds['at_least']}", value)
 
     def arguments(self, intrinsics: Intrinsics) -> tuple[list[float], list[int]]:
-        """The schema's scalars and integers: the enums Scalar and Integer in csrc/bindings/gauss_newton.cpp."""
+        """The schema's scalars and integers: the enums TrackingScalar and TrackingInteger in
+        csrc/bindings/tracking_arguments.h."""
         scalars = [*intrinsics, *(getattr(self, name) or 0.0 for name in _SCALARS)]
         integers = [self.num_pixels, self.iterations, self.seed, int(self.stream), self.frame, int(self.tf32)]
         return scalars, integers

@@ -2,7 +2,8 @@
 
 They are for callers whose arguments come from objects that are right by construction, as `spslam.slam` has them; the
 public op of the same name, where there is one, says what arguments must be, and calls these once it has checked them.
-The bindings still refuse what would have a kernel read or write where nothing is. Nothing is cast in an autocast
+The bindings still refuse dtypes and shapes that would have a kernel read or write where nothing is, but tell no device
+from another. Nothing is cast in an autocast
 region, and autograd is not told of what is changed in place.
 """
 

@@ -62,6 +62,15 @@ def test_a_view_of_a_table_is_the_table(device):
     assert table.sum(1).tolist() == [0, 3, 0, 0]
 
 
+@pytest.mark.parametrize("shift", [1, 3, 4096])
+def test_a_value_may_overlap_the_row_that_it_is_copied_to(shift, device):
+    flat = torch.arange(3 * 8192, dtype=torch.float32, device=device)
+    table, value = flat.view(3, 8192), flat[8192 - shift : 2 * 8192 - shift]
+    expected = value.clone()
+    ops.copy_rows_([table], [1], [value])
+    assert torch.equal(table[1], expected)
+
+
 def test_wrong_arguments(device):
     table, value = torch.zeros(4, 3, device=device), torch.ones(3, device=device)
     for row in (-1, 4):

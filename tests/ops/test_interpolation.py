@@ -259,6 +259,17 @@ def test_points_without_all_corners_get_nothing(device, generator):
     assert not grad_local.any()
 
 
+def test_a_gradient_that_is_no_number_stays_with_the_point_that_has_no_value(device, generator):
+    embeddings, ids, local = (a.to(device) for a in _trilinear(generator, torch.float32, points=300_000))
+    ids[0, 7] = -1
+    embeddings.requires_grad_()
+    value = ops.trilinear_interpolate(embeddings, ids, local)
+    grad = torch.ones_like(value)
+    expected = torch.autograd.grad(value, embeddings, grad, retain_graph=True)[0]
+    grad[0] = float("nan")
+    assert torch.equal(torch.autograd.grad(value, embeddings, grad)[0], expected)
+
+
 def test_volume_without_vertices(device):
     ids = torch.full((3, 8), -1, dtype=torch.int32, device=device)
     value = ops.trilinear_interpolate(torch.empty(0, 8, device=device), ids, torch.zeros(3, 3, device=device))

@@ -275,6 +275,29 @@ def test_query_interpolates_and_says_what_is_unknown(device):
     assert (sdf[1:] == 0).all() and (rgb == 0).all()
 
 
+def test_blocks_without_rows_are_unknown(device):
+    volume = fused([wall((0, 0, 1), 1.5)], device)
+    keys, values, *rows = volume.field()
+    points = torch.tensor([[0.013, -0.021, 1.47]], device=device)
+    stale = keys, values, *(table[:0].clone() for table in rows)
+    assert not ops.tsdf_query(*stale, points, voxel_size=VOXEL)[2].any()
+    cast, _, _ = ops.tsdf_ray_cast(*stale, IDENTITY.to(device), CAMERA, size=(4, 3), voxel_size=VOXEL)
+    assert not cast.any()
+
+
+def test_voxels_that_a_frame_does_not_see_keep_their_weight(device):
+    volume = fused([wall((0, 0, 1), 1.5)], device)
+    volume.weights.fill_(50.0)
+    before = volume.sdf.clone()
+    planes = planes_of(wall((0, 0, 1), 1.5)).to(device)
+    tables = volume.block_coords, volume.sdf, volume.weights, volume.colors
+    sizes = dict(voxel_size=VOXEL, truncation=3 * VOXEL, max_weight=10.0)
+    ops.tsdf_integrate_(*tables, planes, IDENTITY.to(device), CAMERA, **sizes)
+    unseen = volume.weights == 50.0
+    assert unseen.any() and (volume.weights[~unseen] == 10.0).all()
+    assert torch.equal(volume.sdf[unseen], before[unseen])
+
+
 def test_frames_that_are_not_finite_change_nothing(device):
     volume = fused([wall((0, 0, 1), 1.5)], device)
     before = [tensor.clone() for tensor in (volume.sdf, volume.weights)]

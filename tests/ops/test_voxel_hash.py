@@ -110,6 +110,17 @@ def test_lookup_matches_the_dictionary(device, dtype, generator):
     assert torch.allclose(got_local.cpu(), want_local, rtol=0, atol=LOCAL_TOLERANCE[dtype])
 
 
+def test_vertices_without_a_row_of_corners_have_no_cell(device):
+    grid = coords([[x, y, z] for x in range(40) for y in range(40) for z in range(40)])
+    keys, values, inserted = table_of(grid, device=device)
+    rows = torch.full((len(inserted), 8), -1, dtype=torch.int32, device=device)
+    ops.voxel_hash_update_corner_ids(keys, values, inserted, rows, 0)
+    points = (grid.to(device) + 0.5).float()
+    known, _ = ops.voxel_hash_lookup(keys, values, rows[:10].clone(), points, 1.0)  # of before an insertion
+    expected = torch.where(torch.arange(len(grid), device=device)[:, None] < 10, rows, -1)
+    assert torch.equal(known, expected)
+
+
 def test_lookup_gradient_reaches_points_inside_only(device):
     grid = coords([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     keys, values, inserted = table_of(grid, device=device)

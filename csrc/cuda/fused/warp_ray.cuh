@@ -80,7 +80,8 @@ __device__ __forceinline__ LocatedSample locate_sample(const RayStepArguments& a
   if (!exists) return sample;
   sample.t = t;
   sample.point = ray.origin + t * ray.direction;
-  const Cell<float> cell = find_cell(a.scene.table, a.scene.corner_ids, a.inverse_voxel * sample.point);
+  const Cell<float> cell =
+      find_cell(a.scene.table, a.scene.corner_ids, a.scene.num_voxels, a.inverse_voxel * sample.point);
   if (cell.corner_ids) {
     sample.low = reinterpret_cast<const int4*>(cell.corner_ids)[0];
     sample.high = reinterpret_cast<const int4*>(cell.corner_ids)[1];

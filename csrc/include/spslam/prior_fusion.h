@@ -48,7 +48,8 @@ using AllocateScratch = std::function<void*(std::int64_t bytes)>;
 
 // Encodes points [n, 3] (m) with unit normals [n, 3]: per voxel vertex the weighted mean of the encoder's features over
 // the points around it and the sum of weights, sorted by packed coordinate. `allocate` is called once, with the number
-// of vertices, and says where to write. Points that are not finite, out of range or without a normal add nothing.
+// of vertices, and says where to write; the device is waited for. Points that are not finite, out of range or without a
+// normal add nothing.
 template <class Device>
 void encode_points(Device device, const float* points, const float* normals, std::int64_t n, const float* params,
                    const EncoderSettings& settings, const AllocateScratch& scratch,

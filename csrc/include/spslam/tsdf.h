@@ -69,6 +69,7 @@ struct TsdfView {
   const float* sdf;
   const float* weights;
   const std::uint16_t* colors;
+  std::int64_t count;  // of blocks; what the table names beyond them is not there
   float voxel_size, min_weight;
 };
 

@@ -50,10 +50,11 @@ void voxel_hash_update_corner_ids(Device device, const std::int64_t* hash_keys, 
                                   std::int64_t capacity, const std::int32_t* voxel_coords, std::int64_t num_voxels,
                                   std::int64_t first_new, std::int32_t* corner_ids);
 
-// The cell around each point: its corner ids (-1 outside the allocated cells) and local coordinates in [0, 1].
+// The cell around each point: its corner ids (-1 outside the allocated cells, and of vertices beyond the num_voxels
+// rows of corner_ids) and local coordinates in [0, 1].
 template <class Device, class T>
 void voxel_hash_lookup(Device device, const std::int64_t* hash_keys, const std::int32_t* hash_values,
-                       std::int64_t capacity, const std::int32_t* corner_ids, const T* points, std::int64_t n,
-                       T voxel_size, std::int32_t* cell_corner_ids, T* local_coords);
+                       std::int64_t capacity, const std::int32_t* corner_ids, std::int64_t num_voxels, const T* points,
+                       std::int64_t n, T voxel_size, std::int32_t* cell_corner_ids, T* local_coords);
 
 }  // namespace spslam
