@@ -24,7 +24,8 @@ _LEAST_LAG_S = 0.1
 _MOST_SECONDS = 5.0  # from view to view; larger steps come from other units
 _MOST_LAG, _LAG_STEP = 4.0, 0.25  # in views
 _LEAST_PAIRS, _LEAST_POINTS = 10, 30
-# The median difference of turns: at the lag found, as a share of what it is without, and as a share of the turns.
+# The median difference of turns: at the lag found, as a share of what it is without, and as a share of the turns; of
+# the larger half of the turns too, as small ones agree at any lag where depth shows none.
 _BETTER, _EXPLAINED = 0.5, 0.4
 
 
@@ -42,15 +43,18 @@ def lag_findings(views: Sequence[View], lens: Lens, followed: Followed | None = 
     followed = followed or Followed()
     color, depth = _turns_of_color(views, lens, followed), _turns_of_depth(views, lens, followed)
     lags = np.arange(-_MOST_LAG, _MOST_LAG + _LAG_STEP / 2, _LAG_STEP)
-    apart = np.array([_difference(color, depth, lag) for lag in lags])
+    apart = np.array([np.median(_differences(color, depth, lag)) for lag in lags])
     if not np.isfinite(apart).any():
         return []
     best, given = int(np.nanargmin(apart)), apart[len(lags) // 2]
     seconds = lags[best] * between
     is_inside = 0 < best < len(lags) - 1
-    turned = float(np.nanmedian(np.linalg.norm(color, axis=1)))
-    is_clear = apart[best] < _BETTER * given and apart[best] < _EXPLAINED * turned
+    turned = np.linalg.norm(color, axis=1)
+    is_clear = apart[best] < _BETTER * given and apart[best] < _EXPLAINED * float(np.nanmedian(turned))
     if not is_inside or not is_clear or abs(seconds) < _LEAST_LAG_S:
+        return []
+    large = turned >= np.nanmedian(turned)
+    if not np.median(_differences(color, depth, lags[best], large)) < _EXPLAINED * float(np.median(turned[large])):
         return []
     order = "before" if seconds < 0 else "after"
     text = f"color images look taken {abs(seconds):.2f} s {order} their depth images, by how both turn"
@@ -84,14 +88,18 @@ def _vector(rotation: np.ndarray) -> np.ndarray:
     return cv2.Rodrigues(rotation)[0][:, 0]
 
 
-def _difference(color: np.ndarray, depth: np.ndarray, lag: float) -> float:
-    """Median difference (rad) between the turns of color and those of depth `lag` views later; NaN of too few."""
+def _differences(color: np.ndarray, depth: np.ndarray, lag: float, asked: np.ndarray | None = None) -> np.ndarray:
+    """By how much turns of color and those of depth `lag` views later differ, float64 [N], rad; one NaN where few are
+    known, of all or of those in rows `asked`."""
     at = np.arange(len(color)) + lag
     whole = np.floor(at).astype(int)
     inside = (whole >= 0) & (whole + (at > whole) < len(depth))
+    least = _LEAST_PAIRS
+    if asked is not None:
+        inside, least = inside & asked, _LEAST_PAIRS // 2
     before, share = depth[whole[inside]], (at - whole)[inside, None]
     after = depth[np.minimum(whole[inside] + 1, len(depth) - 1)]
     between = np.where(share > 0, (1 - share) * before + share * after, before)
     apart = np.linalg.norm(color[inside] - between, axis=1)
     known = apart[np.isfinite(apart)]
-    return float(np.median(known)) if len(known) >= _LEAST_PAIRS else np.nan
+    return known if len(known) >= least else np.array([np.nan])
