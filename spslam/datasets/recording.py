@@ -51,6 +51,33 @@ class ImageStream(ABC):
 
 
 @dataclass(frozen=True)
+class TimedImages(ImageStream):
+    """Some images of a stream, at the times of the frames that they are of.
+
+    Attributes:
+        stream: has the images.
+        numbers: int64 [N], theirs in the stream.
+        seconds: float64 [N], ascending.
+    """
+
+    stream: ImageStream
+    numbers: np.ndarray
+    seconds: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def times(self) -> np.ndarray:
+        return self.seconds.copy()
+
+    def describe(self, number: int) -> str:
+        return self.stream.describe(int(self.numbers[number]))
+
+    def read(self, number: int) -> np.ndarray:
+        return self.stream.read(int(self.numbers[number]))
+
+
+@dataclass(frozen=True)
 class Calibration:
     """The lenses of a recording and where they are.
 

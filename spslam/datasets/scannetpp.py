@@ -23,7 +23,7 @@ from spslam.datasets.files import find_numbered, require_folder
 from spslam.datasets.image_files import ColorFiles, DepthFiles, first_depth_size
 from spslam.datasets.images import Size, depth_in_meters, first_size
 from spslam.datasets.lens import Lens
-from spslam.datasets.recording import Calibration, ImageStream, Recording, View
+from spslam.datasets.recording import Calibration, ImageStream, Recording, TimedImages, View
 from spslam.datasets.text import camera_from_matrix, checked_poses
 from spslam.datasets.video import VideoStream
 from spslam.errors import DatasetError, brief
@@ -90,34 +90,13 @@ def open_scannetpp(path: Path, view: View = "depth") -> Recording:
     pairs = np.array([(color_numbers[number], depth_numbers[number]) for number in numbers], dtype=np.int64)
     return Recording(
         f"scannetpp/{path.name}",
-        color,
-        _Timed(depth, pairs[:, 1], seconds),
-        np.stack((pairs[:, 0], np.arange(len(pairs))), axis=1),
+        TimedImages(color, pairs[:, 0], seconds),
+        TimedImages(depth, pairs[:, 1], seconds),
+        np.repeat(np.arange(len(pairs))[:, None], 2, axis=1),
         Calibration.of_one_view(Lens(camera), depth_size),
         checked_poses(np.array([frames[number][1] for number in numbers]))[0],
         view=view,
     )
-
-
-@dataclass(frozen=True)
-class _Timed(ImageStream):
-    """Some images of a stream, at other times."""
-
-    stream: ImageStream
-    numbers: np.ndarray
-    seconds: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def times(self) -> np.ndarray:
-        return self.seconds.copy()
-
-    def describe(self, number: int) -> str:
-        return self.stream.describe(int(self.numbers[number]))
-
-    def read(self, number: int) -> np.ndarray:
-        return self.stream.read(int(self.numbers[number]))
 
 
 def _read_frames(path: Path) -> dict[int, tuple[np.ndarray, np.ndarray, float]]:

@@ -14,7 +14,7 @@ import numpy as np
 from spslam.datasets.files import find_numbered, require_folder
 from spslam.datasets.image_files import DepthFiles, first_depth_size
 from spslam.datasets.lens import Lens
-from spslam.datasets.recording import Calibration, Recording, View
+from spslam.datasets.recording import Calibration, Recording, TimedImages, View
 from spslam.datasets.text import read_intrinsics_matrix, read_table
 from spslam.datasets.video import VideoStream
 from spslam.errors import DatasetError
@@ -69,9 +69,11 @@ def open_stray_scanner(folder: Path, min_confidence: int = 0, view: View = "dept
         min_confidence=min_confidence,
     )
     poses = known_poses(np.stack([table[name][used] for name in _POSE], axis=1))
-    pairs = np.stack((numbers, np.arange(len(used))), axis=1)
+    pairs = np.repeat(np.arange(len(used))[:, None], 2, axis=1)
     calibration = Calibration.of_one_view(lens, size)
-    return Recording(f"stray_scanner/{folder.name}", video, stream, pairs, calibration, poses, view=view)
+    # A video has a clock of its own, and its frames were taken with the depth images of their numbers.
+    color = TimedImages(video, numbers, seconds)
+    return Recording(f"stray_scanner/{folder.name}", color, stream, pairs, calibration, poses, view=view)
 
 
 def known_poses(rows: np.ndarray) -> np.ndarray:
