@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -17,6 +18,12 @@ def host_threads(device: torch.device) -> ThreadPoolExecutor | None:
     if device.type != "cuda":
         return None
     return ThreadPoolExecutor(host_thread_count(), thread_name_prefix="spslam-host")
+
+
+@functools.cache
+def shared_host_threads(device: torch.device) -> ThreadPoolExecutor | None:
+    """`host_threads` that all maps of the process share, as for what is short; they end with it."""
+    return host_threads(device)
 
 
 def host_thread_count() -> int:

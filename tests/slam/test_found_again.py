@@ -24,7 +24,7 @@ UNLIKELY = replace(CERTAIN, mean_robust_weight=0.3, inlier_share=0.5, min_eigenv
 @pytest.fixture(scope="module")
 def recovery():
     config, camera, confidence = settings(), Recorded(1).camera, PoseConfidenceModel.load()
-    return Recovery(config, camera, Tracker(config, camera, confidence.score_kernel_m), confidence, torch.device("cpu"))
+    return Recovery(config, camera, Tracker(config, camera, confidence.score_kernel_m), confidence)
 
 
 def found_again(recovery, fit, consistent_before):

@@ -6,7 +6,6 @@ three-point solver within RANSAC (OpenCV's `solvePnPRansac` by USAC, Raguram et 
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +18,7 @@ from spslam.camera import Camera
 from spslam.geometry import inverse
 from spslam.slam.color_motion import ColorMotion
 from spslam.slam.depth_keyframes import depth_image_intrinsics
+from spslam.slam.host_threads import shared_host_threads
 from spslam.slam.image_features import ImageFeatures
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery.feature_equations import (
@@ -76,7 +76,7 @@ class FeatureAlignment:
         motion: from the frame's depth to its color image; None where they are of one moment. Poses that are taken and
             returned are those of depth.
         read: the features as they were read, where `features` are rectified.
-        device: that compares descriptors.
+        device: that compares descriptors, and has the poses.
         depth_noise: a^2 (m^2) and c^2 (1/m^2) of the variance of a depth z, a^2 + c^2 z^4; none where it is not known.
 
     Attributes:
@@ -150,10 +150,9 @@ class FeatureAlignment:
         positions = self.features.positions[row].astype(np.float64)
         return SeenRays(to_world[:3, 3], directions @ to_world[:3, :3].T, positions, ranges[known].astype(np.float64))
 
-    def poses(
-        self, several: Sequence[FeatureMatches], device: torch.device, threads: ThreadPoolExecutor | None = None
-    ) -> list[torch.Tensor | None]:
-        """`pose` of several matches, each by itself; on threads, where there are some."""
+    def poses(self, several: Sequence[FeatureMatches]) -> list[torch.Tensor | None]:
+        """`pose` of several matches, each by itself; on the host's threads beside a GPU."""
+        device, threads = self._device, shared_host_threads(self._device)
         if threads is None or len(several) < 2:
             return [self.pose(one, device) for one in several]
         return list(threads.map(self.pose, several, [device] * len(several)))

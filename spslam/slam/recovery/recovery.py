@@ -13,7 +13,6 @@ from spslam.config import Config
 from spslam.geometry import pose7_to_matrix
 from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
-from spslam.slam.host_threads import host_threads
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.doubtful_frame import (
@@ -52,20 +51,11 @@ class Recovery:
         camera: of all frames.
         tracker: optimizes the pose from other initial poses.
         confidence: computes the probability that a pose is wrong.
-        device: of the map.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        camera: Camera,
-        tracker: Tracker,
-        confidence: PoseConfidenceModel,
-        device: torch.device,
-    ):
+    def __init__(self, config: Config, camera: Camera, tracker: Tracker, confidence: PoseConfidenceModel):
         self._config, self._camera, self._tracker, self._confidence = config, camera, tracker, confidence
         self._verifier = Verifier(config, camera, confidence)
-        self._threads = host_threads(device)
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
 
     def judge(self, estimate: PoseEstimate) -> TrackedFrame:
@@ -296,8 +286,7 @@ class Recovery:
             return frame, []
         matches, starts = list(frame.matches), []
         several = joined_too(found)
-        poses = frame.image.poses(several, frame.problem.predicted.device, self._threads)
-        for matched, start in zip(several, poses, strict=True):
+        for matched, start in zip(several, frame.image.poses(several), strict=True):
             if start is not None:
                 matches.append(frame.image.counted(matched, frame.image.color_pose(start)))
                 starts.append(start)

@@ -1,6 +1,7 @@
 """Verification of a pose where its fit to the map leaves doubt: free space, the map's holes and brightness."""
 
 import math
+import weakref
 from dataclasses import replace
 
 import torch
@@ -29,7 +30,8 @@ class Verifier:
     def __init__(self, config: Config, camera: Camera, confidence: PoseConfidenceModel):
         self._config, self._camera, self._confidence = config, camera, confidence
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
-        self._covered: tuple[FramePixels, Scene, float] | None = None  # the coverage as a frame found it
+        # The coverage as the last frame found it; neither frame nor map is kept for it.
+        self._covered: tuple[weakref.ref[FramePixels], weakref.ref[Scene], float] | None = None
 
     def verified(
         self,
@@ -54,13 +56,13 @@ class Verifier:
         counts, best = surface_counts(pixels, pose, history.poses, history.depth_thumbnails, rows, self._camera)
         asked = [self._brightness_sums(pixels, pose, rows[best], history)] if compares_brightness else []
         known = self._covered
-        is_known = known is not None and known[0] is pixels and known[1] is scene
+        is_known = known is not None and known[0]() is pixels and known[1]() is scene
         if not is_known:
             asked.append(self._map_coverage(scene, history))
         # Waits for the device, once.
         seen, through, occluded, *numbers = torch.cat([counts, *asked]).tolist()
         coverage = known[2] if known is not None and is_known else numbers.pop()
-        self._covered = pixels, scene, coverage
+        self._covered = weakref.ref(pixels), weakref.ref(scene), coverage
         unknown = self._confidence.unknown_free_space_violation
         violation, occluded_share = surface_shares(seen, through, occluded, unknown)
         return replace(
