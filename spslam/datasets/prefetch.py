@@ -44,7 +44,6 @@ class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
     Attributes:
         frames_read: frames handed out so far, broken ones included.
         read_seconds: time spent on reading those, summed over the threads.
-        wait_seconds: time that the caller waited for frames.
 
     Raises:
         ValueError: `workers` is negative, or `ahead` below 1.
@@ -62,7 +61,6 @@ class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
         self._threads = ThreadPoolExecutor(workers, thread_name_prefix="spslam-prefetch") if workers else None
         self.frames_read = 0
         self.read_seconds = 0.0
-        self.wait_seconds = 0.0
 
     def __next__(self) -> Frame | DatasetError:
         try:
@@ -87,9 +85,7 @@ class Prefetcher(Iterator[Frame | DatasetError], Generic[Frame]):
         self.close()
 
     def _take_next(self) -> Frame | DatasetError:
-        started = time.perf_counter()
         frame, seconds = self._read_in_place() if self._threads is None else self._wait_for_oldest(self._threads)
-        self.wait_seconds += time.perf_counter() - started
         self.read_seconds += seconds
         self.frames_read += 1
         return frame

@@ -25,8 +25,6 @@ _CLEARLY_BETTER = 0.5
 # Ratios between the depth scales in use (units a meter: 1000, 5000, 6553.5, 10000, 1).
 _SCALES = (0.001, 0.1, 0.2, 0.5, 0.1526, 0.763, 1.311, 2.0, 5.0, 6.5535, 10.0, 1000.0)
 
-Depths = Sequence[np.ndarray]
-
 
 @dataclass(frozen=True)
 class DepthPair:

@@ -30,8 +30,8 @@ _INTRINSICS = "intrinsic_depth.txt", "intrinsic_color.txt"
 def open_scannet(path: Path) -> RgbdDataset:
     """Opens a scan.
 
-    A frame whose pose isn't finite has no pose. A frame whose image is missing or broken, or whose pose is no rigid
-    motion, is one that raises when it is read.
+    A frame whose pose isn't finite or is no rigid motion has no pose; the latter is a doubt. A frame whose image is
+    missing or broken is one that raises when it is read.
 
     Args:
         path: the `.sens` file, the folder that holds one, or an exported folder (which wins if both are there).

@@ -48,8 +48,8 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None, registere
     """Opens one sequence of a scene.
 
     The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the dataset's default
-    (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite pose, has no
-    pose. A frame with an image missing or a malformed pose file is one that raises when it is read.
+    (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite or malformed pose,
+    has no pose; the last is a doubt. A frame with an image missing is one that raises when it is read.
 
     Args:
         folder: the scene (with `seq-XX` in it) or a sequence itself.

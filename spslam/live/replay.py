@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.clock import CaptureOffsets
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
 from spslam.live.source import LiveFrame, LiveSource
@@ -58,6 +59,10 @@ class ReplaySource(LiveSource):
             return None
         frame = self._dataset[int(self._order[number])]
         frame.timestamp = float(self._times[number])
+        if (
+            number and self._order[number] < self._order[number - 1]
+        ):  # time runs backwards: what came after comes before
+            frame.offsets = CaptureOffsets(-frame.offsets.depth, -frame.offsets.color)
         return frame
 
     def frames(self) -> Iterator[LiveFrame | DatasetError | None]:

@@ -42,7 +42,7 @@ def cut(frames: int, options: ChunkOptions) -> list[Chunk]:
         ConfigError: the chunks would be shorter than what they share.
     """
     if frames // options.count <= options.overlap:
-        most = max((frames - 1) // (options.overlap + 1), 1)
+        most = max(frames // (options.overlap + 1), 1)
         raise ConfigError(
             f"--chunks must leave more frames in each than the {options.overlap} that two share, of {frames} frames in "
             f"at most {most} chunks, got {options.count}; --overlap changes what they share"

@@ -155,7 +155,7 @@ def load_checkpoint(path: Path, state: SlamState, config: Config) -> dict[str, A
 def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
     state.scene.load_state_dict(_section(tensors, "scene."))
     state.frames.load_state_dict(_section(tensors, "frames."))
-    state.frames.opened = header["opened"]
+    state.frames.opened = whole_number(header, "opened", high=len(state.frames))
     state.pixels.load_state_dict(_section(tensors, "pixels."))
     state.unjoined = _unjoined(_section(tensors, "unjoined."), len(tensors["frames.poses"]))
     state.noise.load_state_dict(_section(tensors, "noise."))

@@ -89,7 +89,7 @@ class FramePipeline:
         self._measures_timing = tracking.depth_keyframes and tracking.color and tracking.capture_timing
         confidence = PoseConfidenceModel.load()
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
-        self.recovery = Recovery(config, camera, self.tracker, confidence, self.device)
+        self.recovery = Recovery(config, camera, self.tracker, confidence)
         self._localizer = Localizer(self.tracker, self.recovery, self._rectifier)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
         self.first_pose = np.eye(4)
@@ -249,8 +249,11 @@ class FramePipeline:
             return ()
         if self.global_mapping.adopts(number):
             self.optimize_map()
+        return self._of_recording(self.global_mapping.before_frame(number))
+
+    def _of_recording(self, decisions: Sequence[LoopDecision]) -> tuple[LoopDecision, ...]:
+        """Decisions by the recording's numbers of frames: those of a map that was opened come before, negative."""
         opened = self.state.frames.opened
-        decisions = self.global_mapping.before_frame(number)
         return tuple(replace(each, source=each.source - opened, target=each.target - opened) for each in decisions)
 
     def _follow_other_maps(self, frame: PreparedFrame, pixels: FramePixels) -> None:
@@ -262,7 +265,7 @@ class FramePipeline:
         """`_update_globally` of a live run, after a frame: waits for nothing."""
         if self.global_mapping is None:
             return ()
-        volume, loops = self.state.scene.volume, self.global_mapping.take_up_ready(number)
+        volume, loops = self.state.scene.volume, self._of_recording(self.global_mapping.take_up_ready(number))
         if self._task is not None and self.state.scene.volume is not volume:
             self._task = self.mapper.begin(self.state, self._task.left)  # it was begun for the map before
         return loops

@@ -182,6 +182,8 @@ def _contradiction(registrar: Registrar, one: Component, other: Component, pose:
         best = int(shares.argmax())
         if shares[best] >= MIN_SHARED:
             pairs.append((row, best))
+    if not pairs:
+        return "where they seem to meet, no two views share enough surface to be compared"
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), COMPARED)).round().astype(int))
     agreeing = 0
     for row, best in (pairs[i] for i in chosen.tolist()):
