@@ -33,7 +33,8 @@ class Fit:
         feature_inliers: number of image features whose points in earlier frames lie, from the pose, within 0.33
             degrees of where the frame shows them.
         feature_share: of the features that agree on a pose, the share that agrees with this one; of the earlier frames
-            that they were matched with, the least. Unknown where colors are not where depth is.
+            that they were matched with, the least, or where surface holds the pose in all directions that of the frame
+            with which most agree. Unknown where colors are not where depth is.
         feature_rays: number of image features that were beyond the range of the last frame's depth and lie, from the
             pose, within that angle of where they may be on their rays.
     """

@@ -12,6 +12,7 @@ from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import FramePixels
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatches
 from spslam.slam.recovery.icp_alignment import IcpAlignment
+from spslam.slam.recovery.sliding import WEAK_EIGENVALUE
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import TrackingProblem
 
@@ -87,6 +88,9 @@ class DoubtfulFrame:
         if self.colors_are_registered:
             most = max((one.agreeing for one in self.matches), default=0)
             telling = [one for one in self.matches if one.agreeing > FEW_FEATURES * most]
+            if telling and fit.min_eigenvalue >= WEAK_EIGENVALUE:
+                # Surface leaves nothing free to slide along: where others contradict, their own poses are off.
+                telling = [max(telling, key=lambda one: one.agreeing)]
             within = [self.image.inliers(one, at, self.late_px) for one in telling]
             shares = [min(n / one.agreeing, 1.0) for n, one in zip(within, telling, strict=True)]
         return fit.having(
