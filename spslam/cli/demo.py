@@ -66,11 +66,13 @@ def _remove_earlier_demo(folder: RunFolder) -> None:
         raise OutputError(f"{folder.path}: holds something that isn't a demo; use another --output") from error
     if earlier.dataset.type != "generated":
         raise OutputError(f"{folder.path}: holds a run over other data; use another --output")
-    for path in folder.files():
+    # Temporary files are of a killed run.
+    files = {*folder.files(), *folder.path.glob(".*.tmp.*")}
+    others = sorted({*folder.path.iterdir()} - files - {folder.previews})
+    if others:
+        raise OutputError(f"{folder.path}: holds {others[0].name} beside an earlier demo; use another --output")
+    for path in files:
         path.unlink(missing_ok=True)
-    # Temporary files of a killed run.
-    for path in folder.path.glob(".*.tmp.*"):
-        path.unlink()
     shutil.rmtree(folder.previews, ignore_errors=True)
 
 

@@ -16,7 +16,8 @@ _LISTED = 5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Copy a recording of any format into OUT: images of one pinhole camera (distortion undone, color and depth "
-        "registered), intrinsics.json, times.txt and, where known, poses.txt. spslam run folder --data OUT reads it."
+        "registered), intrinsics.json, times.txt and, where known, poses.txt. Depth outside dataset.min_depth_m to "
+        "dataset.max_depth_m is left out. spslam run folder --data OUT reads it."
     )
     add_config(parser)
     parser.add_argument("output", metavar="OUT", type=Path, help="a new or an empty folder")

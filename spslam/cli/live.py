@@ -119,6 +119,8 @@ def _run(
     from spslam.live.request import LiveRequest
     from spslam.live.session import run_live
 
+    if args.record is not None and args.record.resolve() == output.resolve():
+        raise UsageError(f"--record and --output must be two folders, got {output} for both")
     progress = make_live_progress(args.quiet)
     request = LiveRequest(
         config,

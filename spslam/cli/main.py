@@ -9,6 +9,7 @@ import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from typing import TextIO
 
 from spslam.cli.parser import Parser, UsageError
 from spslam.errors import SpslamError
@@ -39,7 +40,13 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for what the user can put right, 130 interrupted, 1 unexpected."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    # Streams that were closed, as by `2>&-`, are None: what is written to them goes nowhere.
+    sys.stdout, sys.stderr = (stream or _nowhere() for stream in (sys.stdout, sys.stderr))
     return exit_code(lambda: _run(arguments), arguments)
+
+
+def _nowhere() -> TextIO:
+    return os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
 
 
 def exit_code(run: Callable[[], None], arguments: Sequence[str]) -> int:
@@ -90,6 +97,8 @@ def _joined(arguments: list[str]) -> list[str]:
             continue
         if before in ("--data", "--output") and argument == "":
             raise UsageError(f"{before} must be a path, got the empty text (an unset variable of the shell?)")
+        if argument == "":
+            raise UsageError("an argument is the empty text (an unset variable of the shell?)")
         joined.append(argument)
     return joined
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shutil
 import sys
@@ -60,9 +61,9 @@ class ProgressLines:
         if done < total and now - self._last < SECONDS_BETWEEN_LINES:
             return
         self._last = now
-        print(
-            f"{done}/{total} frames, {self._rate.fps():.1f} frames/s, {describe(report)}", file=sys.stderr, flush=True
-        )
+        with contextlib.suppress(BrokenPipeError):  # whoever read this has gone, which is no reason to end
+            text = f"{done}/{total} frames, {self._rate.fps():.1f} frames/s, {describe(report)}"
+            print(text, file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Nothing to do."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -49,6 +50,8 @@ def execute(args: argparse.Namespace) -> None:
     output = args.output or default_output(args.config)
     config = load_config(choose_config(args, args.quiet), args.preset, overrides(args))
     was_finished = args.resume and RunFolder(output).is_finished
+    if args.resume and not RunFolder(output).config.exists():
+        logging.getLogger("spslam").warning("%s: has no run to be resumed; a new one begins", output)
     request = make_request(config, output, args.frames, args.resume, not args.no_mesh)
     request = replace(request, map=args.map, command=args.command_line)
     if args.chunks is not None:

@@ -107,6 +107,7 @@ class RgbdDataset(ABC):
             do not expect it.
         is_random_access: whether each frame is read by itself, so that several processes may share the frames; frames
             of a video, or of a bag, are read best in order.
+        is_timed: whether frames are in order by the recording's own time stamps, not by names of files.
         readers: number of processes that read its frames; 0 where the thread does that asks for one.
         doubts: what opening the recording found doubtful, which a run says as well as a check of the data.
         remarks: what a check of the data says besides, as it may be meant so.
@@ -119,6 +120,7 @@ class RgbdDataset(ABC):
     border_px: int = 0
     is_registered: bool = True
     is_random_access: bool = False
+    is_timed: bool = False
     readers: int = 0
     doubts: Sequence[Finding] = ()
     remarks: Sequence[str] = ()
@@ -240,7 +242,7 @@ class Subset(RgbdDataset):
         self.depth_range = dataset.depth_range
         self.border_px = dataset.border_px
         self.is_registered = dataset.is_registered
-        self.is_random_access = dataset.is_random_access
+        self.is_random_access, self.is_timed = dataset.is_random_access, dataset.is_timed
         self.doubts, self.remarks, self.scale_remedy = dataset.doubts, dataset.remarks, dataset.scale_remedy
 
     def __len__(self) -> int:

@@ -237,7 +237,7 @@ def _checked_depth(stored: np.ndarray, name: str, units_per_meter: float | None,
     if stored.ndim != 2 or stored.dtype not in _DEPTH_TYPES:
         channels = 1 if stored.ndim == 2 else stored.shape[-1]
         raise DatasetError(
-            f"{name}: depth must be 16-bit or floating-point with one channel, got {stored.dtype} with {channels}"
+            f"{name}: depth must be uint16, float32 or float64 with one channel, got {stored.dtype} with {channels}"
         )
     return depth_in_meters(stored, units_per_meter, invalid)
 
@@ -297,7 +297,7 @@ def _load_array(path: Path, size: Size | None) -> np.ndarray:
         ) from None
     if len(shape) != 2 or min(shape) < 1 or dtype.type not in _DEPTH_TYPES:
         raise DatasetError(
-            f"{path}: depth must be 16-bit or floating-point [H, W], got {brief(str(dtype))} {brief(list(shape))}"
+            f"{path}: depth must be uint16, float32 or float64 [H, W], got {brief(str(dtype))} {brief(list(shape))}"
         )
     height, width = map(int, shape)  # True counts as a number in NumPy's headers
     _check_size((width, height), size, str(path))
@@ -307,7 +307,7 @@ def _load_array(path: Path, size: Size | None) -> np.ndarray:
     stored = np.frombuffer(content, dtype, height * width, start).reshape(
         (height, width), order="F" if fortran_order else "C"
     )
-    return stored.astype(dtype.newbyteorder("="), copy=False)
+    return np.ascontiguousarray(stored, dtype.newbyteorder("="))
 
 
 def _image_bytes(path: Path) -> bytes:

@@ -42,6 +42,11 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
         raise DatasetError(f"dataset.type must be one of {', '.join(dataset_types())}, got {config.type}")
     dataset.depth_range = (_option(config, "min_depth_m", 0.0), _option(config, "max_depth_m", float("inf")))
     dataset.border_px = _option(config, "border_px", 0)
+    camera = dataset.camera
+    if 2 * dataset.border_px >= min(camera.width, camera.height):
+        raise DatasetError(
+            f"dataset.border_px must leave some of images of {camera.width}x{camera.height}, got {dataset.border_px}"
+        )
     dataset.scale_remedy = _SCALE_REMEDIES.get(config.type, _FIXED_SCALE.format(config.type))
     stride = _option(config, "stride", 1)
     return dataset if stride == 1 else Subset(dataset, step=stride)

@@ -158,7 +158,7 @@ def open_tum(folder: Path, calibration: str | None = None) -> FileDataset:
         undistortion=Rectification.of(Lens(camera, "brown", distortion)) if any(distortion) else None,
         doubts=(*((_DEFAULT_CAMERA,) if is_guessed else ()), *reference.doubts),
     )
-    dataset.remarks = _unpaired(len(colors), len(pairs))
+    dataset.remarks, dataset.is_timed = _unpaired(len(colors), len(pairs)), True
     return dataset
 
 

@@ -41,7 +41,7 @@ def cut(frames: int, options: ChunkOptions) -> list[Chunk]:
     Raises:
         ConfigError: the chunks would be shorter than what they share.
     """
-    if frames // options.count <= options.overlap:
+    if options.count > 1 and frames // options.count <= options.overlap:
         most = max(frames // (options.overlap + 1), 1)
         raise ConfigError(
             f"--chunks must leave more frames in each than the {options.overlap} that two share, of {frames} frames in "

@@ -70,12 +70,20 @@ def merge_runs(request: MergeRequest) -> dict[str, Any]:
             share no place, or the output folder can't be used.
         ConfigError: an option by which the maps can't be one.
     """
-    config = load_config(RunFolder(request.folders[0]).config) if request.folders else None
-    if config is None or len(request.folders) < 2:
+    if len(request.folders) < 2:
         raise OutputError("spslam merge needs the output folders of two finished runs at least")
+    config = _config_of(RunFolder(request.folders[0]))
     device = resolve_device(request.device)
     with library_threads_limited(), explained_failures(device), kernel_threads_limited(device):
         return _merge(request, config, device)
+
+
+def _config_of(folder: RunFolder) -> Config:
+    if not folder.config.is_file():
+        raise OutputError(
+            f"{folder.path}: must be the output folder of a finished run, but has no {folder.config.name}"
+        )
+    return load_config(folder.config)
 
 
 def _merge(request: MergeRequest, config: Config, device: torch.device) -> dict[str, Any]:

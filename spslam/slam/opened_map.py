@@ -58,8 +58,9 @@ def load_archive(folder: RunFolder) -> KeyframeArchive:
     """The keyframes of a finished run; raises OutputError where it has none, or they can't be read."""
     if not folder.path.is_dir():
         raise OutputError(f"{folder.path}: must be the output folder of a finished run, but is no folder")
-    if not folder.metrics.is_file() or not folder.map.is_file():
-        raise OutputError(f"{folder.path}: must be the output folder of a finished run")
+    for required in (folder.metrics, folder.map):
+        if not required.is_file():
+            raise OutputError(f"{folder.path}: must be the output folder of a finished run, but has no {required.name}")
     if not folder.keyframes.is_file():
         raise OutputError(
             f"{folder.path}: has no {folder.keyframes.name}, which runs with graph.enabled=true write; run it again"

@@ -1,11 +1,13 @@
 """Invalid input: a one-line error, exit code 2, and no partial output."""
 
 import shutil
+import sys
 
 import numpy as np
 import pytest
 import torch
 
+from spslam.cli.main import main
 from tests.cli.command import assert_refused, spslam
 from tests.datasets import layouts
 
@@ -131,6 +133,34 @@ def test_demo_does_not_replace_another_run(tmp_path):
     (tmp_path / "out" / "config.yaml").write_text("something: else\n")
     assert_refused(spslam("demo", "--output", "out", cwd=tmp_path), "holds something that isn't a demo")
     assert len(list((tmp_path / "out").iterdir())) == 1
+
+
+def test_demo_removes_nothing_where_something_else_is_too(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "config.yaml").write_text("dataset: {type: generated}\n")
+    for name in ("mesh.ply", "notes.txt"):
+        (tmp_path / "out" / name).write_text("mine")
+    refused = spslam("demo", "--output", "out", cwd=tmp_path)
+    assert_refused(refused, "out: holds notes.txt beside an earlier demo; use another --output")
+    assert len(list((tmp_path / "out").iterdir())) == 3
+
+
+def test_closed_streams_are_no_error(tmp_path, monkeypatch):
+    for stream in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, stream, None)
+    assert main(["run", "absent", "--output", str(tmp_path / "out")]) == 2
+    assert main(["--version-of-nothing"]) == 2
+
+
+def test_arguments_that_can_not_be_meant_are_refused(tmp_path, scene):
+    assert_refused(spslam("run", "", cwd=tmp_path), "an argument is the empty text")
+    border = run(tmp_path, "7scenes", "--data", scene, "--set", "dataset.border_px=300")
+    assert_refused(border, "dataset.border_px must leave some of images of ")
+    both = ("--record", "out", "--output", "out")
+    assert_refused(spslam("live", "replay", "7scenes", "--data", scene, *both, cwd=tmp_path), "must be two folders")
+    (tmp_path / "empty").mkdir()
+    merged = spslam("merge", "empty", "empty", "--output", "out", cwd=tmp_path)
+    assert_refused(merged, "empty: must be the output folder of a finished run, but has no config.yaml")
 
 
 @pytest.mark.parametrize("command", ["eval", "mesh"])

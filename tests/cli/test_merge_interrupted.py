@@ -16,7 +16,7 @@ def request_of(tmp_path, monkeypatch):
         monkeypatch.setattr(merge, name, lambda *_: None)
     monkeypatch.setattr(merge, "_joined", lambda *_: SimpleNamespace(settings=None))
     monkeypatch.setattr(merge, "joined_state", lambda *_: None)
-    monkeypatch.setattr(merge, "load_config", lambda _: SimpleNamespace())
+    monkeypatch.setattr(merge, "_config_of", lambda _: SimpleNamespace())
 
     def make(error):
         def write(folder, *_):

@@ -32,8 +32,11 @@ def test_floating_point_depth(tmp_path):
     stored = np.array([[1.5, np.nan, -1], [np.inf, 0, 2]], np.float32)
     cv2.imwrite(str(tmp_path / "d.tiff"), stored)
     np.save(tmp_path / "d.npy", stored.astype(np.float64))
-    for name in ("d.tiff", "d.npy"):
-        np.testing.assert_array_equal(read_depth(tmp_path / name, None), [[1.5, 0, 0], [0, 0, 2]])
+    np.save(tmp_path / "transposed.npy", np.asfortranarray(stored))
+    for name in ("d.tiff", "d.npy", "transposed.npy"):
+        depth = read_depth(tmp_path / name, None)
+        np.testing.assert_array_equal(depth, [[1.5, 0, 0], [0, 0, 2]])
+        assert depth.flags.c_contiguous  # as OpenCV asks for
 
 
 def test_sixteen_bits_are_millimeters_unless_told(tmp_path):
@@ -70,8 +73,8 @@ def test_broken_files(tmp_path):
         "text.png": "text.png: can't be decoded as an image",
         "text.npy": "text.npy: can't be read as an array",
         "folder.png": "folder.png: can't be read: Is a directory",
-        "eight.png": "eight.png: depth must be 16-bit or floating-point with one channel, got uint8 with 1",
-        "rgb.png": "rgb.png: depth must be 16-bit or floating-point with one channel, got uint8 with 3",
+        "eight.png": "eight.png: depth must be uint16, float32 or float64 with one channel, got uint8 with 1",
+        "rgb.png": "rgb.png: depth must be uint16, float32 or float64 with one channel, got uint8 with 3",
     }.items():
         with pytest.raises(DatasetError, match=message) as error:
             read_depth(tmp_path / name, 1000.0)

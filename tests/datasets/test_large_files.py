@@ -105,9 +105,9 @@ def test_a_sens_file_that_announces_more_frames_than_anybody_records(tmp_path):
     ("shape", "message"),
     [
         ((10**6, 10**6), "an image must have 1 to 16777216 pixels"),
-        ((10**12,), r"depth must be 16-bit or floating-point \[H, W\], got float32 \[1000000000000\]"),
-        ((), r"depth must be 16-bit or floating-point \[H, W\], got float32 \[\]"),
-        ((0, 5), r"depth must be 16-bit or floating-point \[H, W\], got float32 \[0, 5\]"),
+        ((10**12,), r"depth must be uint16, float32 or float64 \[H, W\], got float32 \[1000000000000\]"),
+        ((), r"depth must be uint16, float32 or float64 \[H, W\], got float32 \[\]"),
+        ((0, 5), r"depth must be uint16, float32 or float64 \[H, W\], got float32 \[0, 5\]"),
         ((24, 32), "the array is truncated"),
     ],
 )

@@ -121,7 +121,8 @@ def judge(dataset: RgbdDataset, views: Sequence[View], followed: Followed | None
     has_depth = any(view.known_share > 0 for view in views)
     if not has_depth or any(finding.certain for finding in findings):
         return Judgment(folded(findings), True)
-    findings += [*order_findings(views), *time_findings(dataset.timestamps())]
+    findings += [] if dataset.is_timed else order_findings(views)
+    findings += time_findings(dataset.timestamps())
     tracks = follow(views, followed)
     lens = Lens(stretch.camera, float(np.median(stretch.known_depth()[::7])))
     segments, points = _with_depth(views, tracks.segments)
