@@ -65,6 +65,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
   poses = as_contiguous(poses);
   const std::int64_t frames = pixels.size(0), count = pixels.size(1);
   check_count("gauss_newton_poses", "pixels of a frame", count, 0);
+  SPS_CHECK(frames < 1 << 16, "gauss_newton_poses: there must be fewer than 2^16 frames, got ", frames);
   Tensor hessian = empty(poses, {frames, 6, 6}, ScalarType::Float);
   Tensor gradient = empty(poses, {frames, 6}, ScalarType::Float);
   Tensor cost = empty(poses, {frames}, ScalarType::Float);

@@ -204,11 +204,11 @@ __global__ void __launch_bounds__(kThreads)
   __shared__ float sums[kWarps][kSums];
   network.load(scene.geometry_params);
   __syncthreads();
-  const std::int64_t frame = blockIdx.x;  // there may be more frames than a grid has in y
+  const std::int64_t frame = blockIdx.y;
   PixelQueue queue(source, frame);
   const double sum =
       sum_block(scene, network, measurement(options, nullptr, 0), load_pose(poses + kPoseSize * frame), queue, sums);
-  if (threadIdx.x < kSums) partials[(frame * gridDim.y + blockIdx.y) * kSums + threadIdx.x] = sum;
+  if (threadIdx.x < kSums) partials[(frame * gridDim.x + blockIdx.x) * kSums + threadIdx.x] = sum;
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -260,7 +260,7 @@ void gauss_newton_poses<Cuda>(Cuda device, const SceneView& scene, const std::in
   const std::int64_t blocks = block_count(pixels_per_frame);
   const PixelSource source{pixels, frames * pixels_per_frame, pixels_per_frame, false, {}};
   if (blocks > 0) {
-    const dim3 grid(static_cast<unsigned>(frames), static_cast<unsigned>(blocks));
+    const dim3 grid(static_cast<unsigned>(blocks), static_cast<unsigned>(frames));
     residual_kernel<<<grid, kThreads, 0, stream>>>(scene, source, poses, map_options(intrinsics, truncation, kernel),
                                                    partials);
   }

@@ -213,7 +213,7 @@ def gauss_newton_poses(
 
     Args:
         scene: the map.
-        pixels: int32 [F, N, 3] packed pixel records.
+        pixels: int32 [F, N, 3] packed pixel records, F < 2^16.
         poses: float32 [F, 7].
         intrinsics: of the camera.
         truncation: of the scene's SDF, m.
