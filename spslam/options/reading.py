@@ -171,7 +171,11 @@ class DatasetOptions(Section):
 class RunOptions(Section):
     """How frames are read and what is saved during a run."""
 
-    checkpoint_every: int = option("save a checkpoint every n frames; 0 saves none", "frames", ge=0)
+    checkpoint_every: int = option(
+        "save a checkpoint every n frames, and every tenth of what is done where that is more; 0 saves none",
+        "frames",
+        ge=0,
+    )
     prefetch_workers: int | None = option(
         "threads that read and decode images; null chooses by the number of cores and the device", "threads", ge=1
     )
