@@ -135,6 +135,16 @@ def test_larger_texels_where_pages_are_full(monkeypatch):
     assert rms(colors, points) < 6
 
 
+def test_a_face_is_on_one_page_however_fine_the_texels_wanted():
+    vertices = np.array([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]], np.float32)
+    blank = np.zeros((3, 3))
+    mesh = TriangleMesh(vertices, np.array([[0, 1, 2]], np.int32), blank.astype(np.uint8), blank.astype(np.float32))
+    made = atlas.make_atlas(mesh, 1e-5, 4)
+    assert 1e-5 < made.texel_m < 2e-5 and made.pages == 1
+    assert made.corners_px.min() >= 0 and made.corners_px.max() < atlas.MOST_PAGE_PX
+    assert atlas.find_texels(made).places.max() < made.size[0] * made.size[1]
+
+
 def test_more_charts_than_pages_have_room_for_are_refused(monkeypatch):
     monkeypatch.setattr(atlas, "MOST_PAGE_PX", 8)
     with pytest.raises(SpslamError, match="more than 1 pages .* charts; a coarser mesh"):

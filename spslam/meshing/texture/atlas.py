@@ -55,7 +55,7 @@ def make_atlas(mesh: TriangleMesh, texel_m: float, most_pages: int) -> Atlas:
     Args:
         mesh: with at least one face.
         texel_m: edge of a texel wanted, m.
-        most_pages: with more pages of `MOST_PAGE_PX` squared, larger texels are taken.
+        most_pages: with more pages of `MOST_PAGE_PX` squared, or a chart larger than one, larger texels are taken.
 
     Returns:
         The atlas. Deterministic.
@@ -66,6 +66,9 @@ def make_atlas(mesh: TriangleMesh, texel_m: float, most_pages: int) -> Atlas:
     for _ in range(_ATTEMPTS):
         charts = make_charts(mesh, texel_m * TILE_PX)
         sizes = np.ceil(charts.sizes_m / texel_m).astype(np.int64) + 1 + 2 * GUTTER_PX
+        if sizes.max() > MOST_PAGE_PX:  # a face that fits on no page
+            texel_m = float(charts.sizes_m.max()) / max(MOST_PAGE_PX - 2 - 2 * GUTTER_PX, 1)
+            continue
         page_of, offsets, size = _packed(sizes)
         pages = int(page_of.max()) + 1
         if pages <= most_pages:
