@@ -59,9 +59,8 @@ class ReplaySource(LiveSource):
             return None
         frame = self._dataset[int(self._order[number])]
         frame.timestamp = float(self._times[number])
-        if (
-            number and self._order[number] < self._order[number - 1]
-        ):  # time runs backwards: what came after comes before
+        if number and self._order[number] < self._order[number - 1]:
+            # On the way back what was taken later comes first.
             frame.offsets = CaptureOffsets(-frame.offsets.depth, -frame.offsets.color)
         return frame
 

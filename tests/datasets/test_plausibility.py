@@ -11,7 +11,7 @@ from experiments.wrong_inputs import LATE
 from experiments.wrong_recordings import FAULTS, Fault, WrongRecording
 from spslam.datasets.base import RgbdDataset, RgbdFrame
 from spslam.datasets.places import Capture, PlacesDataset
-from spslam.datasets.plausibility import Finding, check_first_frames, folded, require_sound
+from spslam.datasets.plausibility import Finding, check_first_frames, folded, require_sound, turning
 from spslam.datasets.plausibility.edges import TURNS, EdgeMatch
 from spslam.datasets.plausibility.flow_fit import Points, fit_flow, fit_flows
 from spslam.datasets.plausibility.intrinsics import CERTAIN_SIGMAS, estimate_lens
@@ -374,6 +374,20 @@ def test_time_stamps_in_other_units_say_nothing_of_a_lag(unit):
     lens = Lens(arcade.camera, 3.0)
     assert [finding.kind for finding in lag_findings(late, lens)] == ["pairing"]
     assert lag_findings([replace(view, timestamp=unit * view.timestamp) for view in late], lens) == []
+
+
+def test_small_turns_alone_tell_no_lag(monkeypatch):
+    """As in a hall whose walls are out of range: depth shows no turn at all, and small ones of color fit at any lag."""
+    arcade = PlacesDataset("arcade", "handheld", "structured_light", 60, seed=0)
+    views = read_views(arcade, range(0, 48, 2))
+    turns = np.zeros((len(views) - 1, 3))
+    turns[:, 1] = np.radians([*np.linspace(2, 10, 12), *np.full(11, 0.4)])
+    still = np.full_like(turns, np.radians(0.05))
+    monkeypatch.setattr(turning, "_turns_of_color", lambda *_: turns)
+    monkeypatch.setattr(turning, "_turns_of_depth", lambda *_: still)
+    assert lag_findings(views, Lens(arcade.camera, 3.0)) == []
+    monkeypatch.setattr(turning, "_turns_of_depth", lambda *_: np.roll(turns, 3, axis=0))
+    assert [finding.kind for finding in lag_findings(views, Lens(arcade.camera, 3.0))] == ["pairing"]
 
 
 def test_color_may_be_as_late_as_tracking_measures():

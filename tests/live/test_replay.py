@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 
+from spslam.datasets.clock import CaptureOffsets
 from spslam.errors import DatasetError
 from spslam.live import replay
 from spslam.live.replay import ReplaySource
@@ -38,6 +39,15 @@ def test_repeated_it_goes_back_and_forth_in_time_that_ascends():
     assert [frame.index for frame in frames] == [0, 1, 2, 1, 0, 1, 2]
     np.testing.assert_allclose(np.diff([frame.timestamp for frame in frames]), 1 / 30, atol=1e-6)
     assert [frame.timestamp for frame in frames[:3]] == dataset.timestamps().tolist()
+
+
+def test_on_the_way_back_color_that_was_later_is_earlier():
+    def with_late_color(frame):
+        frame.offsets = CaptureOffsets(0.002, 0.01)
+
+    frames = [item.frame for item in frames_of(ReplaySource(Recorded(3, change=with_late_color), 200, repeat=3))]
+    assert [frame.offsets.color for frame in frames] == [0.01, 0.01, 0.01, -0.01, -0.01, 0.01, 0.01]
+    assert frames[3].offsets.depth == -0.002
 
 
 def test_an_unreadable_frame_comes_as_its_error():
