@@ -155,8 +155,8 @@ py::object lookup(const py::object& hash_keys, const py::object& hash_values, co
     std::int32_t* rows_out = rows.mutable_data();
     T* local_out = local.mutable_data();
     without_gil([&] {
-      voxel_hash_lookup(kCpu, keys.data(), values.data(), capacity, corners.data(), at.data(), at.size(0),
-                        static_cast<T>(voxel_size), rows_out, local_out);
+      voxel_hash_lookup(kCpu, keys.data(), values.data(), capacity, corners.data(), corners.size(0), at.data(),
+                        at.size(0), static_cast<T>(voxel_size), rows_out, local_out);
     });
     return py::make_tuple(rows, local);
   });
