@@ -72,7 +72,9 @@ def open_azure_kinect(path: Path, tolerance_s: float = 0.02, view: View = "depth
     sizes = {"color": color.index.size, "depth": depth.index.size}
     calibration = read_calibration(attached, sizes, f"{path}, calibration.json")
     pairs = pair_by_time(color.times(), depth.times(), tolerance_s, str(path))
-    return Recording(f"azure_kinect/{path.stem}", color, depth, pairs, calibration, view=view)
+    dataset = Recording(f"azure_kinect/{path.stem}", color, depth, pairs, calibration, view=view)
+    dataset.is_timed = True
+    return dataset
 
 
 def read_calibration(content: bytes, sizes: Mapping[str, Size], source: str) -> Calibration:

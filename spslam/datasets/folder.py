@@ -133,9 +133,9 @@ def with_times(frames: list[FramePaths], path: Path) -> list[FramePaths]:
         raise DatasetError(f"{path}: must have one time (s) for each of {len(frames)} frames, got {len(times)}")
     ascends = np.isfinite(times) & np.r_[True, np.diff(times) > 0]
     if not ascends.all():
-        line = int(np.flatnonzero(~ascends)[0])
+        first = int(np.flatnonzero(~ascends)[0])
         raise DatasetError(
-            f"{path}: times must be finite and ascend, but the {line + 1}th, {times[line]:.6f}, does not"
+            f"{path}: times must be finite and ascend, but number {first + 1}, {times[first]:.6f}, does not"
         )
     return [replace(frame, timestamp=float(time)) for frame, time in zip(frames, times, strict=True)]
 

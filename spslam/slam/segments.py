@@ -186,8 +186,10 @@ class Segments:
 
 
 def _lost_s(state: SlamState) -> float:
-    """Seconds from the last known frame, or else the first frame, to the newest; of the recording's own, not of those
-    of a map that was opened, whose clock was another."""
+    """Seconds from the last known frame, or else the first frame, to the newest.
+
+    Frames of a map that was opened don't count: their clock was another.
+    """
     opened = state.frames.opened
     known, times = (~state.frames.lost[opened:]).nonzero(), state.frames.timestamps[opened:]
     return float(times[-1] - times[int(known[-1]) if len(known) else 0])

@@ -65,7 +65,9 @@ def open_realsense(path: Path, options: RosOptions | None = None) -> Recording:
     color_stream = TopicStream(path, color.name, color_index, False)
     depth_stream = TopicStream(path, depth.name, depth_index, True, scale)
     pairs = pair_by_time(color_index.seconds, depth_index.seconds, options.pair_tolerance_s, str(path))
-    return Recording(f"realsense/{path.stem}", color_stream, depth_stream, pairs, calibration, view=options.view)
+    dataset = Recording(f"realsense/{path.stem}", color_stream, depth_stream, pairs, calibration, view=options.view)
+    dataset.is_timed = True
+    return dataset
 
 
 def _lens(bag: Bag, topic: ImageTopic) -> Lens:

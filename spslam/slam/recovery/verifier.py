@@ -30,8 +30,8 @@ class Verifier:
     def __init__(self, config: Config, camera: Camera, confidence: PoseConfidenceModel):
         self._config, self._camera, self._confidence = config, camera, confidence
         self._intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
-        # The coverage as the last frame found it; neither frame nor map is kept for it.
-        self._covered: tuple[weakref.ref[FramePixels], weakref.ref[Scene], float] | None = None
+        # The coverage as the last frame found it, from which trusted frame; neither frame nor map is kept for it.
+        self._covered: tuple[weakref.ref[FramePixels], weakref.ref[Scene], int | None, float] | None = None
 
     def verified(
         self,
@@ -55,14 +55,14 @@ class Verifier:
         rows = history.compared_rows()
         counts, best = surface_counts(pixels, pose, history.poses, history.depth_thumbnails, rows, self._camera)
         asked = [self._brightness_sums(pixels, pose, rows[best], history)] if compares_brightness else []
-        known = self._covered
-        is_known = known is not None and known[0]() is pixels and known[1]() is scene
-        if not is_known:
+        coverage, last = self._known_coverage(scene, pixels, history), history.last_row()
+        if coverage is None:
             asked.append(self._map_coverage(scene, history))
         # Waits for the device, once.
         seen, through, occluded, *numbers = torch.cat([counts, *asked]).tolist()
-        coverage = known[2] if known is not None and is_known else numbers.pop()
-        self._covered = weakref.ref(pixels), weakref.ref(scene), coverage
+        if coverage is None:
+            coverage = numbers.pop()
+            self._covered = weakref.ref(pixels), weakref.ref(scene), last, coverage
         unknown = self._confidence.unknown_free_space_violation
         violation, occluded_share = surface_shares(seen, through, occluded, unknown)
         return replace(
@@ -72,6 +72,14 @@ class Verifier:
             map_coverage=coverage,
             brightness_correlation=brightness_correlation(*numbers) if compares_brightness else math.nan,
         )
+
+    def _known_coverage(self, scene: Scene, pixels: FramePixels, history: FrameHistory) -> float | None:
+        """The map coverage, if it was counted for another pose of the same frame."""
+        if self._covered is None:
+            return None
+        counted_for, counted_in, last, coverage = self._covered
+        is_same = counted_for() is pixels and counted_in() is scene and last == history.last_row()
+        return coverage if is_same else None
 
     def _brightness_sums(
         self, pixels: FramePixels, pose: torch.Tensor, rows: torch.Tensor, history: FrameHistory
