@@ -77,14 +77,19 @@ def observed_samples(
         count: number of points.
 
     Returns:
-        float64 [M, 3], M <= count; fewer than `count` only if very little of the surface is observed. Deterministic.
+        float64 [M, 3], M <= count, distributed uniformly over what is observed; fewer than `count` only if very little
+        of the surface is. Deterministic.
     """
     kept: list[np.ndarray] = [np.zeros((0, 3))]
     missing = count
     for seed in range(_SAMPLING_ROUNDS):
         points = surface.sample_surface(count, seed)
-        kept.append(points[observed(points)][:missing])
-        missing -= len(kept[-1])
+        found = points[observed(points)]
+        if len(found) > missing:
+            # Samples come in the order of the faces: the first ones would be of one part of the surface.
+            found = np.random.default_rng(seed).permutation(found)[:missing]
+        kept.append(found)
+        missing -= len(found)
         if missing == 0 or not len(points):
             break
     return np.concatenate(kept)

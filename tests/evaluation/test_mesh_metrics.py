@@ -139,3 +139,14 @@ def test_observed_samples_of_a_surface_with_a_small_observed_part():
     assert len(observed_samples(square(), lambda p: p[:, 0] < 0.5, 1000)) == 1000
     empty = TriangleSurface(np.zeros((0, 3)), np.zeros((0, 3), int))
     assert observed_samples(empty, everywhere, 10).shape == (0, 3)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
+def test_the_order_of_faces_does_not_matter(order):
+    """Of three squares of one size a third is not observed, and of the others one is 10 cm off."""
+    exact, off, unseen = square(), square(height=0.1), square(height=9.0)
+    meshes = [(exact, off, unseen)[i].triangles() for i in order]
+    vertices = np.concatenate([vertices for vertices, _ in meshes])
+    faces = np.concatenate([faces + 4 * i for i, (_, faces) in enumerate(meshes)])
+    points = observed_samples(TriangleSurface(vertices, faces), lambda p: p[:, 2] < 1, 3000)
+    assert len(points) == 3000 and np.mean(points[:, 2] > 0.05) == pytest.approx(0.5, abs=0.03)
