@@ -87,18 +87,18 @@ def _config_of(folder: RunFolder) -> Config:
 
 
 def _merge(request: MergeRequest, config: Config, device: torch.device) -> dict[str, Any]:
-    _check_output(request.output_dir)
+    output = _output_of(request)
     archives = _archives(request, config)
     joined = _joined(request.folders, archives, config)
     state = joined_state(RunFolder(request.folders[0]), joined, config, device)
     make_map(state, config)
     archive = archive_of(state, None, joined.settings)
-    temporary = OutputFolder(request.output_dir.parent / f".{request.output_dir.name}.merging")
+    temporary = OutputFolder(output.parent / f".{output.name}.merging")
     with temporary.locked():
         try:
             _empty(temporary.path)
             metrics = _write(temporary, request, config, state, archive)
-            _rename(temporary.path, request.output_dir)
+            _rename(temporary.path, output)
         except BaseException:  # Ctrl-C among them: only a killed merge leaves its folder
             shutil.rmtree(temporary.path, ignore_errors=True)
             raise
@@ -112,9 +112,14 @@ def _rename(made: Path, output: Path) -> None:
         raise OutputError(f"{output}: can't be made: {error.strerror or error}") from None
 
 
-def _check_output(path: Path) -> None:
+def _output_of(request: MergeRequest) -> Path:
+    """The folder that the results are renamed to, after symbolic links; it is empty or not there yet."""
+    path = request.output_dir.resolve()
+    if path == Path.cwd():
+        raise OutputError(f"{request.output_dir}: is the working directory; use another --output")
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise OutputError(f"{path}: is not an empty folder; use another --output")
+        raise OutputError(f"{request.output_dir}: is not an empty folder; use another --output")
+    return path
 
 
 def _empty(path: Path) -> None:
@@ -142,7 +147,7 @@ def _joined(folders: Sequence[Path], archives: Sequence[KeyframeArchive], config
     """One map of all; each is joined as soon as it shares a place with those before."""
     joined, waiting = archives[0], dict(zip(folders[1:], archives[1:], strict=True))
     while waiting:
-        reasons = {}
+        reasons, before = {}, len(waiting)
         for folder, archive in list(waiting.items()):
             found = join_archives(joined, archive, registrar_of(joined, archive, config))
             if isinstance(found, str):
@@ -150,7 +155,7 @@ def _joined(folders: Sequence[Path], archives: Sequence[KeyframeArchive], config
             else:
                 joined = found
                 del waiting[folder]
-        if len(reasons) == len(waiting):
+        if len(waiting) == before:
             break
     for folder, reason in reasons.items() if waiting else ():
         raise OutputError(f"{folder}: shares no place with {folders[0]}: {reason}")

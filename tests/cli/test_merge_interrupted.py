@@ -1,5 +1,6 @@
 """What `spslam merge` leaves where it does not come to its end."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -59,3 +60,33 @@ def test_an_interruption_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(merge, "merge_runs", interrupted)
     result = spslam("merge", "a", "b", "--output", "out", cwd=tmp_path)
     assert result.returncode == 130 and result.stderr == "spslam: interrupted\n"
+
+
+def test_an_empty_folder_behind_a_symbolic_link_is_filled(request_of, tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "disk")
+    merge.merge_runs(request_of(None))
+    assert [path.name for path in (tmp_path / "disk").iterdir()] == ["half"]
+
+
+def test_the_working_directory_is_refused(request_of, tmp_path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    with pytest.raises(OutputError, match="is the working directory; use another --output"):
+        merge.merge_runs(request_of(None))
+
+
+@pytest.mark.parametrize("order", [("one", "near", "far"), ("one", "far", "near")])
+def test_maps_are_joined_in_any_order_that_works(monkeypatch, order):
+    """`far` shares a place with `near` only."""
+    shared = [{"one", "near"}, {"near", "far"}]
+
+    def join(first, second, _):
+        return first | second if any({a, b} in shared for a in first for b in second) else "no place is shared"
+
+    monkeypatch.setattr(merge, "join_archives", join)
+    monkeypatch.setattr(merge, "registrar_of", lambda *_: None)
+    joined = merge._joined([Path(name) for name in order], [{name} for name in order], None)
+    assert joined == {"one", "near", "far"}
+    with pytest.raises(OutputError, match="far: shares no place with one: no place is shared"):
+        merge._joined([Path("one"), Path("far")], [{"one"}, {"far"}], None)
