@@ -21,6 +21,7 @@ from spslam.slam.graph.archive import RECORDS, KeyframeArchive, Recording, same_
 from spslam.slam.graph.joined import moved_recordings
 from spslam.slam.graph.keyframe import MIN_DEPTH_M, Keyframe
 from spslam.slam.graph.keyframe_graph import GraphContent
+from spslam.slam.graph.keyframe_store import KeyframeStore
 from spslam.slam.graph.remap import empty_volume, encode_keyframe
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, unpack_points
 from spslam.slam.poses import pose_tensor
@@ -143,9 +144,28 @@ def archive_of(state: SlamState, recording: Recording | None, settings: Mapping[
         recordings.append(recording)
     keyframes = [each.changed(frame=int(row)) for row, each in zip(rows, store.keyframes, strict=True)]
     noise = {**store.noises, store.camera: state.noise.model.cpu()} if recording is not None else store.opened_noise
+    content, followers = store.content, _followers(store, first)
     return KeyframeArchive(
-        recordings, keyframes, store.links, records, store.content.edges, store.content.tried, noise, settings
+        recordings, keyframes, store.links, records, content.edges, content.tried, noise, settings, followers
     )
+
+
+def _followers(store: KeyframeStore, first: int) -> np.ndarray:
+    """int64 [N, 2] as `KeyframeArchive` has them: of the opened map, whose frames come first, and of the run.
+
+    Args:
+        store: of the state.
+        first: number of the state's first frame of the run; those before are the opened map's keyframes.
+    """
+    own = [(anchor.frame, anchor.reference) for anchor in store.anchors]
+    if store.opened is None:
+        return np.array(own, np.int64).reshape(-1, 2)
+    # Of the opened map's keyframes, those that are kept, by their numbers now, and those that are not.
+    references = {int(row): number for number, row in enumerate(store.rows) if row < first} | dict(own)
+    before = [(frame, references[keyframe]) for frame, keyframe in store.opened.followers.tolist()]
+    rows, shift = store.opened.rows, int(store.opened.ends[-1]) - first
+    now = [(rows[frame] if frame < first else frame + shift, reference) for frame, reference in own]
+    return np.array(sorted([*before, *now]), np.int64).reshape(-1, 2)
 
 
 def seen_by(records: torch.Tensor, own: Camera, keyframe: Keyframe, camera: Camera) -> torch.Tensor:

@@ -8,6 +8,7 @@ from spslam.camera import Camera
 from spslam.config import load_config
 from spslam.slam.graph.archive import KeyframeArchive, Recording
 from spslam.slam.graph.edges import Link
+from spslam.slam.graph.joined import moved_recordings
 from spslam.slam.graph.keyframe import Keyframe
 from spslam.slam.opened_map import archive_of, put_keyframes
 from spslam.slam.poses import pose_tensor
@@ -80,3 +81,39 @@ def test_each_keyframe_keeps_its_own_pose_and_pixels(state, left_out):
     assert [int(each.intensity.flatten()[0]) for each in archive.keyframes] == expected
     assert archive.poses[:, 0, 3].tolist() == expected
     assert archive.records[:, 0, 2].tolist() == expected
+
+
+def test_frames_follow_keyframes_that_were_left_out(state):
+    """Those of the opened map at 3 and 4 follow that at 2, the own at 102 that at 101, whatever lies between."""
+    state.graph.leave_out({2: 1, 5: 4}, state.frames.matrices()[state.graph.rows])
+    state.graph.leave_out({2: 1}, state.frames.matrices()[state.graph.rows])
+    archive = archive_of(state, recording("own", 101, OWN), {})
+    assert archive.rows.tolist() == [0, 1, 4, 6] and archive.followers.tolist() == [[2, 1], [3, 1], [5, 2]]
+    turned = archive.poses
+    turned[1:3, 1, 3] = [1.0, 5.0]  # the middle two are moved
+    opened, own = moved_recordings(archive, turned)
+    assert opened.trajectory.poses[:, 1, 3].tolist() == [0, 1, 1, 1]
+    assert own.trajectory.poses[:, 1, 3].tolist() == [5, 5, 0]
+    assert opened.trajectory.poses[:, 0, 3].tolist() == [1, 2, 3, 4]
+
+
+def test_followers_are_kept_by_maps_that_are_opened_again(state, tmp_path):
+    state.graph.leave_out({2: 1, 5: 4}, state.frames.matrices()[state.graph.rows])
+    archive = archive_of(state, recording("own", 101, OWN), {})
+    archive.save(tmp_path / "keyframes.safetensors")
+    known = KeyframeArchive.load(tmp_path / "keyframes.safetensors")
+    assert known.followers.tolist() == archive.followers.tolist() == [[2, 1], [5, 3]]
+    again = SlamState.start(load_config("folder"), CAMERA, np.eye(4), None, torch.device("cpu"))
+    put_keyframes(again, known, known.poses)
+    again.graph.leave_out({3: 2}, again.frames.matrices()[again.graph.rows])
+    # Of the five keyframes the fourth, own frame 101, is left out now: what followed it follows the third.
+    assert archive_of(again, None, {}).followers.tolist() == [[2, 1], [4, 2], [5, 2]]
+
+
+def test_noise_of_an_opened_map_is_restored_beside_that_of_the_same_camera(state):
+    store = state.graph
+    store.opened_noise[store.camera] = torch.tensor([1.0, 2, 3, 4])
+    again = SlamState.start(load_config("folder"), CAMERA, np.eye(4), None, torch.device("cpu")).graph
+    again.load_state_dict(store.tensors())
+    assert again.noise.tolist() == store.noise.tolist()
+    assert again.opened_noise[store.camera].tolist() == [1, 2, 3, 4]

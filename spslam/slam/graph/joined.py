@@ -48,13 +48,14 @@ def registrar_of(first: KeyframeArchive, second: KeyframeArchive, config: Config
 
 
 def moved_recordings(archive: KeyframeArchive, poses: np.ndarray) -> list[Recording]:
-    """The recordings of a map whose keyframes are now at poses float64 [K, 4, 4]; frames between follow them."""
+    """The recordings of a map whose keyframes are now at poses float64 [K, 4, 4]; all frames follow them."""
+    rows, at_rows = archive.with_followers(poses)
     moved, begin = [], 0
     for recording, end in zip(archive.recordings, archive.ends.tolist(), strict=True):
-        own = (archive.rows >= begin) & (archive.rows < end)
+        own = (rows >= begin) & (rows < end)
         at = recording.trajectory.poses
         if own.any():
-            at = corrected_poses(at, archive.rows[own] - begin, poses[own])
+            at = corrected_poses(at, rows[own] - begin, at_rows[own])
         moved.append(_at(recording, at))
         begin = end
     return moved
@@ -78,6 +79,7 @@ def _concatenated(
         first.tried | {(one + count, other + count) for one, other in second.tried},
         {**second.noise, **first.noise},
         first.settings,
+        np.concatenate([first.followers, second.followers + (frames, count)]),
     )
     return joined, [replace(each, source=each.source + count) for each in joint.loops]
 

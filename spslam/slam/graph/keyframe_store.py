@@ -25,6 +25,8 @@ from spslam.slam.graph.keyframe_tensors import (
 )
 from spslam.slam.graph.redundancy import Anchor, moved_anchors
 
+NO_NOISE = torch.zeros((0, 4))
+
 
 class KeyframeStore:
     """The graph's keyframes, what was measured between them, and the solution that is being made.
@@ -132,6 +134,8 @@ class KeyframeStore:
             "start": torch.from_numpy(self.start),
             "target": torch.from_numpy(np.zeros((0, 4, 4)) if self.target is None else self.target),
             "noise": torch.stack([self.noise, *(self.opened_noise[camera] for camera in cameras[1:])]),
+            # Of a camera like the run's, which has a noise of its own.
+            "opened_noise": self.opened_noise[self.camera][None] if self.camera in self.opened_noise else NO_NOISE,
             "numbers": torch.tensor([content.done, -1 if self.begun is None else self.begun]),
         }
 
@@ -154,6 +158,8 @@ class KeyframeStore:
         self.target = state["target"].cpu().numpy().copy() if len(state["target"]) else None
         self.noise, *others = state["noise"].cpu().clone()
         self.opened_noise = dict(zip(cameras[1:], others, strict=True))
+        for noise in state.get("opened_noise", NO_NOISE).cpu().clone():
+            self.opened_noise[self.camera] = noise
 
     def _settle(self) -> None:
         if self._arriving is not None:

@@ -73,12 +73,12 @@ def join_parts(first: Part, second: Part, boundary: int, registrar: Registrar) -
     """
     kept = _cut(first, slice(0, first.row(boundary))), _cut(second, slice(second.row(boundary), len(second.indices)))
     pose = _pose_by_frames(first, second)
-    if not kept[0].archive.keyframes or (pose is None and not kept[1].archive.keyframes):
+    if not kept[0].archive.keyframes or (isinstance(pose, str) and not kept[1].archive.keyframes):
         return "one of them knows no frame of its own"
-    if pose is None:
+    if isinstance(pose, str):
         joint = find_joint(registrar, *(Component(each.archive.keyframes, each.archive.poses) for each in kept[::-1]))
         if isinstance(joint, str):
-            return f"they know no frame together, and {joint}"
+            return f"{pose}, and {joint}"
         pose = joint.pose
     count = len(kept[0].archive.keyframes)
     joined = _concatenated(*kept, pose)
@@ -96,12 +96,12 @@ def join_parts(first: Part, second: Part, boundary: int, registrar: Registrar) -
     return replace(joined, archive=moved, decisions=tuple(decisions))
 
 
-def _pose_by_frames(first: Part, second: Part) -> np.ndarray | None:
-    """float64 [4, 4] T_first_second by the frames that both know; None where they are too few, or do not agree."""
+def _pose_by_frames(first: Part, second: Part) -> np.ndarray | str:
+    """float64 [4, 4] T_first_second by the frames that both know; in words, why they do not say it."""
     _, ones, others = np.intersect1d(first.indices, second.indices, assume_unique=True, return_indices=True)
     known = np.flatnonzero(~(first.trajectory.lost[ones] | second.trajectory.lost[others]))
     if len(known) < MIN_SHARED_FRAMES:
-        return None
+        return f"the camera is known in {len(known)} frames that they share, {MIN_SHARED_FRAMES} must be"
     chosen = known[np.unique(np.linspace(0, len(known) - 1, COMPARED).round().astype(int))]
     there, here = first.trajectory.poses[ones[chosen]], second.trajectory.poses[others[chosen]]
     candidates = compose(there, inverse(here))
@@ -110,7 +110,8 @@ def _pose_by_frames(first: Part, second: Part) -> np.ndarray | None:
     placed = np.einsum("cij,pj->cpi", candidates[:, :3, :3], points) + candidates[:, None, :3, 3]
     distances = np.linalg.norm(placed[:, None] - placed[None], axis=3).mean(2)
     best = int(distances.sum(1).argmin())
-    return candidates[best] if float(np.median(distances[best])) < AGREE_M else None
+    off_m = float(np.median(distances[best]))
+    return candidates[best] if off_m < AGREE_M else f"the frames that they share disagree by {100 * off_m:.0f} cm"
 
 
 def _cut(part: Part, rows: slice) -> Part:
@@ -119,6 +120,8 @@ def _cut(part: Part, rows: slice) -> Part:
     inside = (archive.rows >= rows.start) & (archive.rows < rows.stop)
     numbers = np.cumsum(inside) - 1
     kept = np.flatnonzero(inside).tolist()
+    followers = archive.followers
+    followers = followers[(followers[:, 0] >= rows.start) & (followers[:, 0] < rows.stop) & inside[followers[:, 1]]]
     edges = [
         replace(edge, source=int(numbers[edge.source]), target=int(numbers[edge.target]))
         for edge in archive.edges
@@ -135,6 +138,7 @@ def _cut(part: Part, rows: slice) -> Part:
         tried={
             (int(numbers[one]), int(numbers[other])) for one, other in archive.tried if inside[one] and inside[other]
         },
+        followers=np.stack([followers[:, 0] - rows.start, numbers[followers[:, 1]]], 1),
     )
     decisions = [
         replace(each, source=each.source - rows.start, target=each.target - rows.start)
@@ -183,6 +187,7 @@ def _concatenated(first: Part, second: Part, pose: np.ndarray) -> Part:
         one.tried | {(source + count, target + count) for source, target in other.tried},
         {**other.noise, **one.noise},
         one.settings,
+        np.concatenate([one.followers, other.followers + (frames, count)]),
     )
     return Part(archive, np.concatenate([first.indices, second.indices]))
 
