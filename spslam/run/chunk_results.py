@@ -174,7 +174,7 @@ def _joined(runs: Sequence[_Run], config: Config) -> Part:
         if isinstance(found, str):
             raise OutputError(
                 f"{run.chunk.name} (frames {run.chunk.begin}:{run.chunk.end}) can't be joined with those before: "
-                f"{found}; use fewer chunks or a larger --overlap"
+                f"{found}; use fewer chunks, or another --overlap"
             )
         joined = found
     return joined

@@ -22,7 +22,7 @@ from spslam.run.output_folder import OutputFolder
 from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest, memory_needed_mb
 from spslam.run.sequence import run_sequence
-from spslam.run.session import finished_metrics, identity_of
+from spslam.run.session import finished_metrics, identity_of, with_absolute_path
 from spslam.run_folder import RunFolder
 from spslam.slam.checkpoint import fingerprint
 from spslam.tasks.schedule import LOG, run_tasks
@@ -85,8 +85,8 @@ def run_chunks(
         finished = finished_metrics(request, dataset)
         if finished is None:
             started = time.perf_counter()
-            _prepare(folder, request, dataset, options)
-            resumed = _run_all(request, chunks, options, executor, report)
+            resumed = _prepare(folder, request, dataset, options)
+            _run_all(request, chunks, options, executor, report)
             runs = [(chunk, chunk_folder(request, chunk)) for chunk in chunks]
             finished = join_chunks(request, dataset, runs, None if resumed else started)
             # The run has finished when the plan is gone; what is killed before is joined again, to the same results.
@@ -113,8 +113,11 @@ def run_chunk(call: TaskCall) -> None:
     run_sequence(RunRequest(config, None if data is None else Path(data), call.output, frames, True, mesh=False))
 
 
-def _prepare(folder: OutputFolder, request: RunRequest, dataset: RgbdDataset, options: ChunkOptions) -> None:
+def _prepare(folder: OutputFolder, request: RunRequest, dataset: RgbdDataset, options: ChunkOptions) -> bool:
     """Makes the locked folder ready, for new chunks or to go on with those that are there.
+
+    Returns:
+        Whether there are some: the time that this takes is then not that of the whole.
 
     Raises:
         OutputError: it holds something else.
@@ -131,11 +134,13 @@ def _prepare(folder: OutputFolder, request: RunRequest, dataset: RgbdDataset, op
     else:
         folder.clear()  # of what was written before they were joined to the end
     device = resolve_device(request.config.device)
-    atomic_write(folder.config, dump_config(request.config, provenance(request.config, device)))
+    config = with_absolute_path(request.config)
+    atomic_write(folder.config, dump_config(config, provenance(request.config, device)))
     if found is None:
         shutil.rmtree(folder.chunks, ignore_errors=True)
         folder.chunks.mkdir()
         plan.write(folder)
+    return found is not None
 
 
 def _check_whole(folder: OutputFolder) -> None:
@@ -151,8 +156,8 @@ def _check_whole(folder: OutputFolder) -> None:
 
 def _run_all(
     request: RunRequest, chunks: Sequence[Chunk], options: ChunkOptions, executor: Executor, report: Report | None
-) -> bool:
-    """Runs the chunks that have not finished; returns whether there were others."""
+) -> None:
+    """Runs the chunks that have not finished."""
     missing = [chunk for chunk in chunks if not chunk_folder(request, chunk).is_finished]
     by_key = {chunk.name: chunk for chunk in missing}
     tasks = [_task(request, chunk, options.device) for chunk in missing]
@@ -168,7 +173,6 @@ def _run_all(
                 report(done, len(chunks), end)
     if failed:
         raise SpslamError(f"{len(failed)} of {len(chunks)} chunks failed; the first: {failed[0]}")
-    return len(missing) < len(chunks)
 
 
 def _task(request: RunRequest, chunk: Chunk, device: str) -> Task:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pydantic
 
-from spslam.datasets import open_dataset
+from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import SpslamError
 from spslam.meshing import TriangleMesh
@@ -86,8 +86,6 @@ def _open_again(recording: Recording) -> RgbdDataset | str:
     if not isinstance(options, dict):
         return "its frames came once"
     try:
-        dataset = open_dataset(DatasetOptions(**options))
-        dataset[0]
+        return open_sequence(DatasetOptions(**options))
     except (SpslamError, pydantic.ValidationError, TypeError) as error:
         return f"its frames can't be read again ({' '.join(str(error).split())[:200]})"
-    return dataset

@@ -57,7 +57,7 @@ def open_session(
         OutputError: the folder can't be used, or its checkpoint belongs to another run.
     """
     folder, identity = OutputFolder(Path(request.output_dir)), identity_of(dataset, request)
-    config = dump_config(_with_absolute_path(system.config), provenance(system.config, system.device))
+    config = dump_config(with_absolute_path(system.config), provenance(system.config, system.device))
     if request.resume and folder.checkpoint.exists():
         _check_data(folder, identity)  # first, as states of other cameras can't be restored
         saved = load_checkpoint(folder.checkpoint, system.state, system.config)
@@ -104,7 +104,7 @@ def _path_of(config: Config) -> str | None:
     return None if path is None else os.path.abspath(path)  # not what a link leads to: its name may tell the camera
 
 
-def _with_absolute_path(config: Config) -> Config:
+def with_absolute_path(config: Config) -> Config:
     """The options as they hold in any working directory."""
     return config.model_copy(update={"dataset": config.dataset.model_copy(update={"path": _path_of(config)})})
 

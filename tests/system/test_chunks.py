@@ -148,6 +148,11 @@ def test_interrupted_chunks_are_not_started_over(tmp_path):
     with pytest.raises(SpslamError):
         run_chunks(request(output), OPTIONS, Broken())
     before = sorted(output.rglob("*"))
+    with pytest.MonkeyPatch.context() as patch:  # half of the time would be missing: nobody knows how long it took
+        patch.setattr(chunks, "_run_all", lambda *_: None)
+        patch.setattr(chunks, "join_chunks", lambda *arguments: pytest.fail(f"{arguments[3]}"))
+        with pytest.raises(pytest.fail.Exception, match="None"):
+            run_chunks(request(output, resume=True), OPTIONS, Broken())
     for resume in (False, True):
         with pytest.raises(OutputError, match=CONTINUED):
             run_sequence(request(output, resume=resume))

@@ -83,7 +83,7 @@ def test_without_a_frame_that_both_know_features_say_it(world):
     joined = join_parts(first, second, 24, registrar(first))
     assert joined.indices.tolist() == list(range(48)) and error_m(joined, world) < 0.03
     reason = join_parts(first, second, 24, registrar(first, features=False))
-    assert reason.startswith("they know no frame together, and 0 of their keyframes")
+    assert reason.startswith("the camera is known in 0 frames that they share, 3 must be, and 0 of their keyframes")
 
 
 def test_poses_that_contradict_are_no_proof(world):
