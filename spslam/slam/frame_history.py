@@ -67,6 +67,12 @@ class FrameHistory:
         known = (~self._state.frames.lost).nonzero()
         return len(self._state.frames) - (int(known[-1]) + 1 if len(known) else 0)
 
+    @property
+    def interval_s(self) -> float:
+        """From the last frame to the next one, as `seconds_since` has it; 0 where that is not known."""
+        seconds = self.seconds_since(-1)
+        return seconds if math.isfinite(seconds) else 0.0
+
     def seconds_since(self, row: int) -> float:
         """From the frame in a row to the next one, if that comes as long after the last as that after the one before.
 

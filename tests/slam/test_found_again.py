@@ -10,6 +10,7 @@ import torch
 from spslam.slam.fit import Fit
 from spslam.slam.recovery.doubtful_frame import preferred_by_brightness, preferred_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.pose_judge import PoseJudge
 from spslam.slam.recovery.recovery import CONSISTENT_FRAMES, Recovery
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.tracker import Tracker
@@ -104,20 +105,25 @@ def test_surface_and_image_features_decide_between_trusted_poses(other, times, d
 
 
 @pytest.mark.parametrize(
-    ("changes", "lost"),
+    ("changes", "interval_s", "lost"),
     [
-        ({}, False),  # the camera turns to what was not seen yet
-        ({"feature_inliers": 40}, True),
-        ({"feature_share": 0.7}, True),
-        ({"feature_share": math.nan}, True),  # colors are not where depth is
-        ({"prediction_error_cm": math.nan}, True),  # it may be anywhere, as where places are alike
-        ({"prediction_error_cm": 30.0}, True),  # it has jumped
-        ({"prediction_error_deg": 10.0}, True),
+        ({}, 0.0, False),  # the camera turns to what was not seen yet
+        ({"feature_inliers": 40}, 0.0, True),
+        ({"feature_share": 0.7}, 0.0, True),
+        ({"feature_share": math.nan}, 0.0, True),  # colors are not where depth is
+        ({"prediction_error_cm": math.nan}, 0.0, True),  # it may be anywhere, as where places are alike
+        ({"prediction_error_cm": 30.0}, 0.0, True),  # it has jumped
+        ({"prediction_error_deg": 10.0}, 0.0, True),
+        ({"prediction_error_cm": 6.0, "prediction_error_deg": 5.0}, 0.1, True),
+        ({"prediction_error_cm": 10.0, "prediction_error_deg": 5.0}, 0.15, False),  # it was carried on meanwhile
+        ({"prediction_error_cm": 31.0}, 0.4, True),
     ],
 )
-def test_off_the_map_image_features_hold_a_camera(recovery, changes, lost):
+def test_off_the_map_image_features_hold_a_camera(recovery, changes, interval_s, lost):
     off = replace(CERTAIN, inlier_share=0.15, mean_robust_weight=0.1, feature_inliers=200, feature_share=1.0)
-    assert recovery._judgement(replace(off, **changes))["lost"] == lost
+    tracked = TrackedFrame(torch.zeros(7), 8, replace(off, **changes), error_probability=0.0, lost=False)
+    judge = PoseJudge(settings(), PoseConfidenceModel.load())
+    assert judge.judged(tracked, SimpleNamespace(interval_s=interval_s)).lost == lost
 
 
 @pytest.mark.parametrize(("share", "taken"), [(1.0, 1), (math.nan, 0)])

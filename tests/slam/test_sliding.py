@@ -61,4 +61,10 @@ def test_features_are_asked_of_what_may_have_slid():
     for surprise in ({"prediction_error_cm": 6.0}, {"prediction_error_deg": 4.5}):
         assert may_have_slid(replace(firm, **surprise))
     unknown = replace(firm, prediction_error_cm=float("nan"), prediction_error_deg=float("nan"))
-    assert not may_have_slid(unknown) and not is_consistent(unknown)
+    assert not may_have_slid(unknown) and not is_consistent(unknown) and not is_consistent(unknown, 0.5)
+
+
+def test_a_camera_that_is_carried_leaves_the_prediction_between_frames_far_apart():
+    far = Fit(prediction_error_cm=12.0, prediction_error_deg=8.0)
+    assert not is_consistent(far) and not is_consistent(far, 1 / 30) and not is_consistent(far, 1 / 8)
+    assert is_consistent(far, 1 / 6)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,6 @@ import torch
 from spslam.camera import Camera
 from spslam.config import Config
 from spslam.geometry import pose7_to_matrix
-from spslam.slam.fit import Fit
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import FramePixels
@@ -25,6 +23,7 @@ from spslam.slam.recovery.feature_alignment import FeatureAlignment, FeatureMatc
 from spslam.slam.recovery.icp_alignment import IcpAlignment
 from spslam.slam.recovery.place_recognition import retrieve, retrieve_by_features
 from spslam.slam.recovery.pose_confidence import PoseConfidenceModel
+from spslam.slam.recovery.pose_judge import PoseJudge
 from spslam.slam.recovery.sliding import WEAK_EIGENVALUE, is_consistent, may_have_slid
 from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.recovery.verifier import Verifier
@@ -55,21 +54,13 @@ class Recovery:
 
     def __init__(self, config: Config, camera: Camera, tracker: Tracker, confidence: PoseConfidenceModel):
         self._config, self._camera, self._tracker, self._confidence = config, camera, tracker, confidence
+        self._judge = PoseJudge(config, confidence)
         self._verifier = Verifier(config, camera, confidence)
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
 
-    def judge(self, estimate: PoseEstimate) -> TrackedFrame:
-        """The estimate, trusted or not by its fit alone."""
-        fit, numbers = estimate.fit, estimate.numbers
-        return TrackedFrame(
-            estimate.pose,
-            estimate.iterations,
-            fit,
-            **self._judgement(fit),
-            equations=estimate.equations,
-            gain=estimate.gain,
-            on_host=None if numbers is None else (estimate.pose, numbers),
-        )
+    def judge(self, estimate: PoseEstimate, history: FrameHistory | None = None) -> TrackedFrame:
+        """The estimate, trusted or not by its fit alone; see `PoseJudge`."""
+        return self._judge.judge(estimate, history)
 
     def settled(self, estimate: PoseEstimate, history: FrameHistory, to_be_mapped: bool) -> TrackedFrame | None:
         """What `resolve` finds where the estimate's fit decides; None where more has to be asked.
@@ -79,7 +70,7 @@ class Recovery:
             history: the frames before.
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
         """
-        tracked = self.judge(estimate)
+        tracked = self.judge(estimate, history)
         is_questioned = self._is_in_doubt(tracked, history) or self._may_have_slid(tracked)
         return None if is_questioned or (to_be_mapped and _may_be_occluded(tracked)) else tracked
 
@@ -102,7 +93,7 @@ class Recovery:
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
             features: of the frame as it was read.
         """
-        tracked = self.judge(estimate)
+        tracked = self.judge(estimate, history)
         if self._is_in_doubt(tracked, history):
             tracked = self._recover(problem, tracked, pixels, history, self._image(problem, history, features))
         else:
@@ -115,21 +106,6 @@ class Recovery:
         # A pose predicted from lost frames is not trusted: continue from the last trusted pose.
         known = history.last() if history.consistent_frames else None
         return replace(tracked, pose=(problem.predicted if known is None else known.pose).clone())
-
-    def _judged(self, tracked: TrackedFrame) -> TrackedFrame:
-        """The frame with what its fit says of its pose."""
-        return replace(tracked, **self._judgement(tracked.fit))
-
-    def _judgement(self, fit: Fit) -> dict[str, Any]:
-        """What a fit says of its pose, as fields of `TrackedFrame`; one of NaN has no inliers."""
-        tracking, probability = self._config.tracking, self._confidence.error_probability(fit)
-        # A camera that turns to what was not seen yet leaves the map, while features of the last frames hold it; one
-        # that has jumped has to be found on the map.
-        is_followed = self._confidence.is_held(fit) and is_consistent(fit)
-        is_somewhere = fit.inlier_share >= tracking.min_inlier_share or is_followed
-        is_trusted = is_somewhere and probability <= tracking.lost_threshold
-        occluded = self._confidence.is_occluded(fit)
-        return {"error_probability": probability, "lost": not is_trusted, "occluded": occluded}
 
     def _is_in_doubt(self, tracked: TrackedFrame, history: FrameHistory) -> bool:
         return history.is_lost or self._is_unpredicted(history) or self._is_doubtful(tracked)
@@ -187,7 +163,8 @@ class Recovery:
         at = image.of_color(matrix)
         frame = replace(frame, matches=tuple(image.counted(one, at) for one in matches))
         fit, on_host = frame.with_features(estimate.fit, matrix), (pose, tuple(numbers.tolist()))
-        held = self._judged(replace(tracked, pose=pose, fit=fit, features=image.read, on_host=on_host))
+        held = replace(tracked, pose=pose, fit=fit, features=image.read, on_host=on_host)
+        held = self._judge.judged(held, frame.history)
         fits = held.weight > tracked.weight - MAX_LOSS and not frame.is_contradicted
         return held if fits else None, True
 
@@ -197,13 +174,13 @@ class Recovery:
         fit = self._verifier.verified(
             tracked.fit, tracked.pose, problem.scene, pixels, history, compares_brightness=False
         )
-        return self._judged(replace(tracked, fit=fit))
+        return self._judge.judged(replace(tracked, fit=fit), history)
 
     def _verify(self, frame: DoubtfulFrame, tracked: TrackedFrame) -> TrackedFrame:
         """The pose judged with what other frames have seen: surface, brightness and image features."""
         scene = frame.problem.scene
         fit = self._verifier.verified(tracked.fit, tracked.pose, scene, frame.pixels, frame.history)
-        return self._judged(replace(tracked, fit=frame.with_features(fit, tracked.matrix)))
+        return self._judge.judged(replace(tracked, fit=frame.with_features(fit, tracked.matrix)), frame.history)
 
     def _recover(
         self,
@@ -294,7 +271,7 @@ class Recovery:
 
     def _track_from(self, frame: DoubtfulFrame, first: TrackedFrame, starts: list[torch.Tensor]) -> list[TrackedFrame]:
         """A result, and those from other starts."""
-        others = [self.judge(self._tracker.track_from(frame.problem, start)) for start in starts]
+        others = [self.judge(self._tracker.track_from(frame.problem, start), frame.history) for start in starts]
         return [first, *(replace(other, recovered=True) for other in others)]
 
     def _seen(self, frame: DoubtfulFrame, starts: list[torch.Tensor]) -> TrackedFrame | None:
@@ -302,7 +279,8 @@ class Recovery:
         if not frame.matches or not frame.colors_are_registered:
             return None
         most = max(range(len(frame.matches)), key=lambda i: frame.matches[i].agreeing)
-        return replace(self.judge(self._tracker.measure(frame.problem, starts[most])), recovered=True)
+        estimate = self._tracker.measure(frame.problem, starts[most])
+        return replace(self.judge(estimate, frame.history), recovered=True)
 
     def _likeliest(
         self,
@@ -356,20 +334,20 @@ class Recovery:
 
         The results from stored frames are appended to `candidates`.
         """
-        count, known = self._config.tracking.relocalization_candidates, len(candidates)
-        alike = retrieve(frame.history, frame.pixels, count, self._camera)
+        history, count, known = frame.history, self._config.tracking.relocalization_candidates, len(candidates)
+        alike = retrieve(history, frame.pixels, count, self._camera)
         starts = frame.alignment.poses([(candidate.earlier, candidate.start) for candidate in alike])
         if frame.image is not None and count:
-            rows = retrieve_by_features(frame.history, frame.image, frame.problem.frame)
+            rows = retrieve_by_features(history, frame.image, frame.problem.frame)
             frame, by_features = self._match(frame, frame.matched(rows))
             starts = [*by_features, *starts]
         candidates += self._track_from(frame, candidates[0], starts)[1:]
         found = self._likeliest(frame, candidates, anywhere=True)
         is_new = not any(found.pose is candidate.pose for candidate in candidates[:known])
         # Stored frames may confirm, where the last one shows too little, that the camera is where it was predicted.
-        is_followed = not frame.history.is_lost and not found.lost and is_consistent(found.fit)
+        is_followed = not history.is_lost and not found.lost and is_consistent(found.fit, history.interval_s)
         if not is_followed:
-            found = self._accept_anywhere(found, frame.history.consistent_frames)
+            found = self._accept_anywhere(found, history.consistent_frames)
         return replace(found, relocalized=is_new and not found.lost)
 
     def _accept_anywhere(self, tracked: TrackedFrame, consistent_before: int) -> TrackedFrame:
@@ -382,7 +360,7 @@ class Recovery:
         """
         was_near = is_consistent(tracked.fit)
         fit = tracked.fit.unpredicted()
-        tracked = self._judged(replace(tracked, fit=fit))
+        tracked = self._judge.judged(replace(tracked, fit=fit))
         is_firm = fit.min_eigenvalue >= WEAK_EIGENVALUE
         is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
         if is_certain and not tracked.lost and (is_firm or self._confidence.has_many_features(fit)):

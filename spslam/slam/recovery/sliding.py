@@ -9,6 +9,8 @@ UNSURE_EIGENVALUE = 0.01  # below it so may a pose that was not predicted well
 UNSURE_CM, UNSURE_DEG = 0.5, 0.35
 UNSURE_DEVIATION_M = 0.0035  # along the weakest direction, by how well surface fits: a noisy sensor says less of it
 CONSISTENT_CM, CONSISTENT_DEG = 5.0, 4.0  # most prediction error from one frame to the next
+# The acceleration of a camera that is carried: at fewer than ten frames/s it leaves the prediction by more than that.
+CARRIED_M_S2, CARRIED_DEG_S2 = 10.0, 800.0
 
 
 def may_have_slid(fit: Fit) -> bool:
@@ -20,6 +22,13 @@ def may_have_slid(fit: Fit) -> bool:
     return fit.min_eigenvalue < WEAK_EIGENVALUE
 
 
-def is_consistent(fit: Fit) -> bool:
-    """Whether the pose is about where the frames before predict it; False where nothing does."""
-    return fit.prediction_error_cm < CONSISTENT_CM and fit.prediction_error_deg < CONSISTENT_DEG
+def is_consistent(fit: Fit, interval_s: float = 0.0) -> bool:
+    """Whether the pose is about where the frames before predict it; False where nothing does.
+
+    Args:
+        fit: of the pose.
+        interval_s: from one frame to the next, s; 0 where that is not known.
+    """
+    most_cm = max(CONSISTENT_CM, 50 * CARRIED_M_S2 * interval_s**2)
+    most_deg = max(CONSISTENT_DEG, CARRIED_DEG_S2 / 2 * interval_s**2)
+    return fit.prediction_error_cm < most_cm and fit.prediction_error_deg < most_deg
