@@ -41,10 +41,14 @@ class FrameHistory:
 
     Args:
         state: of the system; not changed.
+
+    Attributes:
+        coming_s: time stamp of the frame that is localized, s; minus infinity where that is not known.
     """
 
     def __init__(self, state: SlamState):
         self._state = state
+        self.coming_s = -math.inf
 
     @property
     def is_lost(self) -> bool:
@@ -69,9 +73,8 @@ class FrameHistory:
 
     @property
     def interval_s(self) -> float:
-        """From the last frame to the next one, as `seconds_since` has it; 0 where that is not known."""
-        seconds = self.seconds_since(-1)
-        return seconds if math.isfinite(seconds) else 0.0
+        """From the last frame to the one that is localized, s; 0 where that is not known."""
+        return max(self.coming_s - float(self._state.frames.timestamps[-1]), 0.0)
 
     def seconds_since(self, row: int) -> float:
         """From the frame in a row to the next one, if that comes as long after the last as that after the one before.

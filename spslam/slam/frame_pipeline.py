@@ -149,7 +149,7 @@ class FramePipeline:
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
-        read = self._receive(frame, events)
+        read, self.history.coming_s = self._receive(frame, events), frame.timestamp
         features = self.features.of(read)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()

@@ -105,25 +105,28 @@ def test_surface_and_image_features_decide_between_trusted_poses(other, times, d
 
 
 @pytest.mark.parametrize(
-    ("changes", "interval_s", "lost"),
+    ("changes", "interval_s", "knows_speed", "lost"),
     [
-        ({}, 0.0, False),  # the camera turns to what was not seen yet
-        ({"feature_inliers": 40}, 0.0, True),
-        ({"feature_share": 0.7}, 0.0, True),
-        ({"feature_share": math.nan}, 0.0, True),  # colors are not where depth is
-        ({"prediction_error_cm": math.nan}, 0.0, True),  # it may be anywhere, as where places are alike
-        ({"prediction_error_cm": 30.0}, 0.0, True),  # it has jumped
-        ({"prediction_error_deg": 10.0}, 0.0, True),
-        ({"prediction_error_cm": 6.0, "prediction_error_deg": 5.0}, 0.1, True),
-        ({"prediction_error_cm": 10.0, "prediction_error_deg": 5.0}, 0.15, False),  # it was carried on meanwhile
-        ({"prediction_error_cm": 31.0}, 0.4, True),
+        ({}, 0.0, True, False),  # the camera turns to what was not seen yet
+        ({"feature_inliers": 40}, 0.0, True, True),
+        ({"feature_share": 0.7}, 0.0, True, True),
+        ({"feature_share": math.nan}, 0.0, True, True),  # colors are not where depth is
+        ({"prediction_error_cm": math.nan}, 0.0, True, True),  # it may be anywhere, as where places are alike
+        ({"prediction_error_cm": 30.0}, 0.0, True, True),  # it has jumped
+        ({"prediction_error_deg": 10.0}, 0.0, True, True),
+        ({"prediction_error_cm": 6.0, "prediction_error_deg": 5.0}, 0.1, True, True),
+        ({"prediction_error_cm": 10.0, "prediction_error_deg": 5.0}, 0.15, True, False),  # it was carried on meanwhile
+        ({"prediction_error_cm": 22.0, "prediction_error_deg": 5.0}, 0.15, True, True),
+        ({"prediction_error_cm": 22.0, "prediction_error_deg": 5.0}, 0.15, False, False),  # as fast as before, maybe
+        ({"prediction_error_cm": 6.0, "prediction_error_deg": 5.0}, 1 / 30, False, True),
+        ({"prediction_error_cm": 31.0}, 0.4, True, True),
     ],
 )
-def test_off_the_map_image_features_hold_a_camera(recovery, changes, interval_s, lost):
+def test_off_the_map_image_features_hold_a_camera(changes, interval_s, knows_speed, lost):
     off = replace(CERTAIN, inlier_share=0.15, mean_robust_weight=0.1, feature_inliers=200, feature_share=1.0)
     tracked = TrackedFrame(torch.zeros(7), 8, replace(off, **changes), error_probability=0.0, lost=False)
     judge = PoseJudge(settings(), PoseConfidenceModel.load())
-    assert judge.judged(tracked, SimpleNamespace(interval_s=interval_s)).lost == lost
+    assert judge.judged(tracked, SimpleNamespace(interval_s=interval_s, knows_speed=knows_speed)).lost == lost
 
 
 @pytest.mark.parametrize(("share", "taken"), [(1.0, 1), (math.nan, 0)])
@@ -170,7 +173,7 @@ def test_a_camera_that_has_jumped_may_be_anywhere(recovery, monkeypatch, changes
     monkeypatch.setattr(recovery, "_starts_at_last", lambda frame, first: (frame, []))
     monkeypatch.setattr(recovery, "_likeliest", lambda *args, **kwargs: found)
     monkeypatch.setattr(recovery, "_relocalize", lambda frame, candidates: asked.append(1) or found)
-    history = SimpleNamespace(consecutive_lost_frames=0, consistent_frames=0)
+    history = SimpleNamespace(consecutive_lost_frames=0, consistent_frames=0, interval_s=1 / 30, knows_speed=True)
     problem = SimpleNamespace(constraints=SimpleNamespace(reference=None))
     recovery._recover(problem, found, None, history, None)
     assert bool(asked) == asks

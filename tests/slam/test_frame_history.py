@@ -53,6 +53,11 @@ def test_the_next_frame_is_expected_at_the_same_interval(dataset, pixels):
     history = FrameHistory(state)
     assert history.seconds_since(FRAMES - 1) == pytest.approx(1 / 30)
     assert history.seconds_since(FRAMES - 4) == pytest.approx(4 / 30)
+    assert history.interval_s == 0  # nobody says when it comes
+    history.coming_s = FRAMES / 30 + 0.1
+    assert history.interval_s == pytest.approx(1 / 30 + 0.1)
+    history.coming_s = 0.0  # as where time does not go on
+    assert history.interval_s == 0
     state.frames.timestamps[-1] = state.frames.timestamps[-2]
     assert history.seconds_since(0) == np.inf
     state.frames.timestamps[-1] = 1.0

@@ -56,6 +56,4 @@ class PoseJudge:
     def _is_followed(self, fit: Fit, history: FrameHistory | None) -> bool:
         """A camera that turns to what was not seen yet leaves the map, while features of the last frames hold it; one
         that has jumped has to be found on the map."""
-        if not self._confidence.is_held(fit):
-            return False
-        return is_consistent(fit, 0.0 if history is None else history.interval_s)
+        return self._confidence.is_held(fit) and is_consistent(fit, history)

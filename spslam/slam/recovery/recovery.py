@@ -71,7 +71,7 @@ class Recovery:
             to_be_mapped: whether the frame is to be mapped if its pose is trusted.
         """
         tracked = self.judge(estimate, history)
-        is_questioned = self._is_in_doubt(tracked, history) or self._may_have_slid(tracked)
+        is_questioned = self._is_in_doubt(tracked, history) or self._may_have_slid(tracked, history)
         return None if is_questioned or (to_be_mapped and _may_be_occluded(tracked)) else tracked
 
     def resolve(
@@ -97,7 +97,7 @@ class Recovery:
         if self._is_in_doubt(tracked, history):
             tracked = self._recover(problem, tracked, pixels, history, self._image(problem, history, features))
         else:
-            if self._may_have_slid(tracked):
+            if self._may_have_slid(tracked, history):
                 tracked = self._held(problem, tracked, pixels, history, features)
             if to_be_mapped and _may_be_occluded(tracked):
                 tracked = self._check_occlusion(problem, tracked, pixels, history)
@@ -122,10 +122,10 @@ class Recovery:
             or tracked.fit.mean_robust_weight < tracking.recovery_min_robust_weight
         )
 
-    def _may_have_slid(self, tracked: TrackedFrame) -> bool:
+    def _may_have_slid(self, tracked: TrackedFrame, history: FrameHistory) -> bool:
         """Whether image features are used, and asked of this pose."""
         tracking = self._config.tracking
-        return tracking.features and tracking.recovery and may_have_slid(tracked.fit)
+        return tracking.features and tracking.recovery and may_have_slid(tracked.fit, history.interval_s)
 
     def _held(
         self,
@@ -216,7 +216,7 @@ class Recovery:
                 found = self._likeliest(frame, candidates, seen=seen)
         if found is None or found.lost or self._confidence.has_jumped(found.fit):
             found = self._relocalize(frame, candidates)
-        elif self._may_have_slid(found):
+        elif self._may_have_slid(found, history):
             # Tracked on from where features had put it, it may have slid along what surface leaves free.
             held, _ = self._hold(frame, found)
             held = None if held is None else self._verify(frame, held)
@@ -345,7 +345,7 @@ class Recovery:
         found = self._likeliest(frame, candidates, anywhere=True)
         is_new = not any(found.pose is candidate.pose for candidate in candidates[:known])
         # Stored frames may confirm, where the last one shows too little, that the camera is where it was predicted.
-        is_followed = not history.is_lost and not found.lost and is_consistent(found.fit, history.interval_s)
+        is_followed = not history.is_lost and not found.lost and is_consistent(found.fit, history)
         if not is_followed:
             found = self._accept_anywhere(found, history.consistent_frames)
         return replace(found, relocalized=is_new and not found.lost)
