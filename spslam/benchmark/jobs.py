@@ -58,6 +58,11 @@ class Job:
             changes.append(("dataset.path", self.data))
         return load_config(self.config, self.preset, changes)
 
+    def weights(self) -> str | None:
+        """Absolute path of `prior.weights`, if the method reads them; None for the shipped ones."""
+        weights = self.load_config().prior.weights if self.method == SPSLAM else None
+        return None if weights is None else str(Path(weights).resolve())
+
     def key(self) -> str:
         """Name of the run's record: readable words, then a hash of all that its figures depend on.
 

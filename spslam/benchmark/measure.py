@@ -32,14 +32,18 @@ def run_job(call: TaskCall) -> None:
     """The task of a job: runs it and writes its record; called in the processes of `run_jobs`.
 
     Args:
-        call: `job` as text, and `keep`, whether the run's other files are kept in the folder.
+        call: `job` as text, `keep`, whether the run's other files are kept in the folder, and `weights`, the file of
+            `prior.weights` by its absolute path, or None.
 
     Raises:
         SpslamError: as `measure`.
     """
     job, folder = Job.from_json(call.arguments["job"]), call.output
     _empty(folder)  # of an attempt that was killed
-    record = measure(replace(job, data=call.local(job.data), mesh=call.local(job.mesh)), folder, call.threads)
+    here = replace(job, data=call.local(job.data), mesh=call.local(job.mesh))
+    if (weights := call.local(call.arguments["weights"])) is not None:
+        here = replace(here, options=(*here.options, ("prior.weights", weights)))
+    record = measure(here, folder, call.threads)
     record["job"] = vars(job)
     record["environment"]["runs_at_a_time"] = call.simultaneous
     if not call.arguments["keep"]:

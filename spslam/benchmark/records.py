@@ -119,8 +119,9 @@ def _finished(output: Path, key: str, job: Job) -> Outcome | None:
 
 def _task(job: Job, key: str, output: Path, keep: bool) -> Task:
     needs = Needs(gpus=int(job.device == "cuda"), memory_mb=memory_needed_mb(job.load_config(), mesh=True))
-    inputs = tuple(path for path in (job.data, job.mesh) if path is not None)
-    arguments = {"job": job.to_json(), "keep": keep}
+    weights = job.weights()
+    inputs = tuple(path for path in (job.data, job.mesh, weights) if path is not None)
+    arguments = {"job": job.to_json(), "keep": keep, "weights": weights}
     return Task(key, "spslam.benchmark.measure:run_job", arguments, output / WORK / key, needs, inputs)
 
 

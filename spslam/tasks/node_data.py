@@ -7,8 +7,9 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,25 +17,64 @@ from spslam.errors import ClusterError
 
 CHUNK_BYTES = 16 << 20  # of a file that is sent at a time
 
-# Of each file below an input, its path there, `` for an input that is a file itself, and its bytes.
-Listing = list[tuple[str, int]]
+# Files up to this size are told apart by their content, which weights, images and tables of poses are; larger ones,
+# videos and bags, would take longer to read than their names and sizes are likely to deceive.
+HASHED_BYTES = 16 << 20
+
+
+class ListedFile(NamedTuple):
+    """A file of an input.
+
+    Attributes:
+        name: path below the input; empty for an input that is a file itself.
+        size: bytes.
+        content: SHA-256 in hexadecimal of a file of at most `HASHED_BYTES`, else empty.
+        modified_ns: when a larger file was last written, ns; 0 of others, whose content says more.
+    """
+
+    name: str
+    size: int
+    content: str = ""
+    modified_ns: int = 0
+
+
+Listing = list[ListedFile]
 Reader = Callable[[str, int, int], np.ndarray]
 
 
+def file_names(path: Path) -> list[str]:
+    """The files of an input by their paths below it, in a fixed order; one empty name for a file itself."""
+    return [""] if path.is_file() else sorted(str(file.relative_to(path)) for file in _walk(path))
+
+
 def list_files(path: Path) -> Listing:
-    """The files of an input in a fixed order; none where there is no such path, or it can't be read."""
+    """The files of an input in the order of `file_names`; none where there is no such path, or it can't be read.
+
+    Reads all files of at most `HASHED_BYTES`.
+    """
     try:
-        if path.is_file():
-            return [("", path.stat().st_size)]
-        found = [Path(folder, name) for folder, _, names in os.walk(path, followlinks=True) for name in names]
-        return sorted((str(file.relative_to(path)), file.stat().st_size) for file in found)
+        return [_listed(path, name) for name in file_names(path)]
     except OSError:
         return []
 
 
+def has_files(path: Path, wanted: Listing) -> bool:
+    """Whether there are the files of a listing at a path: of the same names, sizes and, where known, content.
+
+    Names and sizes are compared first, so that files are read only where these are the same. When large files were
+    written does not count: whoever copied them may have given them other times.
+    """
+    try:
+        if [(name, _inside(path, name).stat().st_size) for name in file_names(path)] != [file[:2] for file in wanted]:
+            return False
+        return all(_listed(path, file.name)[:3] == file[:3] for file in wanted)
+    except OSError:
+        return False
+
+
 def read_part(path: Path, name: str, offset: int, count: int) -> np.ndarray:
     """uint8 [N] bytes of a file of an input, `count` at most; none behind its end."""
-    with (path / name if name else path).open("rb") as file:
+    with _inside(path, name).open("rb") as file:
         file.seek(offset)
         return np.frombuffer(file.read(count), np.uint8)
 
@@ -49,7 +89,7 @@ def local_input(path: str, wanted: Listing, read: Reader, always_copy: bool) -> 
 
     Args:
         path: of the input on the machine that sends it. Where the same files are under it here they are used, by
-            their names and sizes.
+            `has_files`. A copy of earlier files is not used: what was copied is known by its listing.
         wanted: its files.
         read: bytes of a file by name, offset and count.
         always_copy: copy them even where the path is here, as from a slow network disk.
@@ -58,12 +98,12 @@ def local_input(path: str, wanted: Listing, read: Reader, always_copy: bool) -> 
         The same path, or that of the copy. Of several processes that ask for one input the first copies it.
 
     Raises:
-        ClusterError: there is nothing at the path anywhere, or the copy can't be written.
+        ClusterError: there is nothing at the path anywhere, the copy can't be written, or a file changed meanwhile.
     """
     here = Path(path)
     if not wanted:
-        raise ClusterError(f"{path}: no such file or folder on the machine that sends it")
-    if not always_copy and list_files(here) == wanted:
+        raise ClusterError(f"{path}: no such file or folder, or not to be read, on the machine that sends it")
+    if not always_copy and has_files(here, wanted):
         return here
     digest = hashlib.sha256(json.dumps([path, wanted]).encode()).hexdigest()[:16]
     folder = cache_folder() / digest
@@ -82,15 +122,39 @@ def _copy(folder: Path, root: str, wanted: Listing, read: Reader) -> None:
     """Copies files to a folder that appears at once when all are there."""
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    for name, size in wanted:
-        file = part / root / name if name else part / root
+    for listed in wanted:
+        file = _inside(part / root, listed.name)
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("wb") as out:
             offset = 0
-            while offset < size:
-                piece = read(name, offset, min(CHUNK_BYTES, size - offset))
+            while offset < listed.size:
+                piece = read(listed.name, offset, min(CHUNK_BYTES, listed.size - offset))
                 if not len(piece):
-                    raise ClusterError(f"{root}/{name}: became shorter while it was copied")
+                    raise ClusterError(f"{root}/{listed.name}: became shorter while it was copied")
                 out.write(piece.data)
                 offset += len(piece)
+        if listed.content and _hash(file) != listed.content:
+            raise ClusterError(f"{root}/{listed.name}: changed after the command began")
     os.replace(part, folder)
+
+
+def _walk(path: Path) -> Iterator[Path]:
+    for folder, _, names in os.walk(path, followlinks=True):
+        for name in names:
+            yield Path(folder, name)
+
+
+def _inside(path: Path, name: str) -> Path:
+    return path / name if name else path
+
+
+def _listed(path: Path, name: str) -> ListedFile:
+    file = _inside(path, name)
+    status = file.stat()
+    if status.st_size > HASHED_BYTES:
+        return ListedFile(name, status.st_size, modified_ns=status.st_mtime_ns)
+    return ListedFile(name, status.st_size, _hash(file))
+
+
+def _hash(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -21,7 +21,7 @@ import ray
 import spslam
 from spslam.errors import SpslamError
 from spslam.tasks.child import Child, environment
-from spslam.tasks.node_data import Listing, list_files, local_input, read_part
+from spslam.tasks.node_data import Listing, file_names, list_files, local_input, read_part
 from spslam.tasks.task import TaskCall, TaskEnd
 
 Files = list[tuple[str, np.ndarray]]
@@ -62,7 +62,7 @@ class FileServer:
 
     def read(self, path: str, name: str, offset: int, count: int) -> np.ndarray:
         """Bytes of a file of an input."""
-        if not any(name == each for each, _ in self._listings.get(path, ())):
+        if not any(name == each.name for each in self._listings.get(path, ())):
             raise PermissionError(f"{path}/{name}: was not announced")
         return read_part(Path(path), name, offset, count)
 
@@ -91,7 +91,7 @@ def run_on_node(sent: SentTask, server: Any) -> tuple[TaskEnd, Files]:
             call = replace(sent.call, output=folder, paths=paths)
             error, lost = Child(call, _environment()).wait()
             if not error:
-                files = [(name, np.fromfile(folder / name, np.uint8)) for name, _ in list_files(folder)]
+                files = [(name, np.fromfile(folder / name, np.uint8)) for name in file_names(folder)]
             end = replace(end, error=error, lost=lost)
         finally:
             shutil.rmtree(folder, ignore_errors=True)

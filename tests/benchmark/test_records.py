@@ -9,12 +9,16 @@ import time
 
 import pytest
 
+from spslam.benchmark import measure as measure_module
 from spslam.benchmark.records import RECORDS, RUNS, WORK, record_path, run_jobs
 from spslam.benchmark.suites import GICP
 from spslam.errors import OutputError
+from spslam.tasks.child import execute
 from spslam.tasks.local import LocalExecutor
+from spslam.tasks.task import TaskCall, TaskEnd
 from tests.benchmark.examples import tiny_job
 from tests.cli.command import ROOT, assert_refused, spslam
+from tests.tasks.examples import InThisProcess
 
 
 def by_key(*jobs):
@@ -42,6 +46,31 @@ def test_runs_leave_records_once(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / RECORDS).iterdir()} == before
 
 
+def test_weights_are_an_input_that_is_read_where_it_was_copied(tmp_path, monkeypatch):
+    (tmp_path / "w.safetensors").write_bytes(b"trained")
+    monkeypatch.chdir(tmp_path)
+    job, started, measured = tiny_job(options=(("prior.weights", "w.safetensors"),)), [], []
+
+    class Copying(InThisProcess):
+        def start(self, task):
+            started.append(task)
+            task.output.mkdir(parents=True)
+            paths = dict.fromkeys(task.inputs, "/copy/w.safetensors")
+            execute(TaskCall(task.function, task.arguments, task.output, 1, 1, paths))
+            self.end = TaskEnd(task.key)
+
+    def measure(local, folder, threads):
+        measured.append(local.load_config().prior.weights)
+        return {"environment": {}, "figures": {}}
+
+    monkeypatch.setattr(measure_module, "measure", measure)
+    outcomes = run_jobs(by_key(job), tmp_path / "out", Copying())
+    assert started[0].inputs == (str(tmp_path / "w.safetensors"),)
+    assert measured == ["/copy/w.safetensors"]
+    assert outcomes[job.key()].record["job"]["options"] == [["prior.weights", "w.safetensors"]]
+    assert tiny_job(GICP, options=job.options).weights() is None
+
+
 def test_failed_run_is_reported_and_tried_again(tmp_path):
     job = tiny_job(config="7scenes", options=(), data=str(tmp_path / "nothing"), sequence="kitchen")
     outcome = run_jobs(by_key(job), tmp_path / "out", LocalExecutor())[job.key()]
@@ -61,8 +90,11 @@ def test_damaged_record_is_run_again(tmp_path):
 LONG = """
 import sys
 from pathlib import Path
+from spslam.benchmark import measure as measure_module
 from spslam.benchmark.records import run_jobs
+from spslam.tasks.child import execute
 from spslam.tasks.local import LocalExecutor
+from spslam.tasks.task import TaskCall, TaskEnd
 from tests.benchmark.examples import tiny_job
 
 job = tiny_job(frames="0:3000", options=(*tiny_job().options, ("dataset.frames", 3000)))

@@ -1,11 +1,14 @@
 """Recordings on a node: by their path, or copied once."""
 
+import os
+import shutil
+
 import numpy as np
 import pytest
 
 from spslam.errors import ClusterError
 from spslam.tasks import node_data
-from spslam.tasks.node_data import cache_folder, list_files, local_input, read_part
+from spslam.tasks.node_data import ListedFile, cache_folder, list_files, local_input, read_part
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +61,46 @@ def test_other_files_under_the_same_path_are_not_taken(recording, tmp_path):
     assert reader.calls
 
 
+@pytest.mark.parametrize("always_copy", [False, True])
+def test_changed_content_of_equal_size_is_copied_again(recording, always_copy):
+    """Weights that were trained again have the size of the earlier ones."""
+    weights = recording / "color" / "0.png"
+    earlier = local_input("/nowhere/recording", list_files(recording), Reader(recording), always_copy)
+    weights.write_bytes(bytes(range(1, 41)))
+    copy = local_input("/nowhere/recording", list_files(recording), Reader(recording), always_copy)
+    assert copy != earlier
+    assert (copy / "color" / "0.png").read_bytes() == weights.read_bytes()
+
+
+def test_other_content_of_equal_size_under_the_same_path_is_not_taken(recording, tmp_path):
+    wanted, here = list_files(recording), tmp_path / "recording"
+    shutil.copytree(recording, here)
+    assert local_input(str(here), wanted, Reader(recording), False) == here
+    (here / "color" / "0.png").write_bytes(bytes(40))
+    copy = local_input(str(here), wanted, Reader(recording), False)
+    assert copy != here and list_files(copy) == wanted
+
+
+def test_a_large_file_is_known_by_name_size_and_its_copy_by_its_time(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(node_data, "HASHED_BYTES", 39)
+    here = tmp_path / "recording"
+    shutil.copytree(recording, here)
+    os.utime(here / "color" / "0.png", ns=(1, 1))
+    assert local_input(str(here), list_files(recording), Reader(recording), False) == here
+    copies = set()
+    for time_ns in (5, 6):
+        os.utime(recording / "color" / "0.png", ns=(time_ns, time_ns))
+        copies.add(local_input("/nowhere/recording", list_files(recording), Reader(recording), False))
+    assert len(copies) == 2
+
+
+def test_what_changes_before_it_is_copied_is_reported(recording):
+    wanted = list_files(recording)
+    (recording / "color" / "0.png").write_bytes(bytes(40))
+    with pytest.raises(ClusterError, match=r"0.png: changed after the command began"):
+        local_input("/nowhere/recording", wanted, Reader(recording), False)
+
+
 def test_a_copy_is_made_where_it_is_asked_for(recording):
     copy = local_input(str(recording), list_files(recording), Reader(recording), True)
     assert copy != recording and list_files(copy) == list_files(recording)
@@ -87,4 +130,4 @@ def test_what_is_nowhere_and_what_shrinks_is_reported(recording):
     with pytest.raises(ClusterError, match="/nowhere: no such file or folder"):
         local_input("/nowhere", list_files(recording / "none"), Reader(recording), False)
     with pytest.raises(ClusterError, match="became shorter"):
-        local_input("/nowhere/x", [("empty", 3)], Reader(recording), False)
+        local_input("/nowhere/x", [ListedFile("empty", 3)], Reader(recording), False)
