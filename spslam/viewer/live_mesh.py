@@ -48,21 +48,21 @@ class LiveMesh:
             everything: whether to make all again.
 
         Returns:
-            The chunks made: a mesh, or None where there is no surface any more.
+            The chunks made: a mesh, or None where there is no surface any more, as where a map that the keyframe graph
+            made again has no cell.
         """
         self._round += 1
         volume = scene.volume
         complete = volume.corner_ids[:, 0] >= 0
         cells = volume.voxel_coords[complete]
-        if not len(cells):
-            return {}
         per_chunk = max(round(CHUNK_M / volume.voxel_size_m), 1)
         codes, owner = np.unique(_codes(cells.numpy() // per_chunk), return_inverse=True)
         weights = np.bincount(owner, volume.weights[complete].numpy(), len(codes))
         present = [_key(int(code)) for code in codes]
+        gone = self._drop_all_but(present)
         chosen = self._choose(present, weights, everything)
         if not chosen:
-            return {}
+            return gone
         wanted = np.array(sorted(chosen))
         selected = cells[torch.from_numpy(_touches(cells.numpy(), per_chunk, wanted))]
         made = dict(split_mesh(self._extract(scene, selected, poses), wanted, per_chunk * volume.voxel_size_m))
@@ -72,7 +72,7 @@ class LiveMesh:
                 self.chunks[key] = made[key]
             else:
                 self.chunks.pop(key, None)
-        return {key: made.get(key) for key in chosen}
+        return gone | {key: made.get(key) for key in chosen}
 
     def merged(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """All chunks as one mesh: float32 vertices [V, 3], integer faces [L, 3], uint8 colors [V, 3]."""
@@ -83,6 +83,14 @@ class LiveMesh:
         faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
         vertices = np.concatenate([mesh.vertices for mesh in meshes])
         return vertices, np.concatenate(faces), np.concatenate([mesh.colors for mesh in meshes])
+
+    def _drop_all_but(self, present: list[Key]) -> dict[Key, TriangleMesh | None]:
+        """Forgets the other chunks; returns those that had a mesh, as chunks without surface."""
+        gone: dict[Key, TriangleMesh | None] = dict.fromkeys(self.chunks.keys() - set(present))
+        for key in self._ages.keys() - set(present):
+            del self._ages[key]
+            self.chunks.pop(key, None)
+        return gone
 
     def _choose(self, present: list[Key], weights: np.ndarray, everything: bool) -> set[Key]:
         old = {key: self._weights.get(key, 0.0) for key in present}

@@ -63,6 +63,29 @@ def test_empty_map_has_no_mesh(world):
     assert LiveMesh(camera, 0.04).update(Scene(scene.settings, 0), poses) == {}
 
 
+def test_chunks_that_a_map_made_again_lacks_are_gone(world, monkeypatch):
+    """Also where no other chunk changed, and where nothing is left of the map."""
+    scene, camera, poses = world
+    monkeypatch.setattr(module, "_REFRESHED_SHARE", 0.0)
+    live = LiveMesh(camera, 0.04)
+    live.update(scene, poses)
+    shown, corner_ids = set(live.chunks), scene.volume.corner_ids
+    before = corner_ids.clone()
+    chunk = round(module.CHUNK_M / scene.settings.voxel_size_m)
+    owner = torch.div(scene.volume.voxel_coords, chunk, rounding_mode="floor")
+    some = min(shown)
+    try:
+        corner_ids[(owner == torch.tensor(some)).all(1), 0] = -1
+        assert live.update(scene, poses) == {some: None}
+        assert set(live.chunks) == shown - {some} and live.update(scene, poses) == {}
+        corner_ids[:, 0] = -1
+        assert live.update(scene, poses) == dict.fromkeys(shown - {some})
+        assert not len(live.merged()[1])
+    finally:
+        corner_ids.copy_(before)
+    assert {key for key, mesh in live.update(scene, poses).items() if mesh is not None} == shown
+
+
 def test_glb_is_the_mesh(world):
     scene, camera, poses = world
     mesh = extract_mesh(scene, 0.08, camera, poses)
