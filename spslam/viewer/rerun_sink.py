@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spslam.camera import Camera
 from spslam.geometry import matrix_to_pose7
 from spslam.viewer import segments
 from spslam.viewer.curves import known_curves
@@ -45,6 +46,7 @@ class RerunSink(Sink):
         self._lock = threading.RLock()
         self._model: RunModel | None = None
         self._logged = 0
+        self._size = (0, 0)  # of the pinhole, width and height
         self._lengths: dict[str, int] = {}
 
     def begin(self, model: RunModel) -> None:
@@ -52,14 +54,7 @@ class RerunSink(Sink):
             self._model = model
             # Up is where the first camera's is: y points down.
             self._log("world", self._rerun.ViewCoordinates.RDF, static=True)
-            camera = model.info.camera
-            pinhole = self._rerun.Pinhole(
-                image_from_camera=camera.matrix(),
-                width=camera.width,
-                height=camera.height,
-                image_plane_distance=_FRUSTUM_M,
-            )
-            self._log("world/camera", pinhole, static=True)
+            self._log_pinhole(model.info.camera)
 
     def show_frames(self) -> None:
         model = self._model
@@ -92,7 +87,11 @@ class RerunSink(Sink):
                     self._log(name, shape)
 
     def show_images(self, images: FrameImages) -> None:
+        height, width = images.color.shape[:2]
         with self._lock:
+            if self._model is not None and (width, height) != self._size:
+                # An image fills the frustum only where the pinhole is of its size, to which it was reduced.
+                self._log_pinhole(self._model.info.camera.resized(width, height))
             self._set_time(images.row)
             self._log("world/camera/image", self._rerun.Image(images.color).compress(80))
             if images.depth is not None:
@@ -115,6 +114,17 @@ class RerunSink(Sink):
                 self._temporary.unlink(missing_ok=True)
             else:
                 os.replace(self._temporary, self._path)
+
+    def _log_pinhole(self, camera: Camera) -> None:
+        """The camera of all frames; static, so that the last one logged holds for the whole recording."""
+        self._size = camera.width, camera.height
+        pinhole = self._rerun.Pinhole(
+            image_from_camera=camera.matrix(),
+            width=camera.width,
+            height=camera.height,
+            image_plane_distance=_FRUSTUM_M,
+        )
+        self._log("world/camera", pinhole, static=True)
 
     def _log_frame(self, model: RunModel, frame: int) -> None:
         self._set_time(frame)
