@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from spslam.camera import Camera
 from spslam.geometry import matrix_to_pose7
 from spslam.viewer import segments
-from spslam.viewer.curves import known_curves
+from spslam.viewer.curves import Curve, known_curves
 from spslam.viewer.model import RunModel
 from spslam.viewer.protocol import unfinished
 from spslam.viewer.segments import Segments
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _LINE_PX = -1.5  # rerun's unit for widths on the screen is below 0
 _FRUSTUM_M = 0.25
-_BLOCK = 256
+_BLOCK = 256  # segments of a line
 
 
 class RerunSink(Sink):
@@ -47,7 +47,7 @@ class RerunSink(Sink):
         self._model: RunModel | None = None
         self._logged = 0
         self._size = (0, 0)  # of the pinhole, width and height
-        self._lengths: dict[str, int] = {}
+        self._lengths: dict[str, int] = {}  # of the lines, in segments
 
     def begin(self, model: RunModel) -> None:
         with self._lock:
@@ -62,13 +62,13 @@ class RerunSink(Sink):
             return
         with self._lock, model.lock:
             first, self._logged = self._logged, len(model)
+            curves = known_curves(model)
             for frame in range(first, len(model)):
-                self._log_frame(model, frame)
-            self._log_path(model, first)
+                self._log_frame(model, frame, curves)
+            self._set_time(len(model) - 1)
             for name, lines in self._lines(model).items():
-                if self._lengths.get(name, 0) != len(lines):
-                    self._lengths[name] = len(lines)
-                    self._log_lines(f"world/{name}", lines)
+                if len(lines) > self._lengths.get(name, 0):
+                    self._log_lines(name, lines, self._lengths.get(name, 0))
 
     def show_mesh(self, chunks: Mapping[Key, TriangleMesh | None]) -> None:
         with self._lock:
@@ -101,13 +101,14 @@ class RerunSink(Sink):
                 self._log("images/map_depth", self._rerun.DepthImage(images.map_depth, meter=1.0))
 
     def close(self) -> None:
-        """Writes the path as it is in the end, completes the file and gives it its name."""
+        """Writes all lines as they are in the end, completes the file and gives it its name."""
         with self._lock:
             model = self._model
             if model is not None and len(model):
                 with model.lock:
                     self._set_time(len(model) - 1)
-                    self._log_path(model, 0)
+                    for name, lines in self._lines(model).items():
+                        self._log_lines(name, lines, 0)
             self._recording.flush()
             self._recording.disconnect()
             if model is None:  # no run began
@@ -126,35 +127,37 @@ class RerunSink(Sink):
         )
         self._log("world/camera", pinhole, static=True)
 
-    def _log_frame(self, model: RunModel, frame: int) -> None:
+    def _log_frame(self, model: RunModel, frame: int, curves: Sequence[Curve]) -> None:
         self._set_time(frame)
         pose = matrix_to_pose7(model.poses[frame][None])[0]
         w, x, y, z = pose[:4]
         self._log("world/camera", self._rerun.Transform3D(translation=pose[4:], quaternion=[x, y, z, w]))
-        for curve in known_curves(model):
+        for curve in curves:
             value = curve.scale * model.column(curve.column)[frame]
             if np.isfinite(value):
                 self._log(f"curves/{curve.column}", self._rerun.Scalars(value))
 
-    def _log_path(self, model: RunModel, first: int) -> None:
-        """The blocks of the path from frame `first` on; one block is one entity, so that a long path has few."""
-        path = segments.path(model, len(model))
-        for block in range(max(first - 1, 0) // _BLOCK, -(-len(path) // _BLOCK)):
-            part = slice(block * _BLOCK, (block + 1) * _BLOCK)
-            self._log_lines(f"world/path/{block}", Segments(path.points[part], path.colors[part]))
-
     @staticmethod
     def _lines(model: RunModel) -> dict[str, Segments]:
         return {
+            "path": segments.path(model, len(model)),
             "lost": segments.lost_stretches(model),
             "keyframes": segments.keyframes(model),
             "loops": segments.loops(model),
             "ground_truth": segments.ground_truth(model),
         }
 
-    def _log_lines(self, name: str, lines: Segments) -> None:
-        if len(lines):
-            self._log(name, self._rerun.LineStrips3D(lines.points, colors=lines.colors[:, 0], radii=_LINE_PX))
+    def _log_lines(self, name: str, lines: Segments, first: int) -> None:
+        """The blocks of lines from segment `first` on.
+
+        One block is one entity: logged as one, a line that grows with the run would be written whole again with each
+        new segment; with an entity for each segment there would be very many.
+        """
+        self._lengths[name] = len(lines)
+        for block in range(first // _BLOCK, -(-len(lines) // _BLOCK)):
+            part = slice(block * _BLOCK, (block + 1) * _BLOCK)
+            shape = self._rerun.LineStrips3D(lines.points[part], colors=lines.colors[part, 0], radii=_LINE_PX)
+            self._log(f"world/{name}/{block}", shape)
 
     def _set_time(self, frame: int) -> None:
         self._recording.set_time("frame", sequence=max(frame, 0))
