@@ -65,7 +65,7 @@ class LivePlayer(Player):
 
 
 class ReplayPlayer(Player):
-    """Moves through a finished run at the speed of its time stamps.
+    """Moves through a finished run at the speed of its time stamps, until it is closed.
 
     Args:
         timestamps: float64 [F], s; F is at least 1.
@@ -77,7 +77,9 @@ class ReplayPlayer(Player):
         self._pauses_s = np.clip(np.diff(timestamps), _MIN_PAUSE_S, _MAX_PAUSE_S)
         self._show, self._frame = show, len(timestamps) - 1
         self._lock, self._changed = threading.RLock(), threading.Event()
-        threading.Thread(target=self._play, name="spslam-viewer-play", daemon=True).start()
+        self._has_ended = False
+        self._thread = threading.Thread(target=self._play, name="spslam-viewer-play", daemon=True)
+        self._thread.start()
 
     @property
     def label(self) -> str:
@@ -85,7 +87,7 @@ class ReplayPlayer(Player):
 
     def toggle(self) -> None:
         with self._lock:
-            self.is_playing = not self.is_playing
+            self.is_playing = not self.is_playing and not self._has_ended
             if self.is_playing and self._frame >= len(self._pauses_s):
                 self._move(0)
         self._changed.set()
@@ -100,12 +102,21 @@ class ReplayPlayer(Player):
             self.is_playing = False
             self._move(frame)
 
+    def close(self) -> None:
+        """Ends the thread; nothing is shown any more. Must not be called from `show`. May be called again."""
+        with self._lock:
+            self._has_ended, self.is_playing = True, False
+        self._changed.set()
+        self._thread.join()
+
     def _move(self, frame: int) -> None:
+        if self._has_ended:
+            return
         self._frame = min(max(frame, 0), len(self._pauses_s))
         self._show(self._frame)
 
     def _play(self) -> None:
-        while True:
+        while not self._has_ended:
             self._changed.wait()
             self._changed.clear()
             while self.is_playing and self._frame < len(self._pauses_s):

@@ -76,6 +76,7 @@ class Replay(contextlib.AbstractContextManager):
             self._rendered = Scene.load(run.folder.map), mesh
         self._ended = threading.Event()
         self._failure: Exception | None = None
+        self._player: ReplayPlayer | None = None
         listener = listen(options)
         self.url, self.has_token = listener.url, listener.token is not None
         self._sink = BrowserSink(listener, f"spslam view {run.folder.path.name}", self._make_player)
@@ -98,8 +99,10 @@ class Replay(contextlib.AbstractContextManager):
             raise self._failure
 
     def close(self) -> None:
-        """Ends the server. May be called again."""
+        """Ends the player, the workers and the server. May be called again."""
         self._ended.set()
+        if self._player is not None:
+            self._player.close()  # or it would go on to give the workers frames
         for worker in (self._frames, self._images):
             worker.close()
             worker.wait_until_idle(_CLOSING_S)
@@ -111,7 +114,8 @@ class Replay(contextlib.AbstractContextManager):
         self.close()
 
     def _make_player(self, model: RunModel) -> ReplayPlayer:
-        return ReplayPlayer(model.column("timestamp").copy(), self.show)
+        self._player = ReplayPlayer(model.column("timestamp").copy(), self.show)
+        return self._player
 
     def _show_frame(self, frame: int) -> None:
         self._sink.show(frame)

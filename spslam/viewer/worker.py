@@ -36,10 +36,11 @@ class NewestWorker(Generic[Item]):
         self._thread.start()
 
     def submit(self, item: Item) -> None:
-        """Replaces the item that waits, if any."""
+        """Replaces the item that waits, if any; does nothing once closed."""
         with self._changed:
-            self._item = item
-            self._changed.notify_all()
+            if not self._has_ended:
+                self._item = item
+                self._changed.notify_all()
 
     def wait_until_idle(self, timeout_s: float) -> bool:
         """Waits until nothing is left to do; returns whether that is so."""

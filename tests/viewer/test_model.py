@@ -146,6 +146,27 @@ def test_replay_player_plays_seeks_and_steps():
     assert shown[3:8] == [0, 1, 2, 3, 4]
 
 
+def test_replay_player_ends_its_thread_while_it_plays():
+    shown = []
+    player = ReplayPlayer(np.arange(5.0), shown.append)
+    player.toggle()
+    for _ in range(2):
+        player.close()
+    count = len(shown)
+    for act in (player.toggle, player.step, lambda: player.seek(1)):
+        act()
+    assert not player._thread.is_alive() and not player.is_playing
+    assert len(shown) == count <= 1
+
+
+def test_closed_worker_takes_nothing():
+    done = []
+    worker = NewestWorker(done.append, "test")
+    worker.close()
+    worker.submit(1)
+    assert worker.wait_until_idle(0) and done == []
+
+
 def test_worker_skips_to_the_newest():
     release, done = threading.Event(), []
 
