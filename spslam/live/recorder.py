@@ -29,6 +29,8 @@ _MOST_UNITS = 65535
 class FolderRecorder(contextlib.AbstractContextManager):
     """Writes frames to `color/NNNNNN.jpg` and `depth/NNNNNN.png`, with `intrinsics.json` and `times.txt`.
 
+    If any frame has a pose, `poses.txt` has a row for each, of NaN where it is unknown.
+
     `spslam run folder --data DIR` reads the result, also after a kill: each image appears whole, and a frame's time is
     the last that is written of it. Color is JPEG of quality 95. A frame that comes while `WAITING_FRAMES` others wait
     for the disk is left out and counted.
@@ -110,10 +112,13 @@ class FolderRecorder(contextlib.AbstractContextManager):
         self._write_image("color", f"{name}.jpg", color, _JPEG)
         if self._times is None:
             self._times = self._open("times.txt", files)
-            self._poses = self._open("poses.txt", files) if frame.pose is not None else None
+        if self._poses is None and frame.pose is not None:
+            if self.frames:
+                # Their rows appear at once: some of them alone would be the poses of another number of frames.
+                atomic_write(self.folder / "poses.txt", self.frames * (_pose_row(None) + "\n"))
+            self._poses = self._open("poses.txt", files)
         if self._poses is not None:
-            pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
-            self._append(self._poses, " ".join(f"{value:.12g}" for value in pose.reshape(-1)))
+            self._append(self._poses, _pose_row(frame.pose))
         self._append(self._times, f"{frame.timestamp:.9f}")
 
     def _write_image(self, kind: str, name: str, image: np.ndarray, options: list[int]) -> None:
@@ -133,13 +138,18 @@ class FolderRecorder(contextlib.AbstractContextManager):
     def _open(self, name: str, files: contextlib.ExitStack) -> TextIO:
         path = self.folder / name
         with writing(path):
-            file = path.open("w", encoding="utf-8", buffering=1)
+            file = path.open("a", encoding="utf-8", buffering=1)
         files.callback(_close, file)
         return file
 
     def _append(self, file: TextIO, row: str) -> None:
         with writing(file.name):
             file.write(row + "\n")
+
+
+def _pose_row(pose: np.ndarray | None) -> str:
+    """A row of `poses.txt`, of NaN where the pose is unknown."""
+    return " ".join(f"{value:.12g}" for value in (np.full(16, np.nan) if pose is None else pose.reshape(-1)))
 
 
 def _close(file: TextIO) -> None:

@@ -36,6 +36,48 @@ def test_a_recording_has_the_frames_as_they_came(tmp_path):
     np.testing.assert_allclose(times, dataset.timestamps(), atol=1e-8)
 
 
+@pytest.mark.parametrize("known", [(0, 3), (2, 3), (3,)])
+def test_poses_that_begin_late_or_are_missing_are_kept(tmp_path, known):
+    """As of a motion capture system that finds the camera after a while."""
+    dataset = Recorded(4)
+    with FolderRecorder(tmp_path / "x", dataset.camera) as recorder:
+        for frame in dataset:
+            frame.pose = frame.pose if frame.index in known else None
+            recorder.offer(frame)
+    recorded = opened(tmp_path / "x")
+    assert recorded.doubts == dataset.doubts
+    for index, pose in enumerate(recorded.poses()):
+        if index in known:
+            np.testing.assert_allclose(pose, dataset.poses()[index], atol=1e-9)
+        else:
+            assert np.isnan(pose).all()
+
+
+def test_frames_without_any_pose_have_no_poses(tmp_path):
+    with FolderRecorder(tmp_path / "x", Recorded(1).camera) as recorder:
+        recorder.offer(plain_frame(0))
+    assert not (tmp_path / "x" / "poses.txt").exists()
+
+
+def test_a_kill_where_the_first_pose_comes_late_leaves_a_recording(tmp_path, monkeypatch):
+    """The rows of the frames before it are there, and nothing of the frame itself but its images."""
+    dataset, folder = Recorded(3), tmp_path / "x"
+
+    def killed(self, file, row):
+        if file.name.endswith("poses.txt"):
+            raise OutputError("killed")
+        append(self, file, row)
+
+    append = FolderRecorder._append
+    monkeypatch.setattr(FolderRecorder, "_append", killed)
+    with FolderRecorder(folder, dataset.camera) as recorder:
+        for frame in dataset:
+            frame.pose = frame.pose if frame.index == 2 else None
+            recorder.offer(frame)
+    assert (folder / "color" / "000002.jpg").exists()
+    assert len(opened(folder)) == 2 and opened(folder).poses() is None
+
+
 def test_frames_that_come_too_fast_are_left_out_and_counted(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "WAITING_FRAMES", 3)
     write, offered = FolderRecorder._write, 0
