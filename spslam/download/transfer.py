@@ -124,7 +124,7 @@ def _resume(url: str, part_path: Path, record_path: Path, progress: Progress | N
     headers = {"User-Agent": "spslam", "Accept-Encoding": "identity"}
     if start and part.version is not None:
         headers |= {"Range": f"bytes={start}-", "If-Range": part.version}
-    with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S) as response:
+    with _open(urllib.request.Request(url, headers=headers)) as response:
         start = start if response.status == 206 and _first_byte(response) == start else 0
         if response.status == 206 and start == 0:
             raise _InterruptedError("the server sent another range than requested")
@@ -139,6 +139,15 @@ def _resume(url: str, part_path: Path, record_path: Path, progress: Progress | N
         raise _InterruptedError(f"the connection ended after {_size(part_path)} of {part.total} bytes")
 
 
+def _open(request: urllib.request.Request) -> http.client.HTTPResponse:
+    try:
+        return urllib.request.urlopen(request, timeout=_TIMEOUT_S)  # type: ignore[no-any-return]
+    except urllib.error.URLError:
+        raise
+    except OSError as error:  # while the response was waited for, which urllib doesn't wrap
+        raise _InterruptedError(error.strerror or str(error) or type(error).__name__) from error
+
+
 def _copy(
     response: http.client.HTTPResponse, file: BinaryIO, done: int, total: int | None, progress: Progress | None
 ) -> None:
@@ -147,6 +156,8 @@ def _copy(
             chunk = response.read1(_CHUNK_BYTES)
         except http.client.IncompleteRead as error:
             chunk = error.partial
+        except OSError as error:  # of the network, as of TLS or of routing; those of the disk are raised below
+            raise _InterruptedError(error.strerror or str(error) or type(error).__name__) from error
         if not chunk:
             return
         file.write(chunk)

@@ -1,7 +1,10 @@
 """Downloads over interrupted connections, and of files that change on the server."""
 
+import errno
 import hashlib
+import http.client
 import shutil
+import ssl
 
 import numpy as np
 import pytest
@@ -47,6 +50,60 @@ def test_an_interrupted_connection_is_resumed_where_it_stopped(site, tmp_path):
     get(site, tmp_path, sha256=DIGEST)
     check_whole(tmp_path)
     assert site.requested == [None, 100_000, 150_000, 150_001]
+
+
+NETWORK_ERRORS = [
+    ssl.SSLError(1, "[SSL: DECRYPTION_FAILED_OR_BAD_RECORD_MAC] bad record"),
+    OSError(errno.EHOSTUNREACH, "No route to host"),
+    TimeoutError("timed out"),
+]
+
+
+@pytest.mark.parametrize("error", NETWORK_ERRORS, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("where", ["read1", "begin"])
+def test_a_connection_that_fails_is_resumed_whatever_the_error(site, tmp_path, monkeypatch, error, where):
+    """Of the network, that is, and not of the disk: while the body is read, or the response waited for."""
+    site.cuts, responses, failed, method = [120_000], [], [], getattr(http.client.HTTPResponse, where)
+
+    def failing(response, *arguments):
+        if response not in responses:
+            responses.append(response)
+        if len(responses) == 2 and not failed:
+            failed.append(where)
+            raise error
+        return method(response, *arguments)
+
+    monkeypatch.setattr(http.client.HTTPResponse, where, failing)
+    get(site, tmp_path, sha256=DIGEST)
+    check_whole(tmp_path)
+    assert failed and site.requested[0] is None and set(site.requested[1:]) == {120_000}
+
+
+def test_a_failing_network_is_named(site, tmp_path, monkeypatch):
+    def failing(response, count):
+        raise NETWORK_ERRORS[1]
+
+    monkeypatch.setattr(http.client.HTTPResponse, "read1", failing)
+    with pytest.raises(DatasetError, match="can't be downloaded: No route to host; 0 bytes are kept"):
+        get(site, tmp_path)
+
+
+def test_a_failing_disk_is_not_tried_again(site, tmp_path, monkeypatch):
+    def full(response, file, *arguments):
+        return copy(response, Full(file), *arguments)
+
+    class Full:
+        def __init__(self, file):
+            self.file = file
+
+        def write(self, content):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    copy = transfer._copy
+    monkeypatch.setattr(transfer, "_copy", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        get(site, tmp_path)
+    assert site.requested == [None]
 
 
 def test_a_later_call_resumes(site, tmp_path):
