@@ -35,7 +35,7 @@ class Capture(contextlib.AbstractContextManager):
         self.source, self.queue, self.recorder = source, queue, recorder
         self.failure: Exception | None = None
         self._count = 0
-        self._ending = threading.Event()
+        self._ending, self._is_left_alone = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="spslam-capture", daemon=True)
 
     @property
@@ -47,10 +47,16 @@ class Capture(contextlib.AbstractContextManager):
         return self
 
     def stop(self) -> None:
-        """Ends the thread and closes the source; waits until the source has yielded once more."""
+        """Ends the thread and closes the source; waits until the source has yielded once more.
+
+        May be called again; a source that did not end in time is not waited for a second time.
+        """
         self._ending.set()
+        if self._is_left_alone:
+            return
         self._thread.join(_END_S)
-        if self._thread.is_alive() and self.failure is None:
+        self._is_left_alone = self._thread.is_alive()
+        if self._is_left_alone and self.failure is None:
             self.failure = SourceError(f"{self.source.name}: did not end within {_END_S:g} s; it is left alone")
 
     def __exit__(

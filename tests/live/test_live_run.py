@@ -13,7 +13,8 @@ import pytest
 from spslam.config import load_config
 from spslam.errors import DatasetError, OutputError, SourceError, SpslamError
 from spslam.evaluation.run_output import RunOutput
-from spslam.live import FolderRecorder, LiveRequest, ReplaySource, session
+from spslam.live import FolderRecorder, LiveRequest, ReplaySource, capture, session
+from spslam.live.frame_queue import FrameQueue
 from spslam.live.session import run_live
 from spslam.slam.system import SlamSystem
 from tests.cli.command import ROOT, assert_refused, spslam
@@ -183,13 +184,23 @@ def test_a_recording_that_fails_is_said_after_the_results(tmp_path, monkeypatch)
 
 
 def test_a_source_that_does_not_end_is_left_alone(tmp_path, monkeypatch):
-    from spslam.live import capture
-
     monkeypatch.setattr(capture, "_END_S", 0.1)
     forever = threading.Event()
     camera = RoomCamera(4, change=lambda frame: forever.wait(20) and frame if frame.index == 3 else frame)
     with pytest.raises(SourceError, match=r"did not end within 0.1 s; it is left alone; the results of 3 frames"):
         run_live(request(tmp_path, seconds=1.0), camera)
+    forever.set()
+
+
+def test_a_source_that_does_not_end_is_waited_for_once(monkeypatch):
+    monkeypatch.setattr(capture, "_END_S", 0.5)
+    forever = threading.Event()
+    camera = RoomCamera(1, change=lambda frame: forever.wait(20) and frame)
+    with capture.Capture(camera, FrameQueue(1.0)) as capturing:
+        capturing.stop()
+        began = time.monotonic()
+    assert time.monotonic() - began < 0.25
+    assert "did not end within 0.5 s" in str(capturing.failure)
     forever.set()
 
 
