@@ -5,9 +5,15 @@ depth is inverse to the amplitude, which falls with the square of the distance, 
 reflectivity; non-sinusoidal modulation makes a periodic error ("wiggling", also Lindner et al., Time-of-Flight sensor
 calibration for accurate range sensing, CVIU 114 (2010)). Keller and Kolb, Real-time simulation of time-of-flight
 sensors, Simulation Modelling Practice and Theory 17 (2009): a pixel at an edge adds the phasors of both surfaces and
-measures a point between them. Size of the errors: Toelgyessy et al., Evaluation of the Azure Kinect and Its Comparison
-to Kinect V1 and Kinect V2, Sensors 21 (2021): deviation 1 to 2 mm at 1 m and below 17 mm in the range, systematic error
-below 11 mm + 0.1 %.
+measures a point between them.
+
+Size of the errors: Toelgyessy et al., Evaluation of the Azure Kinect and Its Comparison to Kinect V1 and Kinect V2,
+Sensors 21 (2021): deviation 1 to 2 mm at 1 m and below 17 mm in the range, systematic error below 11 mm + 0.1 %. The
+model's deviation is 0.5 mm z^2 / (r cos) for reflectivity r, 0.15 (black) to 1 (white), z in m and the cosine of
+incidence. So 1 to 2 mm at 1 m hold for surfaces that face the camera with gray levels of 96 to 170; white has 0.5 mm,
+black 3.3 mm. Below 17 mm hold up to 5.8 m sqrt(r cos): in the whole range for white alone (15 mm at 5.5 m), up to 3.4 m
+for middle gray (level 128: 1.5, 13, 23 and 36 mm at 1, 3, 4 and 5 m) and up to 2.3 m for black, which is lost beyond
+4.3 m. The systematic error is wiggling of 4 mm on all of them.
 """
 
 from __future__ import annotations
