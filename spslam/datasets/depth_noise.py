@@ -23,8 +23,10 @@ def kinect_depth(depth: np.ndarray, focal_px: float, level: float, generator: np
     """Depth as a structured-light sensor would measure it.
 
     Disparity noise, mostly correlated over a few pixels, and its quantization give an error that grows with depth
-    squared (about 0.2 cm at 1 m, 1.1 cm at 2.5 m); edges wander sideways; pixels are missing at depth edges, on
-    surfaces seen under more than 80 degrees, outside 0.35 to 8 m, and now and then anywhere.
+    squared: RMS 0.12 cm z^2, z in m, over surfaces at all depths (0.12 cm at 1 m, 0.75 cm at 2.5 m). The deviation on
+    one flat wall that faces the camera is 0.09 to 0.145 cm z^2, by where its disparity lies between two steps. Edges
+    wander sideways; pixels are missing at depth edges, on surfaces seen under more than 80 degrees, outside 0.35 to
+    8 m, and now and then anywhere.
 
     Args:
         depth: float32 [H, W], m, exact depth, all above 0.

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from spslam.camera import Camera
+from spslam.datasets.depth_noise import _DISPARITY_PX_M, _DISPARITY_STEP_PX, kinect_depth
 from spslam.datasets.places.sensors import SENSORS
 from spslam.datasets.places.sensors.occlusion import occluded
 from spslam.datasets.places.sensors.phone_lidar import SPOT_M, SPOT_SHARE
@@ -48,6 +49,20 @@ def test_structured_light_errs_by_disparity(depth_m):
     # Khoshelham and Elberink 2012, equation 10 and figure 10: 1.4 mm at 1 m, growing with depth squared.
     found, _ = deviation("structured_light", depth_m)
     assert found == pytest.approx(0.0013 * depth_m**2, rel=0.35)
+
+
+def test_structured_light_errs_as_documented():
+    """The page and `kinect_depth` say so: over one step of disparity around 1 m, and walls on and between two steps."""
+    deviations, squares = [], []
+    for disparity_px in _DISPARITY_PX_M + np.arange(-8, 8) / 16 * _DISPARITY_STEP_PX:
+        depth_m = _DISPARITY_PX_M / disparity_px
+        measured = kinect_depth(wall(depth_m), 277.0, 1.0, np.random.default_rng(0))
+        error = (measured - depth_m)[measured > 0]
+        deviations.append(error.std())
+        squares.append(np.mean(error**2))
+    assert np.sqrt(np.mean(squares)) == pytest.approx(0.0012, rel=0.03)
+    assert min(deviations) == pytest.approx(0.0009, rel=0.05)
+    assert max(deviations) == pytest.approx(0.00145, rel=0.05)
 
 
 @pytest.mark.parametrize("depth_m", [1.0, 2.0, 4.0])
@@ -112,6 +127,14 @@ def test_shadow_is_as_wide_as_the_difference_of_disparity():
     assert hidden[60].sum() == pytest.approx(width, abs=1)
     assert hidden[60, 120 - int(width) + 1 : 120].all()
     assert not occluded(disparity_px_m / wall(2.0), 0.25).any()
+
+
+def test_shadow_of_narrow_things_is_as_wide_as_that_of_wide_ones():
+    """Which is documented as too wide."""
+    depth = step(1.0, 2.0)
+    depth[:, 123:] = 2.0
+    hidden = occluded(20.0 / depth, 0.25)[60]
+    assert hidden[111:120].all() and hidden.sum() == pytest.approx(10, abs=1)
 
 
 def test_structured_light_loses_the_shadow_and_stereo_the_occluded():
