@@ -75,23 +75,27 @@ def surface_figures(
         Metrics as in `spslam.evaluation.mesh_metrics` and `spslam.evaluation.depth_metrics`.
 
     Raises:
-        OutputError: the run has no mesh, or none of its frames is in the dataset.
+        OutputError: the run has no mesh; none of its frames with a pose is in the dataset, or can be read; or these
+            observed nothing of the ground-truth surface.
     """
     mesh = _require_mesh(run)
     known = run.known_ground_truth
-    rows, indices = _frames_of(run, dataset, _CULLING_FRAMES, known_only=run.ground_truth is None)
-    poses = run.trajectory.poses if run.ground_truth is None else run.ground_truth
-    rows, depths = _read_depths(dataset, rows, indices)
+    poses = run.trajectory.mask_lost(run.trajectory.poses) if run.ground_truth is None else run.ground_truth
+    rows, depths = _read_depths(run, dataset, *_frames_of(run, dataset, _CULLING_FRAMES, poses))
     vertices = mesh.vertices if known is None else _align_views(run.trajectory.poses, known).apply(mesh.vertices)
 
     def observed(points: np.ndarray) -> np.ndarray:
         return observed_mask(points, depths, poses[rows], dataset.camera)
 
-    figures = evaluate_surface(TriangleSurface(vertices, mesh.faces), ground_truth, observed, samples)
+    reconstructed = TriangleSurface(vertices, mesh.faces)
+    if not len(reconstructed.triangles()[1]):
+        raise OutputError(f"{run.folder.path}: no face of its mesh has an area; `spslam mesh` makes another one")
+    figures = evaluate_surface(reconstructed, ground_truth, observed, samples)
+    if "completeness_cm" not in figures:  # no point to measure from, as there is a surface to measure to
+        raise OutputError(_nothing_observed(run, len(rows)))
     if not novel_views:
         return figures
-    known = np.flatnonzero(np.isfinite(poses[rows]).all(axis=(1, 2)))
-    views = novel_poses(poses[rows][known], [depths[row] for row in known], dataset.camera, novel_views)
+    views = novel_poses(poses[rows], depths, dataset.camera, novel_views)
     height_px = max(round(dataset.camera.height * _NOVEL_WIDTH_PX / dataset.camera.width), 1)
     camera = dataset.camera.resized(_NOVEL_WIDTH_PX, height_px)
     pairs = novel_depth((vertices, mesh.faces), ground_truth.triangles(), views, camera, observed, novel_views)
@@ -114,14 +118,15 @@ def view_figures(run: RunOutput, dataset: RgbdDataset) -> dict[str, float]:
         Empty if no frame can be read or no view shows surface.
 
     Raises:
-        OutputError: the run has no mesh or no map, or none of its frames is in the dataset.
+        OutputError: the run has no mesh or no map, or none of its tracked frames is in the dataset.
     """
     mesh, map_file = _require_mesh(run), run.folder.map
     if not map_file.is_file():
         raise OutputError(f"{run.folder.path}: has no {map_file.name} to render")
     scene = None if run.metrics.get("mesh_source") == "tsdf" else Scene.load(map_file)
     scores, coverage = [], []
-    for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS, known_only=True), strict=True):
+    tracked = run.trajectory.mask_lost(run.trajectory.poses)
+    for row, index in zip(*_frames_of(run, dataset, COLOR_VIEWS, tracked), strict=True):
         try:
             frame = dataset[int(index)]
         except DatasetError:
@@ -178,23 +183,46 @@ def _align_views(estimated: np.ndarray, reference: np.ndarray) -> Alignment:
     return Alignment(*umeyama(*points))
 
 
-def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int, known_only: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Evenly spaced rows of the run's trajectory, and the indices of these frames in the dataset."""
+def _frames_of(run: RunOutput, dataset: RgbdDataset, count: int, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Evenly spaced rows of the trajectory with a finite pose, and the indices of these frames in the dataset."""
     indices = match_times(dataset.timestamps(), run.trajectory.timestamps)
-    rows = np.flatnonzero((indices >= 0) & ~(run.trajectory.lost & known_only))
-    if not len(rows):
+    if not (indices >= 0).any():
         raise OutputError(f"{run.folder.path}: must be a run over {dataset.name}, but has none of its frames")
+    rows = np.flatnonzero((indices >= 0) & np.isfinite(poses).all(axis=(1, 2)))
+    if not len(rows):
+        raise OutputError(
+            f"{run.folder.path}: none of the run's frames that are in {dataset.name} has a known pose to evaluate "
+            "from; restore the data of the run, or run it again"
+        )
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
     return rows, indices[rows]
 
 
-def _read_depths(dataset: RgbdDataset, rows: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def _read_depths(
+    run: RunOutput, dataset: RgbdDataset, rows: np.ndarray, indices: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """The rows whose frames can be read, and their depth images."""
-    readable, depths = [], []
+    readable, depths, unreadable = [], [], ""
     for row, index in zip(rows, indices, strict=True):
         try:
             depths.append(dataset[int(index)].depth)
-        except DatasetError:
+        except DatasetError as error:
+            unreadable = unreadable or str(error)
             continue
         readable.append(row)
+    if not readable:
+        raise OutputError(
+            f"{run.folder.path}: can't tell what was observed, as none of {len(rows)} frames can be read; restore the "
+            f"data ({unreadable})"
+        )
     return np.array(readable, dtype=np.int64), depths
+
+
+def _nothing_observed(run: RunOutput, views: int) -> str:
+    """Why there is nothing to compare the mesh with."""
+    poses = "ground-truth poses; it must be in meters and in their world"
+    if run.ground_truth is None:
+        poses = "estimated poses; it must be in meters and, as there are no ground-truth poses, in the world of the run"
+    return (
+        f"{run.folder.path}: nothing of the ground-truth surface is seen in depth images of {views} frames at {poses}"
+    )

@@ -67,11 +67,14 @@ class TriangleSurface:
 
     @classmethod
     def load(cls, path: Path) -> TriangleSurface:
-        """Reads a mesh file; raises DatasetError as `spslam.meshing.load_mesh` does, and for a mesh without faces."""
+        """Reads a mesh file; raises DatasetError as `spslam.meshing.load_mesh` does, and for a mesh without area."""
         mesh = load_mesh(path)
         if not len(mesh.faces):
             raise DatasetError(f"{path}: must be a mesh with faces, got none")
-        return cls(mesh.vertices, mesh.faces)
+        surface = cls(mesh.vertices, mesh.faces)
+        if not len(surface._faces):
+            raise DatasetError(f"{path}: must be a mesh with an area, but none of {len(mesh.faces)} faces has one")
+        return surface
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices [V, 3] and faces [L, 3], without faces of zero area."""

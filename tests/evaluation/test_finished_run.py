@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -12,8 +13,10 @@ from spslam.datasets.base import Subset
 from spslam.datasets.generated import GeneratedDataset
 from spslam.datasets.room import Room
 from spslam.errors import DatasetError, OutputError
+from spslam.evaluation import finished_run
 from spslam.evaluation.finished_run import add_metrics, surface_figures, trajectory_figures, view_figures
 from spslam.evaluation.run_output import RunOutput, match_times
+from spslam.evaluation.surface import TriangleSurface
 from spslam.geometry import pose_from
 from spslam.scene import Scene, SceneSettings
 from spslam.trajectory import Trajectory
@@ -96,6 +99,38 @@ class WithoutSomeFrames(Subset):
 def test_unreadable_frames_are_skipped(output, room):
     broken = WithoutSomeFrames(room)
     assert surface_figures(RunOutput.read(output), broken, room.room, **QUICK)["f1_5cm"] > 99.9
+
+
+def test_observed_is_what_frames_with_a_pose_saw(output, room, monkeypatch):
+    """Of all frames evenly spread ones would be the first and the last, neither of which has a pose."""
+    monkeypatch.setattr(finished_run, "_CULLING_FRAMES", 2)
+    path = output / "previews" / "ground_truth.txt"
+    known = Trajectory.load_tum(path)
+    Trajectory(known.timestamps[1:-1], known.poses[1:-1]).save_tum(path)
+    assert surface_figures(RunOutput.read(output), room, room.room, **QUICK)["f1_5cm"] > 99.9
+
+
+class WithoutFrames(Subset):
+    """A dataset of which no frame can be read."""
+
+    def read(self, index):
+        raise DatasetError(f"frame {index} is broken")
+
+
+def test_figures_need_frames_that_saw_the_surface(output, room):
+    run = RunOutput.read(output)
+    with pytest.raises(OutputError, match=r"none of 6 frames can be read; restore the data \(frame 0 is broken\)"):
+        surface_figures(run, WithoutFrames(room), room.room, **QUICK)
+    vertices, faces = room.room.triangles()
+    with pytest.raises(OutputError, match="nothing of the ground-truth surface is seen .* in their world"):
+        surface_figures(run, room, TriangleSurface(vertices + 100, faces), **QUICK)
+    ground_truth = np.where(np.arange(6)[:, None, None] < 3, run.ground_truth, np.nan)
+    with pytest.raises(OutputError, match="none of the run's frames that are in generated has a known pose"):
+        surface_figures(replace(run, ground_truth=ground_truth), Subset(room, 6, 12), room.room, **QUICK)
+    mesh = trimesh.load(output / "mesh.ply", process=False)
+    trimesh.Trimesh(0 * mesh.vertices, mesh.faces, process=False).export(output / "mesh.ply")
+    with pytest.raises(OutputError, match="no face of its mesh has an area; `spslam mesh` makes another"):
+        surface_figures(run, room, room.room, **QUICK)
 
 
 def test_rendered_views_need_a_map_and_a_mesh(output, room):

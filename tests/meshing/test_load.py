@@ -140,6 +140,12 @@ def test_files_that_are_no_meshes_are_refused(tmp_path):
     refused(tmp_path / "mesh.zip", "a mesh must be one of .ply, .obj, .glb, .stl, .off, got .zip")
 
 
+def test_ground_truth_has_an_area(tmp_path):
+    path = save(tmp_path / "flat.ply", 0 * CUBE.vertices, CUBE.faces)
+    with pytest.raises(DatasetError, match=r"flat.ply: must be a mesh with an area, but none of 12 faces has one"):
+        TriangleSurface.load(path)
+
+
 def test_a_file_that_names_others_is_read_alone(tmp_path):
     (tmp_path / "a.obj").write_text("mtllib /etc/passwd\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert len(load_mesh(tmp_path / "a.obj").faces) == 1
