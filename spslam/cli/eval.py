@@ -38,10 +38,7 @@ def execute(args: argparse.Namespace) -> None:
     run = RunOutput.read(args.output)
     figures: dict[str, Any] = trajectory_figures(run, args.scale)
     if not figures and args.gt_mesh is None and not args.views:
-        raise OutputError(
-            f"{args.output}: there are no ground-truth poses to compare with; "
-            "--gt-mesh evaluates the mesh, --views rendered views of the map"
-        )
+        raise OutputError(f"{args.output}: {_nothing_to_compare(run)}")
     doubts: list[str] = []
     if args.gt_mesh is not None or args.views:
         of_map, doubts = _map_figures(run, args.gt_mesh, args.views)
@@ -52,6 +49,14 @@ def execute(args: argparse.Namespace) -> None:
     print_summary(metrics, args.output)
     for line in doubts:
         print(f"! {line}")
+
+
+def _nothing_to_compare(run: Any) -> str:
+    """Why a trajectory has no figures, and what can be evaluated instead."""
+    if run.ground_truth is None:
+        others = "--gt-mesh evaluates the mesh, --views rendered views of the map"
+        return f"there are no ground-truth poses to compare with; {others}"
+    return "no tracked frame has a ground-truth pose to compare with; --views evaluates rendered views of the map"
 
 
 def _map_figures(run: Any, gt_mesh: Path | None, views: bool) -> tuple[dict[str, float], list[str]]:

@@ -75,11 +75,16 @@ def surface_figures(
         Metrics as in `spslam.evaluation.mesh_metrics` and `spslam.evaluation.depth_metrics`.
 
     Raises:
-        OutputError: the run has no mesh; none of its frames with a pose is in the dataset, or can be read; or these
-            observed nothing of the ground-truth surface.
+        OutputError: the run has no mesh; it has ground-truth poses, but of no tracked frame; none of its frames with a
+            pose is in the dataset, or can be read; or these observed nothing of the ground-truth surface.
     """
     mesh = _require_mesh(run)
     known = run.known_ground_truth
+    if known is not None and not np.isfinite(known).any():
+        raise OutputError(
+            f"{run.folder.path}: no tracked frame has a ground-truth pose, so the mesh can't be aligned with the "
+            "ground truth; ground-truth poses of frames that were tracked are needed"
+        )
     poses = run.trajectory.mask_lost(run.trajectory.poses) if run.ground_truth is None else run.ground_truth
     rows, depths = _read_depths(run, dataset, *_frames_of(run, dataset, _CULLING_FRAMES, poses))
     vertices = mesh.vertices if known is None else _align_views(run.trajectory.poses, known).apply(mesh.vertices)

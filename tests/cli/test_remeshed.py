@@ -12,6 +12,7 @@ from spslam.datasets import export_folder
 from spslam.datasets.generated import GeneratedDataset
 from spslam.evaluation import finished_run
 from spslam.run_folder import RunFolder
+from spslam.trajectory import Trajectory
 from tests.cli.command import assert_refused, spslam
 
 SMALL = ["--set=pixels.per_frame=3000", "--set=mapping.first_iterations=20", "--set=mapping.iterations=2"]
@@ -88,6 +89,21 @@ def test_eval_prints_the_scale(folder):
     assert re.search(r"^ATE, scaled +\d+\.\d\d cm\nscale +[01]\.\d{4}$", result.stdout, re.MULTILINE)
     rows = dict(summarize({"ate_scaled_rmse_cm": 1.234, "ate_scale": 1.00561}, folder))
     assert rows["ATE, scaled"] == "1.23 cm" and rows["scale"] == "1.0056"
+
+
+def test_eval_tells_no_ground_truth_from_none_of_tracked_frames(folder):
+    trajectory, ground_truth = folder / "out" / "trajectory.txt", folder / "out" / "previews" / "ground_truth.txt"
+    known = Trajectory.load_tum(ground_truth)
+    tracked = Trajectory.load_tum(trajectory)
+    Trajectory(tracked.timestamps, tracked.poses, np.arange(6) == 5).save_tum(trajectory)
+    Trajectory(known.timestamps[5:], known.poses[5:]).save_tum(ground_truth)
+    refused = spslam("eval", "out", cwd=folder)
+    assert_refused(refused, "out: no tracked frame has a ground-truth pose to compare with; --views evaluates")
+    refused = spslam("eval", "out", "--gt-mesh", "out/mesh.ply", cwd=folder)
+    assert_refused(refused, "out: no tracked frame has a ground-truth pose, so the mesh can't be aligned")
+    ground_truth.unlink()
+    refused = spslam("eval", "out", cwd=folder)
+    assert_refused(refused, "out: there are no ground-truth poses to compare with; --gt-mesh evaluates the mesh")
 
 
 @pytest.mark.parametrize("command", [["mesh", "out"], ["eval", "out", "--views"]])

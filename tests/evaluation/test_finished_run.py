@@ -133,6 +133,18 @@ def test_figures_need_frames_that_saw_the_surface(output, room):
         surface_figures(run, room, room.room, **QUICK)
 
 
+def test_a_mesh_is_aligned_by_tracked_frames(output, room):
+    path, lost = output / "trajectory.txt", np.arange(6) >= 2
+    tracked = Trajectory.load_tum(path)
+    Trajectory(tracked.timestamps, tracked.poses, lost).save_tum(path)
+    known = Trajectory.load_tum(output / "previews" / "ground_truth.txt")
+    Trajectory(known.timestamps[lost], known.poses[lost]).save_tum(output / "previews" / "ground_truth.txt")
+    run = RunOutput.read(output)
+    assert trajectory_figures(run, with_scale=True) == {}
+    with pytest.raises(OutputError, match="no tracked frame has a ground-truth pose, so the mesh can't be aligned"):
+        surface_figures(run, room, room.room, **QUICK)
+
+
 def test_rendered_views_need_a_map_and_a_mesh(output, room):
     with pytest.raises(OutputError, match="has no map.safetensors to render"):
         view_figures(RunOutput.read(output), room)
