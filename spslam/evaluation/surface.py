@@ -13,15 +13,23 @@ from scipy.spatial import cKDTree
 from spslam.errors import DatasetError
 from spslam.meshing import load_mesh
 
-# Nearest faces are found by sites: points spread over each face at about this spacing. No point of a face is farther
-# from its nearest site than 1.1 times the spacing.
+# Nearest faces are found by sites: points spread over each face at about this spacing, or one if it is smaller. No
+# point of a face is farther from its nearest site than 1.1 times the spacing, or the face's longest edge.
 _SITE_SPACING_M = 0.02
 _REACH = 1.1
-_MOST_SITES_ALONG = 512
+# Small faces would hide large ones behind hundreds of their sites, so faces are searched by size, each so many times
+# larger than the one before.
+_SIZE_RATIO, _SIZES = 2.0, 6
+# A face that would have more sites, such as one of 10 by 10 m, has none: it is compared with each point.
+_MOST_SITES_OF_FACE = 1 << 18
 # Of all faces together, unless there are as many faces: 2,500 m2. They take a quarter of a gigabyte and some seconds.
 _MOST_SITES = 1 << 23
-# Number of nearest sites compared in each round, until the nearest face is certain.
+# Number of nearest sites compared in each round, until the nearest face is certain. Where it is not, points that are no
+# farther than this from the surface are compared with all faces that may be nearest.
 _SITES_COMPARED = (8, 32, 128)
+_EXACT_M = 0.1
+# Pairs of a point and a face that are then compared at once; some 500 bytes each.
+_PAIRS = 1 << 17
 
 
 class Surface(Protocol):
@@ -100,55 +108,79 @@ class TriangleSurface:
         """Distances [N] in meters of points [N, 3] to the nearest triangle; infinite for a mesh without area.
 
         The nearest sites of a point give the candidate faces: as many sites as needed to be certain that no other face
-        is nearer, at most 128. So the distance is exact up to about 10 cm from the surface; farther away it may be a
-        few millimeters too large. Deterministic. Raises DatasetError for a surface of thousands of square meters.
+        is nearer, but of points 10 cm away and more at most 128 of faces of about the same size. So the distance is
+        exact up to 10 cm from the surface; farther away it may be a few millimeters too large. Deterministic. Raises
+        DatasetError for a surface of thousands of square meters.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         distance = np.full(len(points), np.inf)
-        if not len(self._corners):
+        if not len(self._corners) or not len(points):
             return distance
-        unsettled, compared = np.arange(len(points)), 0
-        for count in _SITES_COMPARED:
-            distance[unsettled], settled = self._nearest_among(points[unsettled], distance[unsettled], compared, count)
-            unsettled, compared = unsettled[~settled], count
+        large, sites_by_size = self._sites
+        for face in large:
+            corners = np.broadcast_to(self._corners[face], (len(points), 3, 3))
+            np.minimum(distance, triangle_distance(points, corners), out=distance)
+        for sites in sites_by_size:
+            self._compare(sites, points, distance)
         return distance
 
+    def _compare(self, sites: _Sites, points: np.ndarray, distance: np.ndarray) -> None:
+        """Lowers distances [N], in place, to those to the faces of sites."""
+        unsettled, compared = np.arange(len(points)), 0
+        for count in _SITES_COMPARED:
+            found, settled = self._nearest_among(sites, points[unsettled], distance[unsettled], (compared, count))
+            distance[unsettled] = found
+            unsettled, compared = unsettled[~settled], count
+        near = unsettled[distance[unsettled] < _EXACT_M + sites.reach]
+        lengths = sites.tree.query_ball_point(
+            points[near], distance[near] + sites.reach, workers=-1, return_length=True
+        )
+        for rows in np.split(near, np.flatnonzero(np.diff(np.cumsum(lengths) // _PAIRS)) + 1):
+            self._compare_within_reach(sites, points, distance, rows)
+
     def _nearest_among(
-        self, points: np.ndarray, distance: np.ndarray, first: int, last: int
+        self, sites: _Sites, points: np.ndarray, distance: np.ndarray, ranks: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Updates distances by the faces of the `first`-th to `last`-th nearest sites; returns which are certain."""
-        tree, faces, reach = self._sites
-        ranks = np.arange(first + 1, min(last, len(faces)) + 1)
-        if not len(points) or not len(ranks):
+        """Distances by the faces of the nearest sites within these ranks too; returns which are certain."""
+        first, last = ranks
+        wanted = np.arange(first + 1, min(last, len(sites.faces)) + 1)
+        if not len(points) or not len(wanted):
             return distance, np.ones(len(points), dtype=bool)
-        site_distance, sites = tree.query(points, k=ranks, workers=-1)
+        site_distance, nearest = sites.tree.query(points, k=wanted, workers=-1)
         distance = distance.copy()
-        for column, column_distance in zip(sites.T, site_distance.T, strict=True):
-            rows = np.flatnonzero(column_distance < distance + reach)
-            exact = triangle_distance(points[rows], self._corners[faces[column[rows]]])
+        for column, column_distance in zip(nearest.T, site_distance.T, strict=True):
+            rows = np.flatnonzero(column_distance < distance + sites.reach)
+            exact = triangle_distance(points[rows], self._corners[sites.faces[column[rows]]])
             distance[rows] = np.minimum(distance[rows], exact)
-        return distance, (site_distance[:, -1] >= distance + reach) | (last >= len(faces))
+        return distance, (site_distance[:, -1] >= distance + sites.reach) | (last >= len(sites.faces))
+
+    def _compare_within_reach(self, sites: _Sites, points: np.ndarray, distance: np.ndarray, rows: np.ndarray) -> None:
+        """Lowers distances in `rows`, in place, to those to all faces of sites that may be nearer."""
+        within = sites.tree.query_ball_point(points[rows], distance[rows] + sites.reach, workers=-1)
+        rows = np.repeat(rows, [len(each) for each in within])
+        faces = sites.faces[np.concatenate([np.asarray(each, dtype=np.int64) for each in [*within, []]])]
+        for first in range(0, len(rows), _PAIRS):
+            part = slice(first, first + _PAIRS)
+            np.minimum.at(distance, rows[part], triangle_distance(points[rows[part]], self._corners[faces[part]]))
 
     @cached_property
-    def _sites(self) -> tuple[cKDTree, np.ndarray, float]:
-        """A k-d tree of all sites, the face of each, and the largest distance of a point of a face to its sites."""
+    def _sites(self) -> tuple[np.ndarray, list[_Sites]]:
+        """Faces that have no sites, as they would have too many, and the sites of all others by their size."""
         frames = _BaseFrames.of(self._corners)
-        counts = np.ceil(np.stack((frames.base, frames.height), axis=1) / _SITE_SPACING_M)
-        counts = np.clip(counts, 1, _MOST_SITES_ALONG).astype(np.int64)
-        if counts.prod(axis=1).sum() > max(_MOST_SITES, 2 * len(counts)):
+        counts = np.ceil(np.stack((frames.base, frames.height), axis=1) / _SITE_SPACING_M).clip(1, 1 << 30)
+        counts = counts.astype(np.int64)
+        of_faces = counts.prod(axis=1)
+        if of_faces.clip(max=_MOST_SITES_OF_FACE).sum() > max(_MOST_SITES, 2 * len(counts)):
             raise DatasetError(
                 f"a mesh of {len(counts)} faces and {self._areas.sum():.3g} m2 is too large to measure distances to; "
                 "is it in meters?"
             )
-        sites, owners = [], []
-        for columns, rows in np.unique(counts, axis=0):
-            faces = np.flatnonzero((counts == (columns, rows)).all(axis=1))
-            sites.append(frames.sites(faces, columns, rows))
-            owners.append(np.repeat(faces, columns * rows))
-        reach = _REACH * min(_SITE_SPACING_M, float(frames.base.max()))
-        # Of millions of sites a balanced tree takes three times as long to build, and no less to query.
-        tree = cKDTree(np.concatenate(sites), compact_nodes=False, balanced_tree=False)
-        return tree, np.concatenate(owners), reach
+        reach = _REACH * np.minimum(_SITE_SPACING_M, frames.base)
+        sizes = np.ceil(np.log(reach / (_REACH * _SITE_SPACING_M)) / np.log(_SIZE_RATIO)).clip(-_SIZES + 1, 0)
+        is_large = of_faces > _MOST_SITES_OF_FACE
+        by_size = [np.flatnonzero((sizes == size) & ~is_large) for size in range(0, -_SIZES, -1)]
+        sites = [_Sites.of(frames, counts, faces, float(reach[faces].max())) for faces in by_size if len(faces)]
+        return np.flatnonzero(is_large), sites
 
 
 def triangle_distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -208,6 +240,33 @@ class _BaseFrames:
         y = top[:, :, None] * (np.arange(rows) + 0.5) / rows
         start, along, up = (vectors[faces, None, None] for vectors in (self.start, self.along, self.up))
         return (start + x[:, :, None, None] * along + y[..., None] * up).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class _Sites:
+    """Sites of faces of about the same size.
+
+    Attributes:
+        tree: k-d tree of the sites.
+        faces: int64 [S], the face of each.
+        reach: the largest distance of a point of a face to its nearest site, m.
+    """
+
+    tree: cKDTree
+    faces: np.ndarray
+    reach: float
+
+    @classmethod
+    def of(cls, frames: _BaseFrames, counts: np.ndarray, faces: np.ndarray, reach: float) -> _Sites:
+        """Sites of the given faces [M] by the numbers of columns and rows [F, 2] of all."""
+        sites, owners = [], []
+        for columns, rows in np.unique(counts[faces], axis=0):
+            chosen = faces[(counts[faces] == (columns, rows)).all(axis=1)]
+            sites.append(frames.sites(chosen, columns, rows))
+            owners.append(np.repeat(chosen, columns * rows))
+        # Of millions of sites a balanced tree takes three times as long to build, and no less to query.
+        tree = cKDTree(np.concatenate(sites), compact_nodes=False, balanced_tree=False)
+        return cls(tree, np.concatenate(owners), reach)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

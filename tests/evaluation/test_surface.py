@@ -69,6 +69,24 @@ def test_distance_to_slivers():
     np.testing.assert_allclose(TriangleSurface(vertices, faces).distance(points), expected, atol=EXACT_M)
 
 
+@pytest.mark.parametrize("side_m", [5, 9, 30])
+def test_distance_beside_small_faces_and_on_long_ones(side_m):
+    """Points of a floor of two faces, under a ball whose many faces are all nearer than the floor's sites are."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    middle = np.array([side_m / 2 + 0.013, 0.463 * side_m, 0.051])
+    vertices = np.concatenate((side_m * SQUARE[0], ball.vertices + middle))
+    surface = TriangleSurface(vertices, np.concatenate((SQUARE[1], ball.faces + 4)))
+    points = np.random.default_rng(4).uniform(-0.1, 0.1, (500, 3)) * [1, 1, 0] + middle * [1, 1, 0]
+    assert surface.distance(points).max() < EXACT_M
+
+
+def test_distance_to_large_faces_alone():
+    vertices, faces = SQUARE[0] * 40, SQUARE[1]
+    points = np.random.default_rng(5).uniform(-1, 41, (100, 3))
+    expected = brute_force_distance(points, vertices, faces)
+    np.testing.assert_allclose(TriangleSurface(vertices, faces).distance(points), expected, atol=EXACT_M)
+
+
 def test_samples_are_uniform_on_the_faces():
     vertices, faces = ellipsoid(2)
     points = TriangleSurface(vertices, faces).sample_surface(50000)
@@ -106,11 +124,11 @@ def test_errors():
         TriangleSurface(np.zeros((3, 3)), np.array([[0, 1, 3]]))
 
 
-@pytest.mark.parametrize("size", [0.01, 0.05, 0.5])
+@pytest.mark.parametrize("size", [0.01, 0.05, 0.5, 15])
 def test_every_point_of_a_face_is_within_reach_of_a_site(size):
     generator = np.random.default_rng(3)
-    for flatness in (1.0, 0.1, 0.001):
+    for flatness in (1.0, 0.1, 0.001) if size < 10 else (0.01, 0.001):
         for corners in generator.uniform(size=(20, 3, 3)) * [size, size * flatness, 0]:
             surface = TriangleSurface(corners, np.array([[0, 1, 2]]))
-            tree, _, reach = surface._sites
-            assert tree.query(surface.sample_surface(3000))[0].max() < reach
+            _, (sites,) = surface._sites
+            assert sites.tree.query(surface.sample_surface(3000))[0].max() < sites.reach
