@@ -59,7 +59,7 @@ def color_mesh(
         device: where frames are looked at.
 
     Returns:
-        The mesh, and the number of frames that colors are of; frames that can't be read are left out. Memory beside the
+        The mesh, and the number of frames that colors are of, without those that can't be read. Memory beside the
         meshes: 50 bytes per vertex and 90 per edge, and at most 256 MiB of frames. The same input gives the same bytes.
     """
     parts = keep_colored([parts] if isinstance(parts, PosedFrames) else parts)
@@ -73,7 +73,8 @@ def color_mesh(
         first, second = mesh.colors[edges.ends[chosen]].astype(np.uint16).transpose(1, 0, 2)
         mesh = split_edges(mesh, edges, chosen, ((first + second + 1) // 2).astype(np.uint8))
     views = thinned(parts, colored_every(sum(map(len, parts))))
-    return replace(mesh, colors=_mean_colors(mesh, (views, options.noise, device))), sum(map(len, views))
+    colors, read = _mean_colors(mesh, (views, options.noise, device))
+    return replace(mesh, colors=colors), read
 
 
 def colored_every(count: int) -> int:
@@ -152,15 +153,17 @@ def _has_detail(
 
 def _mean_colors(
     mesh: TriangleMesh, views: tuple[Sequence[PosedFrames], tuple[float, float], torch.device]
-) -> np.ndarray:
-    """uint8 [V, 3]."""
+) -> tuple[np.ndarray, int]:
+    """uint8 [V, 3], and the number of frames that could be read."""
     parts, noise, device = views
+    read = 0
     own = torch.from_numpy(mesh.colors).to(device, torch.float32)
     sums = torch.nn.functional.pad(own, (0, 1), value=1.0) * _OWN_WEIGHT
     for colors, weights in read_seen(_surface(mesh.vertices, mesh.normals, device), parts, noise):
         ops.add_seen_colors_(sums, colors, weights)
         del colors, weights
-    return (sums[:, :3] / sums[:, 3:]).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
+        read += 1
+    return (sums[:, :3] / sums[:, 3:]).round().clamp(0, 255).to(torch.uint8).cpu().numpy(), read
 
 
 def _surface(points: np.ndarray, normals: np.ndarray, device: torch.device) -> ops.SurfacePoints:

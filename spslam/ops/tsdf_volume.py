@@ -46,6 +46,7 @@ class TsdfVolume:
     Attributes:
         blocks: the `VoxelHash` of block coordinates.
         voxel_size, truncation, near_truncation: m.
+        integrated: number of frames added.
 
     Example:
         >>> volume = TsdfVolume(0.05)
@@ -72,6 +73,7 @@ class TsdfVolume:
         near = NEAR_SHARE * self.truncation if near_truncation is None else near_truncation
         check(0 < near <= self.truncation, "TsdfVolume", "near_truncation", "be positive and at most truncation", near)
         self.near_truncation = near
+        self.integrated = 0
         self.blocks = VoxelHash(device=device, max_voxels=max_blocks)
         self._sdf = torch.zeros(0, BLOCK_VOXELS, dtype=torch.float32, device=device)
         self._weights = torch.zeros(0, BLOCK_VOXELS, dtype=torch.float32, device=device)
@@ -191,6 +193,7 @@ class TsdfVolume:
             noise=noise,
             color=color,
         )
+        self.integrated += 1
 
     def make_room(
         self,

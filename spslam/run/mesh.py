@@ -148,7 +148,7 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job), views=views)
     figures = {
         "mesh_source": "tsdf",
-        "mesh_frames": sum(len(part) for part in frames),
+        "mesh_frames": volume.integrated,
         "mesh_mb": volume.nbytes / 2**20,
         "mesh_resolution_m": volume.voxel_size,
     }

@@ -126,6 +126,7 @@ def test_missing_and_unreadable_frames_are_said(folder):
     for said in (remesh(folder), spslam("eval", "out", "--views", cwd=folder).stdout):
         assert "! 1 of 6 frames of the run is not in folder/data any more\n" in said
         assert "! 1 frame of the run can't be read and is left out, the first: " in said and "000003.png" in said
+    assert metrics_of(folder)["mesh_frames"] == metrics_of(folder)["mesh_color_frames"] == 4
 
 
 @pytest.mark.parametrize("source", ["tsdf", "neural"])
