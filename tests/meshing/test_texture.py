@@ -8,10 +8,11 @@ import pytest
 
 from spslam.errors import DatasetError, SpslamError
 from spslam.meshing import TriangleMesh
-from spslam.meshing.texture import TextureOptions, atlas, texture_mesh, texturing
+from spslam.meshing.texture import TextureOptions, atlas, bake, texture_mesh, texturing
+from spslam.meshing.texture.bake import Corrections, ViewWeights
 from spslam.meshing.texture.registration import register
 from spslam.meshing.texture.sharpness import sharpness
-from spslam.meshing.texture.views import ColorView
+from spslam.meshing.texture.views import BestViews, ColorView, read_views
 from tests.meshing.painted import CAMERA, FLOOR, GRAY, NOISE, SIGN, WALL, Painted, frames, mesh_of, pattern
 
 TEXEL_M = 0.008
@@ -143,6 +144,29 @@ def test_a_face_is_on_one_page_however_fine_the_texels_wanted():
     assert 1e-5 < made.texel_m < 2e-5 and made.pages == 1
     assert made.corners_px.min() >= 0 and made.corners_px.max() < atlas.MOST_PAGE_PX
     assert atlas.find_texels(made).places.max() < made.size[0] * made.size[1]
+
+
+def test_large_faces_are_looked_at_in_parts(monkeypatch):
+    """By bands of rows, and texels by some hundred: memory follows neither, and the same face has each texel."""
+    mesh, views = mesh_of(WALL, step_m=2), [frames(WALL)]
+    made = atlas.make_atlas(mesh, 0.02, 1)
+    weights, corrections = (
+        ViewWeights(BestViews(len(mesh.vertices), 2)),
+        Corrections(np.ones((12, 3)), [np.eye(3)] * 12),
+    )
+    monkeypatch.setattr(weights, "of", lambda number: np.linspace(0.5, 1, len(mesh.vertices), dtype=np.float32))
+    results = []
+    for count in (1 << 20, 700):
+        monkeypatch.setattr(atlas, "_FRAGMENTS", count)
+        monkeypatch.setattr(bake, "_CHUNK", count)
+        texels = atlas.find_texels(made)
+        assert np.diff(texels.starts).min() > 3 * 700
+        (sums,) = bake.accumulate(mesh, [texels], read_views(views, NOISE), weights, corrections)
+        results.append((texels.places, texels.faces, texels.weights, sums))
+    assert results[0][3][:, 3].max() > 6
+    assert all(np.array_equal(one, other) for one, other in zip(*results, strict=True))
+    _, _, extent = atlas._bands(made.corners_px[made.charts.faces].astype(np.float64))
+    assert len(extent) > 6 and extent.prod(1).max() <= 700
 
 
 def test_more_charts_than_pages_have_room_for_are_refused(monkeypatch):

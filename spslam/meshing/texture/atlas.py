@@ -129,9 +129,12 @@ def find_texels(atlas: Atlas) -> Texels:
     owners = np.full(atlas.pages * height * width, -1, np.int32)
     corners = atlas.corners_px[atlas.charts.faces].astype(np.float64)
     base = atlas.face_pages() * (height * width)
-    for chunk in _chunks(corners):
-        places, faces = _inside(corners[chunk], base[chunk], width)
-        owners[places] = faces + chunk.start
+    boxes, low, extent = _bands(corners)
+    for chunk in _chunks(extent):
+        faces = boxes[chunk]
+        x, y, rows = _inside(corners[faces], low[chunk], extent[chunk])
+        faces = faces[rows]
+        owners[base[faces] + y * width + x] = faces
     owners = _with_gutter(owners.reshape(atlas.pages, height, width)).reshape(-1)
     places = np.flatnonzero(owners >= 0)
     order = np.argsort(owners[places], kind="stable")
@@ -146,27 +149,40 @@ def find_texels(atlas: Atlas) -> Texels:
     return Texels(places, faces, weights.clip(_LEAST_WEIGHT, _MOST_WEIGHT), starts)
 
 
-def _chunks(corners: np.ndarray) -> list[slice]:
-    """Slices of faces whose boxes have about `_FRAGMENTS` texels."""
-    extent = np.ceil(corners.max(1) - corners.min(1)) + 1
-    bounds = np.searchsorted(np.cumsum(extent.prod(1)), np.arange(_FRAGMENTS, extent.prod(1).sum(), _FRAGMENTS))
-    edges = np.unique(np.concatenate([[0], bounds, [len(corners)]]))
+def _bands(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes of texels that faces are in, or bands of rows of those with more than `_FRAGMENTS`.
+
+    Returns:
+        Faces int64 [B], ascending, and column and row of the first texel and numbers of columns and rows, int64 [B, 2].
+    """
+    low = np.ceil(corners.min(1) - 0.5).astype(np.int64)
+    extent = (np.floor(corners.max(1) - 0.5).astype(np.int64) - low + 1).clip(min=0)
+    height = np.maximum(_FRAGMENTS // extent[:, 0].clip(min=1), 1)
+    counts = -(-extent[:, 1] // height)
+    faces = np.repeat(np.arange(len(corners)), counts)
+    first = (np.arange(len(faces)) - np.repeat(np.cumsum(counts) - counts, counts)) * height[faces]
+    rows = np.minimum(extent[faces, 1] - first, height[faces])
+    return faces, np.stack([low[faces, 0], low[faces, 1] + first], axis=1), np.stack([extent[faces, 0], rows], axis=1)
+
+
+def _chunks(extent: np.ndarray) -> list[slice]:
+    """Slices of boxes [B, 2] that have about `_FRAGMENTS` texels."""
+    ends = np.cumsum(extent.prod(1))
+    bounds = np.searchsorted(ends, np.arange(_FRAGMENTS, ends[-1] if len(ends) else 0, _FRAGMENTS))
+    edges = np.unique(np.concatenate([[0], bounds, [len(extent)]]))
     return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
-def _inside(corners: np.ndarray, base: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flattened places of the texels whose centers lie in faces, and these faces' rows."""
-    low = np.ceil(corners.min(1) - 0.5).astype(np.int64)
-    extent = np.floor(corners.max(1) - 0.5).astype(np.int64) - low + 1
-    counts = extent.clip(min=0).prod(1)
-    rows = np.repeat(np.arange(len(corners)), counts)
-    offset = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    y, x = np.divmod(offset, extent[rows, 0])
-    x, y = x + low[rows, 0], y + low[rows, 1]
-    second, third = _barycentric(corners[rows], x + 0.5, y + 0.5).T
+def _inside(corners: np.ndarray, low: np.ndarray, extent: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows of the texels of boxes whose centers lie in the boxes' faces, and rows of these."""
+    counts = extent.prod(1)
+    boxes = np.repeat(np.arange(len(corners)), counts)
+    offset = np.arange(len(boxes)) - np.repeat(np.cumsum(counts) - counts, counts)
+    y, x = np.divmod(offset, extent[boxes, 0])
+    x, y = x + low[boxes, 0], y + low[boxes, 1]
+    second, third = _barycentric(corners[boxes], x + 0.5, y + 0.5).T
     inside = np.flatnonzero((second >= 0) & (third >= 0) & (second + third <= 1))
-    rows = rows[inside]
-    return base[rows] + y[inside] * width + x[inside], rows
+    return x[inside], y[inside], boxes[inside]
 
 
 def _barycentric(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -127,8 +127,13 @@ def corner_texels(mesh: TriangleMesh) -> Texels:
 
 
 def _texels_of(texels: Texels, faces: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Some faces at a time: the faces, how many texels each has, and the rows of these."""
+    """Some faces at a time, or parts of large ones: the faces, how many texels each has, and the rows of these."""
     counts = texels.starts[faces + 1] - texels.starts[faces]
+    parts = np.maximum(-(-counts // _CHUNK), 1)
+    number = np.arange(int(parts.sum())) - np.repeat(np.cumsum(parts) - parts, parts)
+    starts = np.repeat(texels.starts[faces], parts) + number * _CHUNK
+    counts = np.minimum(np.repeat(counts, parts) - number * _CHUNK, _CHUNK)
+    faces = np.repeat(faces, parts)
     ends = np.cumsum(counts)
     bounds = np.searchsorted(ends, np.arange(_CHUNK, (ends[-1] if len(ends) else 0) + _CHUNK, _CHUNK))
     first = 0
@@ -136,7 +141,7 @@ def _texels_of(texels: Texels, faces: np.ndarray) -> Iterator[tuple[np.ndarray, 
         part = slice(first, int(bound))
         own = counts[part]
         begin = np.cumsum(own) - own
-        rows = np.repeat(texels.starts[faces[part]] - begin, own) + np.arange(int(own.sum()))
+        rows = np.repeat(starts[part] - begin, own) + np.arange(int(own.sum()))
         yield faces[part], own, rows
         first = int(bound)
 
