@@ -169,6 +169,19 @@ def test_large_faces_are_looked_at_in_parts(monkeypatch):
     assert len(extent) > 6 and extent.prod(1).max() <= 700
 
 
+@pytest.mark.parametrize(
+    "corners", [np.eye(3), -np.eye(3), np.eye(3)[::-1], np.diag([1, 1, -1]), np.diag([1, 1, 1.01])]
+)
+def test_a_plane_keeps_its_size_whatever_its_normal(corners):
+    """Also where its coordinates are equal, so that in any other order they are the same normal."""
+    vertices, blank = corners.astype(np.float32), np.zeros((3, 3))
+    mesh = TriangleMesh(vertices, np.array([[0, 1, 2]], np.int32), blank.astype(np.uint8), blank.astype(np.float32))
+    charts = atlas.make_atlas(mesh, 0.01, 1).charts
+    places, own = charts.places_m[charts.faces[0]], vertices[charts.vertices[charts.faces[0]]]
+    sides = [np.linalg.norm(each - np.roll(each, 1, axis=0), axis=1) for each in (places, own)]
+    assert sides[0] == pytest.approx(sides[1], rel=1e-4)
+
+
 def test_more_charts_than_pages_have_room_for_are_refused(monkeypatch):
     monkeypatch.setattr(atlas, "MOST_PAGE_PX", 8)
     with pytest.raises(SpslamError, match="more than 1 pages .* charts; a coarser mesh"):

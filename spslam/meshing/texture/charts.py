@@ -22,6 +22,9 @@ _SMALL_CHART, _LEAST_COSINE, _ROUNDS = 40, 0.2, 4
 _CELL_EDGES, _APART_EDGES, _SLAB_EDGES, _CUTS = 2.0, 7.0, 32.0, 4
 # Normals that count for one of the three axes that most surface is square to, and those that are looked at.
 _ALONG, _SAMPLED = 0.95, 500
+# Where all normals are along the first axis the second is a mixture of its coordinates; what of this is square to the
+# first may be nothing but rounding, as where these are equal.
+_PARALLEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,9 @@ def _main_axes(normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
     level = np.abs(candidates @ first) < np.sqrt(1 - _ALONG**2)
     second = candidates[np.where(level, votes, -1).argmax()] if level.any() else np.roll(first, 1) + np.float32(0.1)
     second = second - first * float(second @ first)
+    if np.linalg.norm(second) < _PARALLEL:
+        second = np.eye(3, dtype=np.float32)[np.abs(first).argmin()]
+        second = second - first * float(second @ first)
     second = second / np.linalg.norm(second)
     return np.stack([first, second, np.cross(first, second)]).astype(np.float32)
 
