@@ -182,6 +182,20 @@ def test_a_plane_keeps_its_size_whatever_its_normal(corners):
     assert sides[0] == pytest.approx(sides[1], rel=1e-4)
 
 
+def test_views_that_are_equally_good_count_equally():
+    best = BestViews(2, 3)
+    for number in range(5):
+        best.add(number, np.array([0]), np.array([4.0], np.float32))
+    weights = ViewWeights(best)
+    # One that no frame saw counts nothing.
+    assert sorted(tuple(weights.of(number)) for number in range(5)) == [(0, 0)] * 3 + [(1, 0)] * 2
+    best = BestViews(1, 3)
+    for number, score in enumerate((4.0, 2.0, 3.0, 1.0)):
+        best.add(number, np.array([0]), np.array([score], np.float32))
+    weights = ViewWeights(best)
+    assert [float(weights.of(number)[0]) for number in range(4)] == [1, 0, 0.5, 0]
+
+
 def test_more_charts_than_pages_have_room_for_are_refused(monkeypatch):
     monkeypatch.setattr(atlas, "MOST_PAGE_PX", 8)
     with pytest.raises(SpslamError, match="more than 1 pages .* charts; a coarser mesh"):

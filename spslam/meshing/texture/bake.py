@@ -36,8 +36,8 @@ class ViewWeights:
     """What each frame counts at each vertex.
 
     Of the K best views of a vertex each counts by how much better it is than the next one that is left out, so none
-    comes or goes at once; the best has 1. Between vertices weights are interpolated, so colors are continuous across
-    faces and charts.
+    comes or goes at once; the best has 1, and so have all where the one left out is as good. Between vertices weights
+    are interpolated, so colors are continuous across faces and charts.
 
     Args:
         best: with one view more than are to be used.
@@ -47,7 +47,9 @@ class ViewWeights:
         order = np.argsort(-best.scores, axis=1, kind="stable")
         scores = np.take_along_axis(best.scores, order, 1)
         numbers = np.take_along_axis(best.numbers, order, 1)[:, :-1]
-        weights = (scores[:, :-1] - scores[:, -1:]) / np.maximum(scores[:, :1] - scores[:, -1:], np.float32(1e-20))
+        spread = scores[:, :1] - scores[:, -1:]
+        weights = (scores[:, :-1] - scores[:, -1:]) / np.maximum(spread, np.float32(1e-20))
+        weights[(spread == 0)[:, 0]] = 1
         weights[numbers < 0] = 0
         by_number = np.argsort(numbers, axis=None, kind="stable")
         self._numbers = numbers.ravel()[by_number]
