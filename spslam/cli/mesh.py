@@ -116,7 +116,9 @@ def _replace_mesh(path: Path, write: Callable[[Path], Any]) -> Any:
     Raises:
         OutputError: the mesh has no surface, or can't be written.
     """
-    if path.suffix != ".ply":  # no other format takes a mesh without faces: writing it is refused
+    from spslam.run.mesh import no_surface
+
+    if path.suffix != ".ply":  # no other format takes a mesh without faces: `write` refuses to write it
         results = write(path)
         _remove_old_textures(path, results[1])
         return results
@@ -125,10 +127,7 @@ def _replace_mesh(path: Path, write: Callable[[Path], Any]) -> Any:
     try:
         results = write(place)
         if not len(results[0].faces):
-            raise OutputError(
-                f"{path}: no surface at a resolution of {results[1]['mesh_resolution_m']:g} m, so no mesh was written; "
-                "choose a smaller --resolution, or a run whose map has surface"
-            )
+            raise OutputError(no_surface(path, results[1]["mesh_resolution_m"]))
         with writing(path):
             os.replace(place, path)
     except OutputError as error:

@@ -106,8 +106,8 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
         The mesh, and what metrics.json says of it.
 
     Raises:
-        OutputError: a mesh is to be fused or textured and no frame of the run is in the dataset, or the file can't be
-            written.
+        OutputError: a mesh is to be fused or textured and no frame of the run is in the dataset, there is no surface
+            and the file is to be another than a PLY, or the file can't be written.
         SpslamError: the surface does not fit into `mesh.max_memory_mb` at any voxel size.
     """
     started = time.perf_counter()
@@ -119,11 +119,26 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
     is_shared = job.scene.device.type == "cuda" and (is_fused or job.texture is not None)
     with shared_out(dataset) if dataset is not None and is_shared else nullcontext(dataset) as readable:
         mesh, figures = _fused(job, readable) if readable is not None and is_fused else _extracted(job)
+        if not len(mesh.faces) and (job.texture is not None or path.suffix != ".ply"):
+            raise OutputError(no_surface(path, figures["mesh_resolution_m"]))
         if job.texture is None or readable is None:
             save_mesh(mesh, path)
         else:
             figures |= _write_textured(path, mesh, job, readable, job.texture.texel_m)
     return mesh, {**figures, "mesh_s": time.perf_counter() - started}
+
+
+def no_surface(path: Path, resolution_m: float) -> str:
+    """Why a mesh is not written that has no faces.
+
+    Args:
+        path: of the mesh.
+        resolution_m: edge of its voxels, m.
+    """
+    return (
+        f"{path}: no surface at a resolution of {resolution_m:g} m, so no mesh was written; choose a smaller "
+        "--resolution, or a run whose map has surface"
+    )
 
 
 def _extracted(job: MeshJob) -> tuple[TriangleMesh, dict[str, Any]]:
@@ -171,8 +186,6 @@ def _write_textured(
     """Bakes the texture of a mesh, writes both, and says how large it is."""
     from spslam.meshing.texture import TextureOptions, texture_mesh
 
-    if not len(mesh.faces):
-        raise OutputError(f"{path}: a mesh without faces can't have a texture")
     options = TextureOptions(job.noise or DEFAULT_NOISE, texel_m)
     textured = texture_mesh(mesh, frames_of(job, dataset), options)
     textured.save(path)

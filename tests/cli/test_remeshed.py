@@ -146,15 +146,16 @@ def test_a_resolution_has_the_range_of_the_option(folder):
     assert_refused(refused, "--resolution: must be a length of at most 1 m, got '100'")
 
 
-def test_a_mesh_without_surface_replaces_none(folder, monkeypatch):
+@pytest.mark.parametrize("wish", [["--format=ply"], ["--format=glb"], ["--format=obj"], ["--format=glb", "--texture"]])
+def test_a_mesh_without_surface_replaces_none(folder, monkeypatch, wish):
     from spslam.meshing import TriangleMesh
     from spslam.run import mesh
 
     empty = TriangleMesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.int32, np.uint8, np.float32)))
     monkeypatch.setattr(mesh, "extract_mesh", lambda *_: empty)
     before = contents(folder / "out")
-    refused = spslam("mesh", "out", "--source", "neural", "--resolution", "1", cwd=folder)
-    assert_refused(refused, "out/mesh.ply: no surface at a resolution of 1 m, so no mesh was written")
+    refused = spslam("mesh", "out", "--source", "neural", "--resolution", "1", *wish, cwd=folder)
+    assert_refused(refused, f"out/mesh.{wish[0][-3:]}: no surface at a resolution of 1 m, so no mesh was written")
     assert contents(folder / "out") == before
 
 
