@@ -11,7 +11,7 @@ from spslam.meshing import TriangleMesh
 from spslam.meshing.texture import TextureOptions, atlas, bake, texture_mesh, texturing
 from spslam.meshing.texture.bake import Corrections, ViewWeights
 from spslam.meshing.texture.registration import register
-from spslam.meshing.texture.sharpness import sharpness
+from spslam.meshing.texture.sharpness import _slope, sharpness
 from spslam.meshing.texture.views import BestViews, ColorView, read_views
 from tests.meshing.painted import CAMERA, FLOOR, GRAY, NOISE, SIGN, WALL, Painted, frames, mesh_of, pattern
 
@@ -257,6 +257,12 @@ def test_nothing_to_register_by_leaves_images_where_they_are():
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)[v, u].astype(np.float32)
     middle = np.array([79.5, 59.5, 1])
     assert np.abs(register(view, places, gray, start) @ middle - middle).max() < 0.2
+
+
+def test_slopes_do_not_depend_on_where_images_are_in_memory():
+    gray = np.random.default_rng(0).normal(size=(120, 160)).astype(np.float32)
+    held = [(np.empty(100 * count + 1, np.uint8), _slope(gray)) for count in range(100)]
+    assert len({slope.tobytes() for _, slope in held}) == 1
 
 
 def test_sharpness_tells_blur_and_not_contrast():
