@@ -66,9 +66,8 @@ def _correlated_noise(shape: tuple[int, ...], scale: float, generator: np.random
 
 
 def _lost(depth: np.ndarray, focal_px: float, share: float, generator: np.random.Generator) -> np.ndarray:
-    gradient = cv2.magnitude(
-        cv2.Sobel(depth, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(depth, cv2.CV_32F, 0, 1, scale=1 / 8)
-    )
+    x, y = (cv2.Sobel(depth, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    gradient = np.sqrt(x**2 + y**2)  # bits of cv2.magnitude depend on where in memory these are
     steep = gradient * np.float32(focal_px) > np.float32(_GRAZING_TANGENT) * depth
     chance = np.where(steep, np.float32(_EDGE_LOSS * share), np.float32(_RANDOM_LOSS * share))
     out_of_range = (depth < _RANGE_M[0]) | (depth > _RANGE_M[1])

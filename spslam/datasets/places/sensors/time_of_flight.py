@@ -55,7 +55,7 @@ def measure_time_of_flight(
         for wave in (np.cos, np.sin)
     ]
     measured = np.mod(np.arctan2(mixed[1], mixed[0]), 2 * np.pi) * np.float32(_AMBIGUITY_M / (2 * np.pi))
-    received = cv2.magnitude(*mixed)
+    received = np.sqrt(mixed[0] ** 2 + mixed[1] ** 2)  # bits of cv2.magnitude depend on where in memory these are
     deviation = np.minimum(DEVIATION_M / np.maximum(received, 1e-4), _LARGEST_DEVIATION_M)
     measured += np.float32(level * WIGGLE_M) * np.sin(np.float32(2 * np.pi / WIGGLE_PERIOD_M) * measured)
     measured += np.float32(level) * deviation * generator.standard_normal(depth.shape, dtype=np.float32)
