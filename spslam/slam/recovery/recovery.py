@@ -345,7 +345,7 @@ class Recovery:
         found = self._likeliest(frame, candidates, anywhere=True)
         is_new = not any(found.pose is candidate.pose for candidate in candidates[:known])
         # Stored frames may confirm, where the last one shows too little, that the camera is where it was predicted.
-        is_followed = not history.is_lost and not found.lost and is_consistent(found.fit, history)
+        is_followed = not history.is_lost and not found.lost and is_consistent(found.fit)
         if not is_followed:
             found = self._accept_anywhere(found, history.consistent_frames)
         return replace(found, relocalized=is_new and not found.lost)
