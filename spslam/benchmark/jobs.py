@@ -69,8 +69,11 @@ class Job:
         The hash is over resolved options and the content of the prior's weights, so a changed preset or a retrained
         prior gives another key, as does another vocabulary of ORB-SLAM3. Where the data is stored does not count.
         """
+        config = self.load_config()
         content = {
-            "settings": fingerprint(self.load_config()),
+            "settings": fingerprint(config),
+            # What decides nothing of a trajectory decides on the mesh, on times and on memory.
+            "outputs": {name: getattr(config, name).model_dump(mode="json") for name in ("mesh", "run", "scene")},
             "options": self.method_options,
             "weights": _weights_hash(self),
             "sequence": self.sequence,

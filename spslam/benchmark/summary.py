@@ -24,6 +24,7 @@ class Summary:
         skipped: sequences without data, and why.
         failed: one line per failed run.
         environments: what the runs were measured on, each once.
+        finished: number of finished runs of each cell.
     """
 
     suite: Suite
@@ -31,6 +32,7 @@ class Summary:
     skipped: dict[str, str]
     failed: tuple[str, ...]
     environments: tuple[dict[str, Any], ...]
+    finished: dict[Cell, int]
 
     def value(self, study: Study, sequence: str, variant: str, figure: str) -> Statistic | None:
         """One statistic; None where it was not measured."""
@@ -40,11 +42,17 @@ class Summary:
         """Names of the study's sequences that have a result."""
         return [s.name for s in study.sequences if any(cell[:2] == (study.name, s.name) for cell in self.cells)]
 
-    def average(self, study: Study, variant: str, figure: str) -> float | None:
-        """Mean of a variant's figure over the sequences that have it."""
+    def average(self, study: Study, variant: str, figure: str) -> tuple[float, int] | None:
+        """Mean of a variant's figure over the sequences that have it, and how many they are; None where none has."""
         found = [self.value(study, name, variant, figure) for name in self.sequences(study)]
         means = [statistic.mean for statistic in found if statistic is not None]
-        return sum(means) / len(means) if means else None
+        return (sum(means) / len(means), len(means)) if means else None
+
+    def without(self, study: Study, sequence: str, variant: str, figure: str) -> int:
+        """How many finished runs lack a figure that others of the cell have, as where all frames are lost."""
+        statistic = self.value(study, sequence, variant, figure)
+        finished = self.finished.get((study.name, sequence, variant), 0)
+        return 0 if statistic is None else finished - statistic.runs
 
     def to_dict(self) -> dict[str, Any]:
         """The content of summary.json."""
@@ -69,14 +77,14 @@ class Summary:
 
 def summarize(suite: Suite, plan: Plan, outcomes: dict[str, Outcome]) -> Summary:
     """Statistics over the seeds of every cell of a plan."""
-    cells = {}
+    cells, finished = {}, {}
     for cell, keys in plan.cells.items():
         records = [outcomes[key].record for key in keys if key in outcomes]
         figures = [record["figures"] for record in records if record is not None]
         if figures:
-            cells[cell] = _statistics(figures)
+            cells[cell], finished[cell] = _statistics(figures), len(figures)
     failed = tuple(f"{key}: {outcome.error}" for key, outcome in outcomes.items() if outcome.record is None)
-    return Summary(suite, cells, plan.skipped, failed, tuple(_environments(outcomes)))
+    return Summary(suite, cells, plan.skipped, failed, tuple(_environments(outcomes)), finished)
 
 
 def _statistics(figures: list[dict[str, float]]) -> dict[str, Statistic]:

@@ -11,6 +11,7 @@ from spslam.benchmark.suites import Study
 from spslam.benchmark.summary import Summary
 
 NOTHING = ""
+_OF_EVERY_RUN = ("ate_rmse_cm",)  # but of those that lose all frames; other figures need more, as a true mesh
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def _ate_table(summary: Summary, study: Study, paper: PublishedTable | None) -> 
         (variant.name, *(_cell(summary, study, name, variant.name, "ate_rmse_cm") for name in names))
         for variant in study.variants
     ]
-    averages = [_number(summary.average(study, variant.name, "ate_rmse_cm"), 2) for variant in study.variants]
+    averages = [_average(summary, study, variant.name, "ate_rmse_cm", 2) for variant in study.variants]
     lines = [(*row, average) for row, average in zip(rows, averages, strict=True) if any(row[1:])]
     note = _frames_note(summary, study)
     if paper is not None and names:
@@ -61,10 +62,9 @@ def _averages_table(summary: Summary, study: Study, paper: PublishedTable | None
         return Table("averages", "", "", (), ())
     lines = [(method, *(_printed(value) for value in values)) for method, values in paper.rows.items()]
     for variant in study.variants:
-        means = [summary.average(study, variant.name, name) for name in paper.columns]
-        if any(mean is not None for mean in means):
-            digits = (figure(name).digits for name in paper.columns)
-            lines.append((variant.name, *(_number(mean, places) for mean, places in zip(means, digits, strict=True))))
+        means = [_average(summary, study, variant.name, name, figure(name).digits) for name in paper.columns]
+        if any(means):
+            lines.append((variant.name, *means))
     note = f"First the paper's {paper.table} (RTX 3090 Ti), over all its scenes; then ours, over those that were run."
     header = ("method", *(figure(name).label for name in paper.columns))
     return Table("averages", "Reconstruction and speed, averages", note, header, tuple(lines))
@@ -130,11 +130,21 @@ def _known_columns(summary: Summary, study: Study) -> list[str]:
 
 def _cell(summary: Summary, study: Study, sequence: str, variant: str, name: str) -> str:
     statistic = summary.value(study, sequence, variant, name)
-    return NOTHING if statistic is None else statistic.text(figure(name).digits)
+    if statistic is None:
+        return NOTHING
+    lacking = summary.without(study, sequence, variant, name) if name in _OF_EVERY_RUN else 0
+    some = f" ({statistic.runs} of {statistic.runs + lacking})" if lacking else ""
+    return f"{statistic.text(figure(name).digits)}{some}"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return NOTHING if value is None else f"{value:.{digits}f}"
+def _average(summary: Summary, study: Study, variant: str, name: str, digits: int) -> str:
+    """A mean over sequences, and of how many it is where others have results and these have not the figure."""
+    found, count = summary.average(study, variant, name), len(summary.sequences(study))
+    if found is None:
+        return NOTHING
+    mean, sequences = found
+    some = f" ({sequences} of {count})" if name in _OF_EVERY_RUN and sequences < count else ""
+    return f"{mean:.{digits}f}{some}"
 
 
 def _printed(value: Number) -> str:

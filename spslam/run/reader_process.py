@@ -118,13 +118,16 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         """Waits until the process can read.
 
         Raises:
-            ReaderUnavailableError: the dataset's class can't be imported by the process, which has then ended.
+            ReaderUnavailableError: the dataset's class can't be imported by the process, which has then ended, or it
+                ended before it could read.
             RuntimeError: it can't begin for another reason, with the traceback.
         """
         try:
             ready = self._connection.recv()
         except DISCONNECTED:
-            ready = False
+            code = self._exit_code()
+            self.close()
+            raise _unavailable(f"the process ended {describe_exit(code)} before it could read") from None
         if isinstance(ready, tuple):
             self.close()
             _check_failure(Message(*ready))
@@ -152,16 +155,21 @@ class ReaderProcess(Iterator[PreparedFrame | DatasetError]):
         try:
             return self._receive()
         except DISCONNECTED:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_EXIT_TIMEOUT_S)
+            code = self._exit_code()
             self.close()
-            raise SpslamError(_describe_exit(self._process.returncode)) from None
+            raise SpslamError(_describe_exit(code)) from None
         except StopIteration:  # closing takes as long as some ten frames: the run waits for it after the last one
             self._has_ended = True
             raise
         except BaseException:
             self.close()
             raise
+
+    def _exit_code(self) -> int | None:
+        """That of the process, which has ended its connection; None where it goes on without."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_EXIT_TIMEOUT_S)
+        return self._process.returncode
 
     def close(self) -> None:
         """Kills the process, which has nothing to save. May be called again."""

@@ -46,6 +46,19 @@ def test_tables_include_the_papers_figures(replica):
     assert len(runs.rows) == 8
 
 
+def test_a_mean_of_fewer_sequences_or_seeds_says_so():
+    def lost_in_office4(sequence, variant, seed):
+        known = figures(sequence, variant, seed)
+        is_lost = (variant == "ORB-SLAM3" and sequence == "office4") or (variant == "spslam paper" and seed == 1)
+        return known if not is_lost else {name: value for name, value in known.items() if name != "ate_rmse_cm"}
+
+    suite = load_suite("replica", sequences=["room0", "office4"], seeds=2)
+    rows = {row[0]: row[1:] for row in make_tables(made_up_summary(suite, lost_in_office4, seeds=2))[0].rows}
+    assert rows["ORB-SLAM3"][0] and rows["ORB-SLAM3"][1] == "" and rows["ORB-SLAM3"][2].endswith(" (1 of 2)")
+    assert rows["spslam paper"] == ("1.00 (1 of 2)", "1.00 (1 of 2)", "1.00")
+    assert rows["spslam balanced"][2] == "1.50"
+
+
 def test_ablation_tables_have_a_column_for_each_sequence_and_figure():
     summary = made_up_summary(ablation(), lambda *_: {"ate_rmse_cm": 0.5})
     (table,) = make_tables(summary)

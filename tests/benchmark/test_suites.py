@@ -187,8 +187,11 @@ def test_key_depends_on_all_that_affects_the_figures():
         tiny_job(mesh="truth.ply"),
         tiny_job(thorough=True),
         tiny_job(options=()),
+        tiny_job(options=(*job.options, ("mesh.resolution_m", 0.05))),
+        tiny_job(options=(*job.options, ("run.reader", "threads"))),
+        tiny_job(options=(*job.options, ("scene.max_voxels", 100000))),
     ]
-    assert len({job.key(), *(other.key() for other in others)}) == 8
+    assert len({job.key(), *(other.key() for other in others)}) == 11
     assert len({tiny_job(config="tum", options=(), data=data).key() for data in ("/here", "/elsewhere")}) == 1
     assert job.key().startswith("room-fast-seed0-")
 

@@ -94,7 +94,20 @@ def not_started(monkeypatch):
     return Recorded(FRAMES)
 
 
+def killed_at_its_start(monkeypatch):
+    take = READERS.take
+
+    def take_and_kill():
+        reader = take()
+        reader.process.kill()
+        return reader
+
+    monkeypatch.setattr(READERS, "take", take_and_kill)
+    return Recorded(FRAMES)
+
+
 UNAVAILABLE = {
+    killed_at_its_start: "the process ended by SIGKILL before it could read",
     not_pickled: "recorded can't be pickled (",
     not_imported: "spslam_nowhere.Stranger can't be imported by another process",
     not_started: "the process can't be started ([Errno 11] Resource temporarily unavailable)",
