@@ -14,6 +14,7 @@ MARGIN_M = 1.0  # planes grow by this much more than needed, so that they grow r
 INITIAL_STD = 0.01
 AXES = ((0, 1), (0, 2), (1, 2))  # axes of the xy, xz and yz planes
 _BLOCK = 32  # edge, in texels, of the square blocks that are initialized with one Philox key
+Rectangle = tuple[int, int, int, int]  # origin u, origin v, size u, size v; of texels
 _FIRST_KEY = 2**31  # the keys of blocks are near this one, apart from the keys of other initial values
 
 
@@ -115,7 +116,7 @@ class TriPlanes:
         self.texels = texels.to(self.texels.device, torch.float32).clone()
         self.layout = [int(value) for value in layout]
 
-    def _check_limit(self, planes: list[tuple[int, int, int, int]]) -> None:
+    def _check_limit(self, planes: list[Rectangle]) -> None:
         wanted = sum(size_u * size_v for _, _, size_u, size_v in planes)
         if self.max_texels is not None and wanted > self.max_texels:
             raise SpslamError(
@@ -123,12 +124,11 @@ class TriPlanes:
                 "it, choose a larger scene.plane_cell_m, or leave out far points by a smaller dataset.max_depth_m"
             )
 
-    def _rectangle(self, plane: int) -> tuple[int, int, int, int]:
-        """(origin u, origin v, size u, size v)."""
+    def _rectangle(self, plane: int) -> Rectangle:
         _, u, v, size_u, size_v = self.layout[5 * plane : 5 * plane + 5]
         return u, v, size_u, size_v
 
-    def _extended(self, plane: int, low: list[int], high: list[int], margin: int) -> tuple[int, int, int, int]:
+    def _extended(self, plane: int, low: list[int], high: list[int], margin: int) -> Rectangle:
         """The rectangle of a plane extended to contain low..high; each side that must grow gets a margin."""
         origins, sizes = [], []
         for slot, axis in enumerate(AXES[plane]):
@@ -144,11 +144,11 @@ class TriPlanes:
             sizes.append(end - begin)
         return origins[0], origins[1], sizes[0], sizes[1]
 
-    def _regrow(self, planes: list[tuple[int, int, int, int]]) -> torch.Tensor:
+    def _regrow(self, planes: list[Rectangle]) -> torch.Tensor:
         texels, layout, moved, first = [], [], [], 0
         for plane, (u, v, size_u, size_v) in enumerate(planes):
             old_first, old_u, old_v, old_size_u, old_size_v = self.layout[5 * plane : 5 * plane + 5]
-            grown = self._initial(plane, u, v, size_u, size_v)
+            grown = self._initial(plane, (u, v, size_u, size_v), (old_u, old_v, old_size_u, old_size_v))
             rows = torch.arange(size_u * size_v, device=self.texels.device).view(size_u, size_v)
             inside = (slice(old_u - u, old_u - u + old_size_u), slice(old_v - v, old_v - v + old_size_v))
             old = self.texels[old_first : old_first + old_size_u * old_size_v]
@@ -161,19 +161,34 @@ class TriPlanes:
         self.texels, self.layout = torch.cat(texels), layout
         return torch.cat(moved) if moved else torch.zeros(0, dtype=torch.int64, device=self.texels.device)
 
-    def _initial(self, plane: int, u: int, v: int, size_u: int, size_v: int) -> torch.Tensor:
-        """Initial texels [size_u, size_v, 32], N(0, 0.01): a crop of blocks at fixed world positions."""
-        first_u, first_v = u // _BLOCK, v // _BLOCK
-        last_u, last_v = (u + size_u - 1) // _BLOCK, (v + size_v - 1) // _BLOCK
-        blocks = [(bu, bv) for bu in range(first_u, last_u + 1) for bv in range(first_v, last_v + 1)]
-        uniform = torch.stack([self._uniform_block(plane, *block) for block in blocks])
+    def _initial(self, plane: int, rectangle: Rectangle, known: Rectangle) -> torch.Tensor:
+        """Initial texels [size_u, size_v, 32], N(0, 0.01), of blocks at fixed world positions.
+
+        Args:
+            plane: its number.
+            rectangle: of the texels.
+            known: of those that are known already; what lies in blocks wholly inside is left undefined.
+        """
+        u, v, size_u, size_v = rectangle
+        device = self.texels.device
+        texels = torch.empty(size_u, size_v, FEATURES, device=device)
+        blocks = [
+            (block_u, block_v)
+            for block_u in range(u // _BLOCK, (u + size_u - 1) // _BLOCK + 1)
+            for block_v in range(v // _BLOCK, (v + size_v - 1) // _BLOCK + 1)
+            if not _is_inside((block_u * _BLOCK, block_v * _BLOCK, _BLOCK, _BLOCK), known)
+        ]
+        uniform = (self._uniform_block(plane, *block) for block in blocks)
         # A CPU takes blocks one by one: the last bits of its logarithms depend on how many there are at a time.
-        texels = _normal(uniform) if uniform.is_cuda else torch.stack([_normal(block) for block in uniform])
-        rows, columns = last_u + 1 - first_u, last_v + 1 - first_v
-        grid = texels.view(rows, columns, _BLOCK, _BLOCK, FEATURES).transpose(1, 2)
-        begin_u, begin_v = u - first_u * _BLOCK, v - first_v * _BLOCK
-        whole = grid.reshape(rows * _BLOCK, columns * _BLOCK, FEATURES)
-        return whole[begin_u : begin_u + size_u, begin_v : begin_v + size_v].contiguous()
+        is_together = device.type == "cuda" and len(blocks) > 0
+        normal = iter(_normal(torch.stack(list(uniform)))) if is_together else map(_normal, uniform)
+        for (block_u, block_v), block in zip(blocks, normal, strict=True):
+            first_u, first_v = block_u * _BLOCK - u, block_v * _BLOCK - v
+            begin_u, begin_v = max(first_u, 0), max(first_v, 0)
+            part = texels[begin_u : first_u + _BLOCK, begin_v : first_v + _BLOCK]
+            rows, columns = begin_u - first_u, begin_v - first_v
+            part.copy_(block[rows : rows + part.shape[0], columns : columns + part.shape[1]])
+        return texels
 
     def _uniform_block(self, plane: int, block_u: int, block_v: int) -> torch.Tensor:
         """Numbers [_BLOCK, _BLOCK, 2, 32] in [0, 1) that the texels of the block with these coordinates are made of."""
@@ -182,6 +197,13 @@ class TriPlanes:
         stream = ops.RandomStream.INITIALIZATION
         uniform = ops.philox_uniform(self.seed, stream, frame, iteration, count, self.texels.device)
         return uniform.view(_BLOCK, _BLOCK, 2, FEATURES)
+
+
+def _is_inside(one: Rectangle, other: Rectangle) -> bool:
+    return all(
+        begin >= first and begin + size <= first + whole
+        for begin, size, first, whole in zip(one[:2], one[2:], other[:2], other[2:], strict=True)
+    )
 
 
 def _normal(uniform: torch.Tensor) -> torch.Tensor:

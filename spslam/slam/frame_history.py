@@ -16,6 +16,7 @@ from spslam.slam.state import SlamState
 
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
 RECENT_COMPARED = 16
+LEAST_MOTION_S = 1e-9  # ops count in whole nanoseconds; nearer stamps are of one moment
 MAX_MOTION_S = 0.12  # between two frames; over a longer time the camera hardly moves evenly
 # At least between the two that say where a color image was taken. What a pose is off by moves the color image that the
 # next one is found by: with color half of that time before depth it would be off as much to the other side, and with
@@ -77,10 +78,14 @@ class FrameHistory:
         return max(self.coming_s - float(self._state.frames.timestamps[-1]), 0.0)
 
     def seconds_since(self, row: int) -> float:
-        """From the frame in a row to the next one, if that comes as long after the last as that after the one before.
+        """From the frame in a row to the one that is localized, s.
 
-        Infinite where that is not known: with one frame only, or where time does not go on.
+        Where nobody says when that comes, it comes as long after the last one as that after the one before. Infinite
+        where that is not known: with one frame only, or where time does not go on.
         """
+        known = self.coming_s - float(self._state.frames.timestamps[row])
+        if known > 0:
+            return known
         times = self._state.frames.timestamps
         interval = float(times[-1] - times[-2]) if len(times) > 1 else 0.0
         since = float(times[-1] - times[row])
@@ -170,7 +175,11 @@ class FrameHistory:
         while 0 < seconds < least_s and before > frames.opened and not frames.is_lost(before - 1):
             before -= 1
             seconds = depth_time - frames.depth_time(before)
-        return ops.FrameMotion(before, seconds, color_offset) if 0 < seconds < MAX_MOTION_S else ops.NO_MOTION
+        return (
+            ops.FrameMotion(before, seconds, color_offset)
+            if LEAST_MOTION_S <= seconds < MAX_MOTION_S
+            else ops.NO_MOTION
+        )
 
     def color_motion(self, motion: ops.FrameMotion) -> ColorMotion | None:
         """How a frame's color image moved on from its depth image; None where the two are of one moment, or nothing
@@ -178,8 +187,16 @@ class FrameHistory:
         delay, before = read_together(self._state.noise.color_delay, self.poses[max(motion.row, 0)])
         return _color_motion(motion, float(delay[0]), before)
 
-    def color_poses(self, rows: Sequence[int]) -> list[np.ndarray]:
-        """float64 [4, 4] where the camera took the color images of the frames in rows. Waits for the device, once."""
+    def color_poses(self, rows: Sequence[int], is_timed: bool = True) -> list[np.ndarray]:
+        """float64 [4, 4] where the camera took the color images of the frames in rows. Waits for the device, once.
+
+        Args:
+            rows: of the frames.
+            is_timed: whether color images are taken to be of other moments than depth images.
+        """
+        if not is_timed:
+            at_depth = read_together(*(self.poses[row] for row in rows))
+            return [pose7_to_matrix(pose.astype(np.float64)) for pose in at_depth]
         motions = [self.own_motion(row) for row in rows]
         poses, before = [self.poses[row] for row in rows], [self.poses[max(motion.row, 0)] for motion in motions]
         delay, *numbers = read_together(self._state.noise.color_delay, *poses, *before)

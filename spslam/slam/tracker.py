@@ -75,7 +75,8 @@ class PoseEstimate:
         measured: how well it fits, without what is only worked out of a pose that is decided on, see `fit`.
         equations: of surface alone at that pose; None where there are none.
         numbers: of the pose, read with its fit; None where they were not.
-        gain: float32 [2] of the frame at that pose, as `FrameTable.gains`; on the device.
+        gain: float32 [2] of the frame at that pose, as `FrameTable.gains`; on the device. None without earlier images
+            whose exposure is known.
     """
 
     pose: torch.Tensor
@@ -213,7 +214,9 @@ class Tracker:
         outcome = FrameOutcome(int(numbers[0]))
         iterations = tracking.iterations + (AGAIN_ITERATIONS if outcome == FrameOutcome.BENT else 0)
         last = numbers[-parts.last_size :]
-        estimate = self._estimate(parts.pose, parts.gain, last, numbers[1:8], iterations)
+        keyframes = constraints.depth_keyframes
+        gain = None if keyframes is None or keyframes.exposure is None else parts.gain
+        estimate = self._estimate(parts.pose, gain, last, numbers[1:8], iterations)
         motion = ops.ShutterMotion(frame.poses[1], parts.predicted, frame.seconds, parts.readout)
         problem = TrackingProblem(scene, outputs[0], parts.predicted, number, constraints)
         return FollowedFrame(problem, motion, outcome, estimate, parts.first_pose, outputs[1:])
@@ -252,7 +255,7 @@ class Tracker:
         self, problem: TrackingProblem, pose: torch.Tensor, meanwhile: Callable[[], None] | None = None
     ) -> PoseEstimate:
         """How well a given pose float32 [7] fits; `meanwhile` as of `track`."""
-        estimate = self._gauss_newton(problem, pose, 1, self.config.tracking.kernel_end_m, meanwhile)
+        estimate = self._gauss_newton(problem, pose, 1, self.config.tracking.kernel_end_m, meanwhile, stays=True)
         return replace(estimate, pose=pose, iterations=0, numbers=None)
 
     def _gauss_newton(
@@ -262,7 +265,10 @@ class Tracker:
         iterations: int,
         kernel_start_m: float,
         meanwhile: Callable[[], None] | None = None,
+        stays: bool = False,
     ) -> PoseEstimate:
+        """Optimizes the pose from an initial one; with `stays` it is that pose whose prediction error is told."""
+        keyframes = problem.constraints.depth_keyframes_of(iterations)
         found = ops.trusted.track_gauss_newton(
             problem.scene.view(),
             problem.records,
@@ -271,7 +277,7 @@ class Tracker:
             self._options(problem.scene, problem.frame, iterations, kernel_start_m),
             problem.constraints.noise,
             problem.constraints.reference,
-            problem.constraints.depth_keyframes_of(iterations),
+            keyframes,
         )
         if meanwhile is not None:
             meanwhile()
@@ -280,7 +286,13 @@ class Tracker:
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
         size = found.numel()
         predicted = numbers[:7] if is_predicted else numbers[size:]
-        return self._estimate(found[7:14], found[-2:], numbers[7:size], predicted, iterations)
+        gain = None if keyframes is None or keyframes.exposure is None else found[-2:]
+        estimate = self._estimate(found[7:14], gain, numbers[7:size], predicted, iterations)
+        if not stays:
+            return estimate
+        error_cm, error_deg = prediction_error(predicted, numbers[:7])
+        fit = estimate.measured.having(prediction_error_cm=error_cm, prediction_error_deg=error_deg)
+        return replace(estimate, measured=fit)
 
     def _options(self, scene: Scene, number: int, iterations: int, kernel_start_m: float) -> ops.GaussNewtonOptions:
         tracking = self.config.tracking
@@ -302,7 +314,7 @@ class Tracker:
     def _estimate(
         self,
         found: torch.Tensor,
-        gain: torch.Tensor,
+        gain: torch.Tensor | None,
         numbers: list[float],
         predicted: list[float],
         iterations: int,
@@ -311,7 +323,7 @@ class Tracker:
 
         Args:
             found: the pose float32 [7].
-            gain: of the frame, the last two numbers.
+            gain: of the frame, the last two numbers; None where nothing says it.
             numbers: pose, H and the statistics of each iteration, read: 43 + 7 iterations.
             predicted: pose.
             iterations: that were made.

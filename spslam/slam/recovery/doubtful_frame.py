@@ -66,7 +66,10 @@ class DoubtfulFrame:
         known = {row: features for row in rows if (features := self.history.features(row)) is not None}
         if not known:
             return {}
-        poses = self.history.color_poses(list(known))
+        keyframes = self.problem.constraints.depth_keyframes
+        # As `Recovery` has it of the frame's own: without timing both are where depth is.
+        is_timed = keyframes is not None and keyframes.timing is not None
+        poses = self.history.color_poses(list(known), is_timed)
         return dict(zip(known, self.image.matches_with(list(zip(known.values(), poses, strict=True))), strict=True))
 
     def with_speed(self, row: int, matches: Sequence[FeatureMatches]) -> "DoubtfulFrame":

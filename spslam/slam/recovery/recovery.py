@@ -141,7 +141,7 @@ class Recovery:
             return tracked
         frame = DoubtfulFrame(problem, pixels, history, IcpAlignment(pixels, self._camera), image)
         held, has_matches = self._hold(frame.compared(row, self._anchors(history, row)), tracked)
-        if held is not None:
+        if held is not None and not held.lost:
             return held
         if not has_matches:
             return replace(tracked, features=image.read)
