@@ -2,7 +2,8 @@
 
 `rgb.mp4` (1920x1440), `depth/NNNNNN.png` (256x192, 16-bit millimeters; `.npy` by early versions),
 `confidence/NNNNNN.png` (0, 1 or 2), `camera_matrix.csv` (3x3, of the video) and `odometry.csv` (a header, then
-`timestamp, frame, x, y, z, qx, qy, qz, qw`; camera to world, OpenCV axes). Depth is registered to the video.
+`timestamp, frame, x, y, z, qx, qy, qz, qw`, in newer versions more, some of them empty; camera to world, OpenCV axes).
+Depth is registered to the video.
 """
 
 from __future__ import annotations

@@ -71,31 +71,39 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     """The columns of a file whose first line names them.
 
     Args:
-        path: words separated by commas or spaces; the names in any case.
+        path: lines of words separated by commas or, where a line has none, by spaces; the names in any case.
 
     Returns:
-        float64 [N] per name.
+        float64 [N] per name, NaN where nothing stands between two commas.
 
     Raises:
         DatasetError: no such file, no row, a row of another length, or something else than numbers in it.
     """
-    rows = read_rows(path, columns=1)
-    names = [name.lower() for name in next(rows, [])]
+    names: list[str] = []
     numbers = array("d")
-    for row in rows:
+    for line in read_lines(path, DatasetError):
+        words = _fields(line)
+        if not any(words) or words[0].startswith("#"):
+            continue
+        if not names:
+            names = [word.lower() for word in words]
+            continue
         try:
-            values = [float(word) for word in row]
+            values = [float(word) if word else float("nan") for word in words]
         except ValueError as error:
             raise DatasetError(f"{path}: must contain numbers below its first line: {brief(str(error))}") from None
         if len(values) != len(names):
-            raise DatasetError(
-                f"{path}: rows must have {len(names)} columns as the first, got {brief(' '.join(row))!r}"
-            )
+            raise DatasetError(f"{path}: rows must have {len(names)} columns as the first, got {brief(line)!r}")
         numbers.extend(values)
     if not names or not numbers:
         raise DatasetError(f"{path}: must have a line of names and rows of numbers, got none")
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(names))
     return {name: table[:, column] for column, name in enumerate(names)}
+
+
+def _fields(line: str) -> list[str]:
+    """The words of a table's line, empty ones among them: Stray Scanner leaves columns without a value empty."""
+    return [word.strip() for word in line.split(",")] if "," in line else line.split()
 
 
 def read_pose(path: Path) -> np.ndarray:
