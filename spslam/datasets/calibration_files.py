@@ -42,7 +42,10 @@ _REMARKS = (
     *("stream_length_usec", "description"),
 )
 _KNOWN = (*_LENS_KEYS, "width", "height", "depth_scale", "color", "depth", "depth_to_color", *_REMARKS)
-# Names of models in files of ROS, librealsense, COLMAP and Open3D; `_` stands for any of space, dot and hyphen.
+# Names of models in files of ROS, librealsense, COLMAP and Open3D; `_` stands for any of space, dot and hyphen. With
+# all of librealsense's Brown models the polynomial leads from the ideal point to the distorted one, with that called
+# inverse too: rs2_project_point_to_pixel applies it and rs2_deproject_pixel_to_point, since 2021, iterates. What
+# librealsense's modified order of terms changes is 0.02 px.
 _MODEL_NAMES: dict[str, LensModel] = {
     "": "pinhole",
     "none": "pinhole",
@@ -56,8 +59,7 @@ _MODEL_NAMES: dict[str, LensModel] = {
     "radtan": "brown",
     "opencv": "brown",
     "full_opencv": "brown",
-    "inverse_brown": "inverse_brown",
-    "inverse_brown_conrady": "inverse_brown",
+    "inverse_brown_conrady": "brown",
     "fisheye": "fisheye",
     "equidistant": "fisheye",
     "kannala_brandt": "fisheye",

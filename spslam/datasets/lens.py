@@ -15,20 +15,18 @@ import numpy as np
 
 from spslam.camera import Camera
 
-LensModel = Literal["pinhole", "brown", "fisheye", "inverse_brown"]
+LensModel = Literal["pinhole", "brown", "fisheye"]
 LENS_MODELS: tuple[str, ...] = get_args(LensModel)
 # How many coefficients a model may have: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6[, s1..s4[, tau_x, tau_y]]]] for
-# Brown's, RealSense's five for its inverse, and k1, k2, k3, k4 of Kannala-Brandt for a fisheye.
+# Brown's, and k1, k2, k3, k4 of Kannala-Brandt for a fisheye.
 COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
     "pinhole": (0, 4, 5, 8, 12, 14),
     "brown": (4, 5, 8, 12, 14),
     "fisheye": (4,),
-    "inverse_brown": (5,),
 }
 # Neighbors whose depth differs by a larger share belong to two surfaces. On a plane that is seen under 87 degrees depth
 # changes by 3 % from pixel to pixel.
 ONE_SURFACE_SHARE = 0.03
-_ITERATIONS = 50
 _NOWHERE_PX = 32000.0
 _PAIR = np.ones((2, 2), dtype=np.uint8)
 
@@ -40,8 +38,7 @@ class Lens:
     Attributes:
         camera: size, focal lengths and principal point.
         model: `pinhole` has no distortion. `brown` is Brown-Conrady's model as OpenCV has it (ROS: plumb_bob and
-            rational_polynomial), `fisheye` is Kannala-Brandt's with four coefficients (ROS: equidistant). With
-            `inverse_brown`, of RealSense cameras, Brown's polynomial leads from the distorted point to the ideal one.
+            rational_polynomial), `fisheye` is Kannala-Brandt's with four coefficients (ROS: equidistant).
         coefficients: as OpenCV orders them.
 
     Raises:
@@ -76,13 +73,6 @@ class Lens:
         coefficients = np.asarray(self.coefficients, dtype=np.float64)
         if self.model == "fisheye":
             return cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
-        if self.model == "inverse_brown":
-            # Brown's polynomial leads from the distorted point to the ideal one, so finding the former inverts it.
-            points = camera.ray_directions()[..., :2].reshape(-1, 1, 2).astype(np.float64)
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, 1e-9)
-            found = cv2.undistortPoints(points, np.eye(3), coefficients, criteria=criteria)
-            found = found.reshape(camera.height, camera.width, 2) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-            return found[..., 0].astype(np.float32), found[..., 1].astype(np.float32)
         return cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, size, cv2.CV_32FC1)
 
 

@@ -15,7 +15,7 @@ from spslam.geometry import pose_from
 
 BROWN = (0.12, -0.24, 0.003, -0.002, 0.06)
 FISHEYE = (-0.03, 0.012, -0.008, 0.002)
-INVERSE_BROWN = (-0.055, 0.066, -0.0004, 0.0006, -0.021)
+REALSENSE = (-0.055, 0.066, -0.0004, 0.0006, -0.021)
 ROOM = Room(0)
 
 
@@ -48,14 +48,6 @@ def lens_rays(lens: Lens) -> np.ndarray:
     elif lens.model == "fisheye":
         points = normal.reshape(-1, 1, 2)
         normal = cv2.fisheye.undistortPoints(points, np.eye(3), np.array(lens.coefficients)).reshape(-1, 2)
-    elif lens.model == "inverse_brown":  # librealsense's deprojection
-        k1, k2, p1, p2, k3 = lens.coefficients
-        x, y = normal.T
-        r2 = x * x + y * y
-        f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        normal = np.stack(
-            (x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * f + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)), axis=1
-        )
     rays = np.ones((camera.height, camera.width, 3), dtype=np.float32)
     rays[..., :2] = normal.reshape(camera.height, camera.width, 2)
     return rays

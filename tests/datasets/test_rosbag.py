@@ -11,7 +11,7 @@ from spslam.datasets.lens import Lens
 from spslam.datasets.prefetch import prefetch
 from spslam.datasets.rosbag import RosOptions, open_realsense, open_rosbag
 from spslam.errors import DatasetError
-from tests.datasets.cameras import BROWN, INVERSE_BROWN, camera, extrinsics, path, render
+from tests.datasets.cameras import BROWN, REALSENSE, camera, extrinsics, path, render
 from tests.datasets.ros_bags import (
     START_S,
     Frames,
@@ -125,7 +125,7 @@ def test_transforms_connect_the_cameras_and_are_the_reference(tmp_path, kind):
 @pytest.mark.parametrize("unit_m", [0.001, 0.00025])
 def test_realsense_bag(tmp_path, unit_m):
     frames = two_cameras(distorted=False)
-    color_lens = Lens(frames.color_lens.camera, "inverse_brown", INVERSE_BROWN)
+    color_lens = Lens(frames.color_lens.camera, "brown", REALSENSE)
     frames.color_lens, frames.color = color_lens, [render(color_lens, pose)[0] for pose in frames.poses]
     make = Messages(False)
     dataset = open_realsense(write_ros1(tmp_path / "d435.bag", realsense_messages(make, frames, unit_m), make))
