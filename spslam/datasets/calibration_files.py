@@ -40,6 +40,8 @@ _LENS_KEYS = (*("fx", "fy", "cx", "cy", "ppx", "ppy", "intrinsic_matrix"), *_COE
 _REMARKS = (
     *("name", "device", "device_name", "serial", "serial_number", "fps", "color_format", "depth_format", "comment"),
     *("stream_length_usec", "description"),
+    # Of Open3D's reader for Azure Kinects.
+    *("color_mode", "depth_mode", "enable_imu", "serial_number_"),
 )
 _KNOWN = (*_LENS_KEYS, "width", "height", "depth_scale", "color", "depth", "depth_to_color", *_REMARKS)
 # Names of models in files of ROS, librealsense, COLMAP and Open3D; `_` stands for any of space, dot and hyphen. With

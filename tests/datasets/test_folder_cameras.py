@@ -99,8 +99,12 @@ def test_open3ds_intrinsics(tmp_path):
     folder = write_folder(tmp_path)
     (folder / "intrinsics.txt").unlink()
     values = {"width": 32, "height": 24, "intrinsic_matrix": [30, 0, 0, 0, 31, 0, 15.5, 11.5, 1], "fps": 30}
-    for name in ("camera_intrinsic.json", "intrinsic.json"):
-        (folder / name).write_text(json.dumps(values | {"device_name": "RealSense D435", "serial_number": "8"}))
+    kinect = {"color_mode": "MJPG_720P", "depth_mode": "NFOV_UNBINNED", "serial_number_": "8", "enable_imu": False}
+    for name, remarks in (
+        ("camera_intrinsic.json", {"device_name": "RealSense D435", "serial_number": "8"}),
+        ("intrinsic.json", kinect | {"stream_length_usec": 1000}),
+    ):
+        (folder / name).write_text(json.dumps(values | remarks))
         assert open_folder(folder).camera == Camera(32, 24, 30, 31, 15.5, 11.5)
         (folder / name).unlink()
 
