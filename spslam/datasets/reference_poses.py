@@ -5,7 +5,7 @@ A pose that is damaged, or a file that covers no frame, is said as a doubt: the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,18 +77,18 @@ def table_poses(numbers: Sequence[int], path: Path, counts: tuple[int, ...] = ()
     return ReferencePoses.of(poses, [faults[number] for number in rows.tolist() if number in faults], str(path))
 
 
-def file_poses(numbers: Sequence[int], pose_path: Callable[[int], Path]) -> ReferencePoses:
+def file_poses(numbers: Sequence[int], files: Mapping[int, Path]) -> ReferencePoses:
     """Poses of a file each; unknown where it is missing, says so or is malformed.
 
     Args:
         numbers: of the frames.
-        pose_path: the file of a number.
+        files: of poses, by number.
     """
     poses = np.full((len(numbers), 4, 4), np.nan)
     lines, first = [], None
     for row, number in enumerate(numbers):
-        path = pose_path(number)
-        if not path.is_file():
+        path = files.get(number)
+        if path is None:
             continue
         first = first or path
         try:

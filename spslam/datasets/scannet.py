@@ -23,7 +23,7 @@ from spslam.datasets.text import camera_from_matrix, checked_poses, motion_fault
 from spslam.errors import DatasetError
 
 FRAMES_PER_SECOND = 30.0
-_COLOR_NAME, _DEPTH_NAME = r"(\d+)\.(?:jpg|jpeg|png)", r"(\d+)\.png"
+_COLOR_NAME, _DEPTH_NAME, _POSE_NAME = r"(\d+)\.(?:jpg|jpeg|png)", r"(\d+)\.png", r"(\d+)\.txt"
 _INTRINSICS = "intrinsic_depth.txt", "intrinsic_color.txt"
 
 
@@ -155,7 +155,7 @@ def _open_exported(folder: Path, name: str) -> FileDataset:
     size = first_size(depths.values(), lambda path: read_depth(path, 1000.0))
     camera = _find_camera(folder, size, list(colors.values()))
     paired = pair_numbered(colors, depths, FRAMES_PER_SECOND)
-    reference = file_poses(list(paired), lambda number: folder / "pose" / f"{number}.txt")
+    reference = file_poses(list(paired), find_numbered(folder / "pose", _POSE_NAME))
     frames, doubts = list(paired.values()), reference.doubts
     return FileDataset(name, camera, frames, reference.poses, units_per_meter=1000.0, resize_color=True, doubts=doubts)
 

@@ -42,6 +42,7 @@ _COLOR_FROM_DEPTH = np.array(
 _MOST_DIGITS = 9  # of a sequence's number
 _COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
 _DEPTH_NAME = r"frame-(\d+)\.depth\.png"
+_POSE_NAME = r"frame-(\d+)\.pose\.txt"
 
 
 def open_seven_scenes(folder: Path, sequence: str | int | None = None, registered: bool | None = None) -> FileDataset:
@@ -71,7 +72,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None, registere
         )
     camera = _find_camera(sequence_folder, list(colors.values()))
     frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
-    reference = file_poses(list(frames), lambda number: sequence_folder / f"frame-{number:06d}.pose.txt")
+    reference = file_poses(list(frames), find_numbered(sequence_folder, _POSE_NAME))
     registration = None if _is_registered(camera, registered) else _registration(camera)
     return FileDataset(
         f"7scenes/{sequence_folder.parent.name}/{sequence_folder.name}",

@@ -90,6 +90,16 @@ def test_broken_frames_name_their_file_and_leave_the_others(tmp_path):
     assert open_scannet(scan).poses() is None
 
 
+def test_numbers_may_have_any_count_of_digits(tmp_path):
+    scan = write_scannet(tmp_path, count=12)
+    for folder in ("color", "depth", "pose"):
+        for path in list((scan / folder).iterdir()):
+            path.rename(path.with_stem(f"{int(path.stem):06d}"))
+    dataset = open_scannet(scan)
+    np.testing.assert_allclose(dataset.poses(), poses(12), atol=1e-9)
+    assert not dataset.doubts
+
+
 def test_a_scan_without_images(tmp_path):
     scan = write_scannet(tmp_path, count=1)
     (scan / "depth" / "0.png").unlink()

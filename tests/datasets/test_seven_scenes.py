@@ -111,6 +111,13 @@ def test_numbers_may_have_gaps(tmp_path):
     np.testing.assert_allclose(dataset[1].pose, poses(4)[2], atol=1e-9)
 
 
+def test_numbers_may_have_any_count_of_digits(tmp_path):
+    scene = write_seven_scenes(tmp_path, count=4)
+    for path in list((scene / "seq-01").iterdir()):
+        path.rename(path.with_name(path.name.replace("frame-0000", "frame-")))
+    np.testing.assert_allclose(open_seven_scenes(scene).poses(), poses(4), atol=1e-9)
+
+
 def test_broken_frames_name_their_file_and_leave_the_others(tmp_path):
     scene = write_seven_scenes(tmp_path, count=8)
     sequence = scene / "seq-01"
