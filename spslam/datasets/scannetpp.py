@@ -3,6 +3,7 @@
 As downloaded `iphone/` has `rgb.mkv` (or mp4, 1920x1440), `depth.bin` (256x192, per frame the number of bytes and
 16-bit millimeters packed by LZ4, or floats by zlib) and `pose_intrinsic_imu.json`, per frame `timestamp`, `intrinsic`
 (3x3, of the video), `pose` and, after alignment to the laser scan, `aligned_pose` (4x4 camera to world, OpenCV axes).
+The two are of different worlds: where any frame has `aligned_pose`, those without have no known pose.
 The authors' toolkit unpacks `rgb/frame_NNNNNN.jpg` and `depth/frame_NNNNNN.png`, which are read in place of the former.
 """
 
@@ -100,15 +101,18 @@ def open_scannetpp(path: Path, view: View = "depth") -> Recording:
 
 
 def _read_frames(path: Path) -> dict[int, tuple[np.ndarray, np.ndarray, float]]:
-    """Intrinsics, pose and time by frame."""
+    """Intrinsics, pose and time by frame; the pose is NaN where only others are aligned."""
     values = parse_json(read_text(path, _MAX_POSES_BYTES, DatasetError), str(path), DatasetError)
+    is_aligned = any(isinstance(entry, dict) and entry.get("aligned_pose") is not None for entry in values.values())
+    key = "aligned_pose" if is_aligned else "pose"
     frames = {}
     for name, entry in values.items():
         match = _FRAME.fullmatch(name)
         if match is None or not isinstance(entry, dict):
             raise DatasetError(f"{path}: must have an object per frame (frame_000000), got {brief(name)}")
         source = f"{path}, {name}"
-        pose = _matrix(entry, "aligned_pose" if entry.get("aligned_pose") is not None else "pose", 4, source)
+        is_unknown = is_aligned and entry.get(key) is None
+        pose = np.full((4, 4), np.nan) if is_unknown else _matrix(entry, key, 4, source)
         time = entry.get("timestamp")
         seconds = float(time) if isinstance(time, (int, float)) else float("nan")
         frames[int(match.group(1))] = _matrix(entry, "intrinsic", 3, source), pose, seconds
