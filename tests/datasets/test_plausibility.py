@@ -69,7 +69,6 @@ REFUSED = {
     "depth x 1.1": ("scale", "depth 0.909 times as large would fit"),
     "depth x 5": ("scale", "depth 0.2 times as large would fit"),
     "depth x 1000": ("scale", "the depth scale looks wrong"),
-    "depth of 8 bits": ("depth", "8 bits"),
     "depth of one value": ("depth", "all depth is the same"),
     "depth mirrored": ("pairing", "mirrored left to right"),
     "disparity as depth": ("pairing", "inverse depth"),
@@ -99,6 +98,7 @@ def test_what_is_wrong_is_named_and_certain(apartment, name):
 
 
 WARNED = {
+    "depth of 8 bits": ("depth", "stored in 8 bits or in coarse units"),
     "poses world-to-camera": ("poses", "world-to-camera"),
     "time stamps all zero": ("times", "do not ascend"),
 }

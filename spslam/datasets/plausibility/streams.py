@@ -23,7 +23,7 @@ _ONE_VALUE_SPAN = 1e-3
 _JUMP, _MANY_JUMPS = 0.25, 0.4
 # What is wrong with the way depth is stored shows in all views; a lens that is covered for a while does not.
 _NEARLY_ALL = 0.9
-# Eight bits hold 256 values; a depth image has thousands.
+# Eight bits hold 256 values; a depth image has thousands, where its units are fine.
 _EIGHT_BITS, _LEAST_SPAN_M, _LEAST_PIXELS = 260, 1.0, 10_000
 _COARSE_STEP_M, _EVEN = 0.01, 1.3
 _VIEWS_FOR_VALUES = 3
@@ -121,7 +121,8 @@ def _value_findings(views: Sequence[View], span_m: float) -> list[Finding]:
         return []
     step_cm = 100 * float(np.median(np.diff(values)))
     text = f"depth has only {len(values)} different values, {step_cm:.1f} cm apart: it looks stored in 8 bits"
-    return [Finding("depth", text, _CONVERT, certain=True)]
+    # A doubt: 16 bits in units of centimeters, as of a recording that reaches far, have the same values indoors.
+    return [Finding("depth", f"{text} or in coarse units", _CONVERT)]
 
 
 def _has_even_steps(values: np.ndarray) -> bool:
