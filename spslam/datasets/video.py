@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +54,7 @@ class VideoStream(ImageStream):
         seconds: times of the frames, float64 [N]; those of the video if None.
 
     Raises:
-        DatasetError: PyAV is not installed, or there is no such track, or it can't be read.
+        DatasetError: PyAV is not installed, or there is no such track, or it can't be read, or it has B-frames in AVI.
     """
 
     def __init__(
@@ -118,6 +119,13 @@ def _cached_index(path: Path, track: int, state: tuple) -> VideoIndex:
         stream = container.streams.video[track]
         size = stream.codec_context.width, stream.codec_context.height
         check_image_size(size, str(path))
+        # AVI has no presentation times, and those that FFmpeg guesses of B-frames give a number another frame's image.
+        # They are no better in a copy of the stream in another container.
+        if container.format.name == "avi" and stream.codec_context.has_b_frames:
+            raise DatasetError(
+                f"{path}: an AVI file with B-frames lacks the times of its frames; write another file in its place: "
+                f"ffmpeg -i {shlex.quote(path.name)} -c:v ffv1 {shlex.quote(path.stem + '.mkv')}"
+            )
         stamps = sorted(_stamps(container, stream, path))
         if not stamps:
             raise DatasetError(f"{path}: must contain frames, got none")

@@ -34,15 +34,15 @@ def write_opencv(path, count=COUNT, fourcc="mp4v", size=(WIDTH, HEIGHT), draw=pi
     return path
 
 
-def write_h264(path, seconds):
+def write_h264(path, seconds, b_frames=3, rate=1000):
     """With B-frames and uneven times."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=1000, options={"bf": "3", "g": "20", "crf": "5"})
+        stream = container.add_stream("libx264", rate=rate, options={"bf": str(b_frames), "g": "20", "crf": "5"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        stream.codec_context.time_base = Fraction(1, 1000)
+        stream.codec_context.time_base = Fraction(1, rate)
         for number, time in enumerate(seconds):
             frame = av.VideoFrame.from_ndarray(picture(number), format="rgb24")
-            frame.pts = round(1000 * time)
+            frame.pts = round(rate * time)
             for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode():
@@ -72,6 +72,30 @@ def test_frames_that_are_stored_out_of_order_and_at_uneven_times(tmp_path):
     np.testing.assert_allclose(stream.times() - stream.times()[0], seconds - seconds[0], atol=1.1e-3)
     np.testing.assert_allclose(reds(stream, range(COUNT)), range(COUNT), atol=0.5)
     np.testing.assert_allclose(reds(stream, [28, 27, 2]), [28, 27, 2], atol=0.5)
+
+
+def rewritten(path, source):
+    """Decoded as FFmpeg's command does it, frames in order, and encoded without losses."""
+    with av.open(str(source)) as found, av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for number, frame in enumerate(found.decode(video=0)):
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def test_b_frames_need_a_container_with_times(tmp_path):
+    seconds = [number / 30 for number in range(COUNT)]
+    path = write_h264(tmp_path / "a.avi", seconds, rate=30)
+    with pytest.raises(DatasetError, match="B-frames lacks .* place: ffmpeg -i a.avi -c:v ffv1 a.mkv") as error:
+        VideoStream(path)
+    assert "\n" not in str(error.value)
+    plain = VideoStream(write_h264(tmp_path / "b.avi", seconds, 0, 30))
+    np.testing.assert_allclose(reds(plain, range(COUNT)), range(COUNT), atol=0.5)
+    mended = VideoStream(rewritten(tmp_path / "a.mkv", path))
+    np.testing.assert_allclose(reds(mended, range(COUNT)), range(COUNT), atol=0.5)
 
 
 def test_from_threads(tmp_path):
