@@ -65,6 +65,16 @@ def test_the_next_frame_is_expected_at_the_same_interval(dataset, pixels):
     assert history.seconds_since(0) == np.inf
 
 
+def test_stamps_of_one_moment_are_no_motion(dataset, pixels):
+    """As 0.3 and 0.1 * 3 are, whose difference is less than the nanoseconds that ops count in."""
+    state = state_of(dataset, pixels)
+    history, last = FrameHistory(state), len(state.frames) - 1
+    last_s = float(state.frames.timestamps[-1])
+    state.frames.timestamps[:last] -= 1.0  # no earlier frame is near enough
+    assert history.motion(last + 1, last_s + 5e-17 + 1e-16).row < 0
+    assert history.motion(last + 1, last_s + 0.01).row == last
+
+
 def test_difference_of_depth_images(device):
     depth_thumbnail = torch.tensor([[1.0, 2.0, 0.0, 0.0]], dtype=torch.float16, device=device)
     others = torch.tensor(

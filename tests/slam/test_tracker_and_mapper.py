@@ -88,6 +88,18 @@ def test_a_frame_near_the_map_is_found(dataset, preset):
     assert np.linalg.norm(result.pose[4:].numpy() - dataset.poses()[1][:3, 3]) < 0.01
 
 
+def test_a_pose_that_is_measured_has_its_own_prediction_error_and_without_earlier_images_no_gain(dataset):
+    system = processed(dataset, 1)
+    pixels = sample_frame(dataset[1], dataset.camera, system.config)
+    predicted = pose_tensor(dataset.poses()[1], CPU)
+    problem = TrackingProblem(system.state.scene, pixels.records, predicted, 1)
+    away = predicted.clone()
+    away[4] += 0.03
+    measured = system.tracker.measure(problem, away)
+    assert measured.pose is away and measured.gain is None
+    assert (measured.fit.prediction_error_cm, measured.fit.prediction_error_deg) == pytest.approx((3.0, 0.0), abs=1e-3)
+
+
 @pytest.mark.parametrize(("shift_m", "goes_on"), [(0.0, False), (0.15, True)])
 def test_tracking_goes_on_where_the_prediction_was_far_off(dataset, monkeypatch, shift_m, goes_on):
     system = processed(dataset, 1)
