@@ -154,10 +154,10 @@ def _check_archive(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
     _check_rigid("frames.poses", tensors["frames.poses"])
     depth = tensors["records"][..., 1].contiguous().view(torch.float32)
     check_values("records (depth)", depth, TensorRule(torch.float32, (), low=0))
-    if sizes.get("followers", 0):
-        frame, keyframe = tensors["followers"].amax(0).tolist()
+    if sizes.get("anchors", 0):
+        frame, keyframe = tensors["anchors"].amax(0).tolist()
         if frame >= sizes["frames"] or keyframe >= sizes["keyframes"]:
-            raise SpslamError(f"tensor followers must name frames and keyframes below {sizes['keyframes']}")
+            raise SpslamError(f"tensor anchors must name frames and keyframes below {sizes['keyframes']}")
     total = int(tensors["recordings"].sum())
     if total != sizes["frames"]:
         raise SpslamError(f"tensor recordings must sum to {sizes['frames']}, got {total}")
@@ -331,7 +331,7 @@ KEYFRAMES = TensorSchema(
         "frames.poses": TensorRule(torch.float64, ("frames", 4, 4)),
         "frames.timestamps": TensorRule(torch.float64, ("frames",)),
         "frames.lost": TensorRule(torch.bool, ("frames",)),
-        "followers": TensorRule(torch.int64, ("followers", 2), low=0, optional=True),
+        "anchors": TensorRule(torch.int64, ("anchors", 2), low=0, optional=True),
     },
     (_check_archive,),
 )

@@ -72,7 +72,7 @@ class Job:
         config = self.load_config()
         content = {
             "settings": fingerprint(config),
-            # What decides nothing of a trajectory decides on the mesh, on times and on memory.
+            # Left out of the fingerprint, as trajectories do not depend on them; meshes, times and memory do.
             "outputs": {name: getattr(config, name).model_dump(mode="json") for name in ("mesh", "run", "scene")},
             "options": self.method_options,
             "weights": _weights_hash(self),

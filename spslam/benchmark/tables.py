@@ -11,7 +11,7 @@ from spslam.benchmark.suites import Study
 from spslam.benchmark.summary import Summary
 
 NOTHING = ""
-_OF_EVERY_RUN = ("ate_rmse_cm",)  # but of those that lose all frames; other figures need more, as a true mesh
+_OF_EVERY_RUN = ("ate_rmse_cm",)  # unless all its frames are lost; other figures need more, such as a ground-truth mesh
 
 
 @dataclass(frozen=True)

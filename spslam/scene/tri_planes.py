@@ -14,7 +14,7 @@ MARGIN_M = 1.0  # planes grow by this much more than needed, so that they grow r
 INITIAL_STD = 0.01
 AXES = ((0, 1), (0, 2), (1, 2))  # axes of the xy, xz and yz planes
 _BLOCK = 32  # edge, in texels, of the square blocks that are initialized with one Philox key
-Rectangle = tuple[int, int, int, int]  # origin u, origin v, size u, size v; of texels
+_Rectangle = tuple[int, int, int, int]  # origin u, origin v, size u, size v; of texels
 _FIRST_KEY = 2**31  # the keys of blocks are near this one, apart from the keys of other initial values
 
 
@@ -116,7 +116,7 @@ class TriPlanes:
         self.texels = texels.to(self.texels.device, torch.float32).clone()
         self.layout = [int(value) for value in layout]
 
-    def _check_limit(self, planes: list[Rectangle]) -> None:
+    def _check_limit(self, planes: list[_Rectangle]) -> None:
         wanted = sum(size_u * size_v for _, _, size_u, size_v in planes)
         if self.max_texels is not None and wanted > self.max_texels:
             raise SpslamError(
@@ -124,11 +124,11 @@ class TriPlanes:
                 "it, choose a larger scene.plane_cell_m, or leave out far points by a smaller dataset.max_depth_m"
             )
 
-    def _rectangle(self, plane: int) -> Rectangle:
+    def _rectangle(self, plane: int) -> _Rectangle:
         _, u, v, size_u, size_v = self.layout[5 * plane : 5 * plane + 5]
         return u, v, size_u, size_v
 
-    def _extended(self, plane: int, low: list[int], high: list[int], margin: int) -> Rectangle:
+    def _extended(self, plane: int, low: list[int], high: list[int], margin: int) -> _Rectangle:
         """The rectangle of a plane extended to contain low..high; each side that must grow gets a margin."""
         origins, sizes = [], []
         for slot, axis in enumerate(AXES[plane]):
@@ -144,7 +144,7 @@ class TriPlanes:
             sizes.append(end - begin)
         return origins[0], origins[1], sizes[0], sizes[1]
 
-    def _regrow(self, planes: list[Rectangle]) -> torch.Tensor:
+    def _regrow(self, planes: list[_Rectangle]) -> torch.Tensor:
         texels, layout, moved, first = [], [], [], 0
         for plane, (u, v, size_u, size_v) in enumerate(planes):
             old_first, old_u, old_v, old_size_u, old_size_v = self.layout[5 * plane : 5 * plane + 5]
@@ -161,7 +161,7 @@ class TriPlanes:
         self.texels, self.layout = torch.cat(texels), layout
         return torch.cat(moved) if moved else torch.zeros(0, dtype=torch.int64, device=self.texels.device)
 
-    def _initial(self, plane: int, rectangle: Rectangle, known: Rectangle) -> torch.Tensor:
+    def _initial(self, plane: int, rectangle: _Rectangle, known: _Rectangle) -> torch.Tensor:
         """Initial texels [size_u, size_v, 32], N(0, 0.01), of blocks at fixed world positions.
 
         Args:
@@ -199,7 +199,7 @@ class TriPlanes:
         return uniform.view(_BLOCK, _BLOCK, 2, FEATURES)
 
 
-def _is_inside(one: Rectangle, other: Rectangle) -> bool:
+def _is_inside(one: _Rectangle, other: _Rectangle) -> bool:
     return all(
         begin >= first and begin + size <= first + whole
         for begin, size, first, whole in zip(one[:2], one[2:], other[:2], other[2:], strict=True)

@@ -40,6 +40,16 @@ class Constraints:
         """The noise, read; waits for the device. All 0 where none is known."""
         return [0.0] * 4 if self.noise is None else self.noise.tolist()
 
+    @property
+    def timing(self) -> ops.ColorTiming | None:
+        """How color images lie beside depth images in time; None where the two are taken to be of one moment."""
+        return None if self.depth_keyframes is None else self.depth_keyframes.timing
+
+    @property
+    def tells_gain(self) -> bool:
+        """Whether there are earlier images by which the gain of the frame's brightness is found."""
+        return self.depth_keyframes is not None and self.depth_keyframes.exposure is not None
+
     def depth_keyframes_of(self, iterations: int) -> ops.DepthKeyframes | None:
         """The depth keyframes for a call of so many iterations."""
         if self.depth_keyframes is None or self.keyframes_from_start:

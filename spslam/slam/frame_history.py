@@ -83,11 +83,9 @@ class FrameHistory:
         Where nobody says when that comes, it comes as long after the last one as that after the one before. Infinite
         where that is not known: with one frame only, or where time does not go on.
         """
-        known = self.coming_s - float(self._state.frames.timestamps[row])
-        if known > 0:
-            return known
-        times = self._state.frames.timestamps
-        interval = float(times[-1] - times[-2]) if len(times) > 1 else 0.0
+        times, interval = self._state.frames.timestamps, self.interval_s
+        if interval == 0 and len(times) > 1:
+            interval = float(times[-1] - times[-2])
         since = float(times[-1] - times[row])
         return since + interval if interval > 0 and since >= 0 else math.inf
 

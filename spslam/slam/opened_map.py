@@ -144,13 +144,13 @@ def archive_of(state: SlamState, recording: Recording | None, settings: Mapping[
         recordings.append(recording)
     keyframes = [each.changed(frame=int(row)) for row, each in zip(rows, store.keyframes, strict=True)]
     noise = {**store.noises, store.camera: state.noise.model.cpu()} if recording is not None else store.opened_noise
-    content, followers = store.content, _followers(store, first)
+    content, anchors = store.content, _anchors(store, first)
     return KeyframeArchive(
-        recordings, keyframes, store.links, records, content.edges, content.tried, noise, settings, followers
+        recordings, keyframes, store.links, records, content.edges, content.tried, noise, settings, anchors
     )
 
 
-def _followers(store: KeyframeStore, first: int) -> np.ndarray:
+def _anchors(store: KeyframeStore, first: int) -> np.ndarray:
     """int64 [N, 2] as `KeyframeArchive` has them: of the opened map, whose frames come first, and of the run.
 
     Args:
@@ -162,7 +162,7 @@ def _followers(store: KeyframeStore, first: int) -> np.ndarray:
         return np.array(own, np.int64).reshape(-1, 2)
     # Of the opened map's keyframes, those that are kept, by their numbers now, and those that are not.
     references = {int(row): number for number, row in enumerate(store.rows) if row < first} | dict(own)
-    before = [(frame, references[keyframe]) for frame, keyframe in store.opened.followers.tolist()]
+    before = [(frame, references[keyframe]) for frame, keyframe in store.opened.anchors.tolist()]
     rows, shift = store.opened.rows, int(store.opened.ends[-1]) - first
     now = [(rows[frame] if frame < first else frame + shift, reference) for frame, reference in own]
     return np.array(sorted([*before, *now]), np.int64).reshape(-1, 2)

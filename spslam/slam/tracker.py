@@ -214,8 +214,7 @@ class Tracker:
         outcome = FrameOutcome(int(numbers[0]))
         iterations = tracking.iterations + (AGAIN_ITERATIONS if outcome == FrameOutcome.BENT else 0)
         last = numbers[-parts.last_size :]
-        keyframes = constraints.depth_keyframes
-        gain = None if keyframes is None or keyframes.exposure is None else parts.gain
+        gain = parts.gain if constraints.tells_gain else None
         estimate = self._estimate(parts.pose, gain, last, numbers[1:8], iterations)
         motion = ops.ShutterMotion(frame.poses[1], parts.predicted, frame.seconds, parts.readout)
         problem = TrackingProblem(scene, outputs[0], parts.predicted, number, constraints)
@@ -268,7 +267,6 @@ class Tracker:
         stays: bool = False,
     ) -> PoseEstimate:
         """Optimizes the pose from an initial one; with `stays` it is that pose whose prediction error is told."""
-        keyframes = problem.constraints.depth_keyframes_of(iterations)
         found = ops.trusted.track_gauss_newton(
             problem.scene.view(),
             problem.records,
@@ -277,7 +275,7 @@ class Tracker:
             self._options(problem.scene, problem.frame, iterations, kernel_start_m),
             problem.constraints.noise,
             problem.constraints.reference,
-            keyframes,
+            problem.constraints.depth_keyframes_of(iterations),
         )
         if meanwhile is not None:
             meanwhile()
@@ -286,7 +284,7 @@ class Tracker:
         numbers = (found if is_predicted else torch.cat([found, problem.predicted])).tolist()
         size = found.numel()
         predicted = numbers[:7] if is_predicted else numbers[size:]
-        gain = None if keyframes is None or keyframes.exposure is None else found[-2:]
+        gain = found[-2:] if problem.constraints.tells_gain else None
         estimate = self._estimate(found[7:14], gain, numbers[7:size], predicted, iterations)
         if not stays:
             return estimate

@@ -177,3 +177,19 @@ def test_a_camera_that_has_jumped_may_be_anywhere(recovery, monkeypatch, changes
     problem = SimpleNamespace(constraints=SimpleNamespace(reference=None))
     recovery._recover(problem, found, None, history, None)
     assert bool(asked) == asks
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_where_features_move_a_pose_to_where_it_is_lost_it_is_recovered(recovery, monkeypatch, lost):
+    tracked = replace(with_features(0.01, 200), equations=object())
+    held, recovered = replace(tracked, lost=lost), replace(tracked, recovered=True)
+    monkeypatch.setattr("spslam.slam.recovery.recovery.IcpAlignment", lambda *_: None)
+    monkeypatch.setattr(
+        "spslam.slam.recovery.recovery.DoubtfulFrame", lambda *_: SimpleNamespace(compared=lambda *_: None)
+    )
+    monkeypatch.setattr(recovery, "_image", lambda *_: SimpleNamespace(read=None))
+    monkeypatch.setattr(recovery, "_anchors", lambda *_: [])
+    monkeypatch.setattr(recovery, "_hold", lambda *_: (held, True))
+    monkeypatch.setattr(recovery, "_recover", lambda *_: recovered)
+    found = recovery._held(None, tracked, None, SimpleNamespace(last_row=lambda: 0), None)
+    assert found is (recovered if lost else held)

@@ -10,7 +10,7 @@ from spslam.datasets.base import RgbdFrame
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
 from spslam.slam.frame_history import FrameHistory
 from spslam.slam.pixels import sample_frame
-from spslam.slam.poses import pose_tensor
+from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery.free_space import surface_counts, surface_shares
 from spslam.slam.recovery.place_recognition import (
     MIN_SEPARATION,
@@ -63,6 +63,16 @@ def test_the_next_frame_is_expected_at_the_same_interval(dataset, pixels):
     state.frames.timestamps[-1] = 1.0
     state.frames.timestamps[0] = 2.0  # of an opened map
     assert history.seconds_since(0) == np.inf
+
+
+def test_without_timing_color_images_are_where_depth_images_are(dataset, pixels):
+    state = state_of(dataset, pixels)
+    state.noise.color_delay.fill_(0.01)
+    history, rows = FrameHistory(state), [1, FRAMES - 1]
+    at_depth = [pose_matrix(state.frames.poses[row]) for row in rows]
+    moved, untimed = history.color_poses(rows), history.color_poses(rows, is_timed=False)
+    assert all(np.array_equal(one, other) for one, other in zip(untimed, at_depth, strict=True))
+    assert not any(np.array_equal(one, other) for one, other in zip(moved, at_depth, strict=True))
 
 
 def test_stamps_of_one_moment_are_no_motion(dataset, pixels):

@@ -88,7 +88,7 @@ def test_frames_follow_keyframes_that_were_left_out(state):
     state.graph.leave_out({2: 1, 5: 4}, state.frames.matrices()[state.graph.rows])
     state.graph.leave_out({2: 1}, state.frames.matrices()[state.graph.rows])
     archive = archive_of(state, recording("own", 101, OWN), {})
-    assert archive.rows.tolist() == [0, 1, 4, 6] and archive.followers.tolist() == [[2, 1], [3, 1], [5, 2]]
+    assert archive.rows.tolist() == [0, 1, 4, 6] and archive.anchors.tolist() == [[2, 1], [3, 1], [5, 2]]
     turned = archive.poses
     turned[1:3, 1, 3] = [1.0, 5.0]  # the middle two are moved
     opened, own = moved_recordings(archive, turned)
@@ -97,17 +97,17 @@ def test_frames_follow_keyframes_that_were_left_out(state):
     assert opened.trajectory.poses[:, 0, 3].tolist() == [1, 2, 3, 4]
 
 
-def test_followers_are_kept_by_maps_that_are_opened_again(state, tmp_path):
+def test_anchors_are_kept_by_maps_that_are_opened_again(state, tmp_path):
     state.graph.leave_out({2: 1, 5: 4}, state.frames.matrices()[state.graph.rows])
     archive = archive_of(state, recording("own", 101, OWN), {})
     archive.save(tmp_path / "keyframes.safetensors")
     known = KeyframeArchive.load(tmp_path / "keyframes.safetensors")
-    assert known.followers.tolist() == archive.followers.tolist() == [[2, 1], [5, 3]]
+    assert known.anchors.tolist() == archive.anchors.tolist() == [[2, 1], [5, 3]]
     again = SlamState.start(load_config("folder"), CAMERA, np.eye(4), None, torch.device("cpu"))
     put_keyframes(again, known, known.poses)
     again.graph.leave_out({3: 2}, again.frames.matrices()[again.graph.rows])
     # Of the five keyframes the fourth, own frame 101, is left out now: what followed it follows the third.
-    assert archive_of(again, None, {}).followers.tolist() == [[2, 1], [4, 2], [5, 2]]
+    assert archive_of(again, None, {}).anchors.tolist() == [[2, 1], [4, 2], [5, 2]]
 
 
 def test_noise_of_an_opened_map_is_restored_beside_that_of_the_same_camera(state):

@@ -30,6 +30,7 @@ from spslam.slam.graph.keyframe_tensors import (
     pair_tensor,
     pairs_of,
 )
+from spslam.slam.graph.redundancy import with_anchors
 from spslam.tensor_file import TensorFile, load_header, load_tensors, save_tensors
 from spslam.tensor_schema import KEYFRAMES
 from spslam.trajectory import Trajectory
@@ -39,7 +40,7 @@ _FILE = TensorFile("keyframe archive", KEYFRAMES, FORMAT, error=OutputError)
 RECORDS = 4096  # pixels with color of a keyframe that are kept, 48 kB
 
 
-def no_followers() -> np.ndarray:
+def no_anchors() -> np.ndarray:
     """int64 [0, 2]."""
     return np.zeros((0, 2), np.int64)
 
@@ -74,8 +75,7 @@ class KeyframeArchive:
         tried: pairs of keyframes that were registered.
         noise: float32 [4] of each camera's sensor.
         settings: what must be alike in maps that are joined, by option.
-        followers: int64 [N, 2], a frame by its number and a keyframe: of each keyframe that was left out, its frame
-            and the keyframe that this one follows.
+        anchors: int64 [N, 2], frame and reference of each `Anchor`, ascending; trajectories have their poses.
     """
 
     recordings: Sequence[Recording]
@@ -86,7 +86,7 @@ class KeyframeArchive:
     tried: set[tuple[int, int]]
     noise: Mapping[KeyframeCamera, torch.Tensor]
     settings: Mapping[str, Any] = field(default_factory=dict)
-    followers: np.ndarray = field(default_factory=no_followers)
+    anchors: np.ndarray = field(default_factory=no_anchors)
 
     @property
     def rows(self) -> np.ndarray:
@@ -103,21 +103,12 @@ class KeyframeArchive:
         """float64 [K, 4, 4] T_world_camera of the keyframes."""
         return np.concatenate([recording.trajectory.poses for recording in self.recordings])[self.rows]
 
-    def with_followers(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames that say how all others move: those of the keyframes, and of keyframes that were left out.
-
-        Args:
-            poses: float64 [K, 4, 4], where the keyframes are now.
-
-        Returns:
-            Their numbers int64 [N], ascending, and where they are now, float64 [N, 4, 4].
-        """
-        rows, (frames, references) = self.rows, self.followers.T
+    def with_anchors(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frames and poses as the function of this name has them, where keyframes are now at poses [K, 4, 4]."""
+        rows, (frames, references) = self.rows, self.anchors.T
         before = np.concatenate([recording.trajectory.poses for recording in self.recordings])
-        followed = compose(poses[references], inverse(before[rows[references]]), before[frames])
-        numbers = np.concatenate([rows, frames])
-        order = np.argsort(numbers, kind="stable")
-        return numbers[order], np.concatenate([poses, followed])[order]
+        relative = compose(inverse(before[rows[references]]), before[frames])
+        return with_anchors(rows, poses, (frames, references, relative))
 
     def recording_of(self, keyframe: int) -> int:
         """Number of the recording that a keyframe is of."""
@@ -145,7 +136,7 @@ class KeyframeArchive:
             "tried": pair_tensor(self.tried),
             "noise": torch.stack([self.noise[camera] for camera in cameras]),
             "records": self.records.contiguous(),
-            "followers": torch.from_numpy(self.followers),
+            "anchors": torch.from_numpy(self.anchors),
             "recordings": torch.tensor([len(each) for each in trajectories], dtype=torch.int64),
             "frames.poses": torch.from_numpy(poses),
             "frames.timestamps": torch.from_numpy(timestamps),
@@ -175,7 +166,7 @@ class KeyframeArchive:
                 pairs_of(tensors["tried"]),
                 dict(zip(cameras, tensors["noise"], strict=True)),
                 dict(header["settings"]),
-                tensors["followers"].numpy().copy() if "followers" in tensors else no_followers(),
+                tensors["anchors"].numpy().copy() if "anchors" in tensors else no_anchors(),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise OutputError(f"{path}: a damaged keyframe archive ({brief(str(error), 300)})") from None

@@ -49,7 +49,7 @@ def registrar_of(first: KeyframeArchive, second: KeyframeArchive, config: Config
 
 def moved_recordings(archive: KeyframeArchive, poses: np.ndarray) -> list[Recording]:
     """The recordings of a map whose keyframes are now at poses float64 [K, 4, 4]; all frames follow them."""
-    rows, at_rows = archive.with_followers(poses)
+    rows, at_rows = archive.with_anchors(poses)
     moved, begin = [], 0
     for recording, end in zip(archive.recordings, archive.ends.tolist(), strict=True):
         own = (rows >= begin) & (rows < end)
@@ -79,7 +79,7 @@ def _concatenated(
         first.tried | {(one + count, other + count) for one, other in second.tried},
         {**second.noise, **first.noise},
         first.settings,
-        np.concatenate([first.followers, second.followers + (frames, count)]),
+        np.concatenate([first.anchors, second.anchors + (frames, count)]),
     )
     return joined, [replace(each, source=each.source + count) for each in joint.loops]
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from spslam.geometry import compose
 from spslam.slam.graph.archive import KeyframeArchive
 from spslam.slam.graph.content_tensors import content_of, content_tensors
 from spslam.slam.graph.edges import Link
@@ -23,7 +22,7 @@ from spslam.slam.graph.keyframe_tensors import (
     links_of,
     stacked,
 )
-from spslam.slam.graph.redundancy import Anchor, moved_anchors
+from spslam.slam.graph.redundancy import Anchor, moved_anchors, with_anchors
 
 NO_NOISE = torch.zeros((0, 4))
 
@@ -114,11 +113,8 @@ class KeyframeStore:
         """
         if not self.anchors:
             return self.rows, poses
-        references = [anchor.reference for anchor in self.anchors]
-        followed = compose(poses[references], np.stack([anchor.pose for anchor in self.anchors]))
-        rows = np.append(self.rows, [anchor.frame for anchor in self.anchors])
-        order = np.argsort(rows, kind="stable")
-        return rows[order], np.concatenate([poses, followed])[order]
+        frames, references = np.array([(anchor.frame, anchor.reference) for anchor in self.anchors], np.int64).T
+        return with_anchors(self.rows, poses, (frames, references, np.stack([one.pose for one in self.anchors])))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All that a checkpoint needs, on the CPU."""

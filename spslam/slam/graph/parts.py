@@ -120,8 +120,8 @@ def _cut(part: Part, rows: slice) -> Part:
     inside = (archive.rows >= rows.start) & (archive.rows < rows.stop)
     numbers = np.cumsum(inside) - 1
     kept = np.flatnonzero(inside).tolist()
-    followers = archive.followers
-    followers = followers[(followers[:, 0] >= rows.start) & (followers[:, 0] < rows.stop) & inside[followers[:, 1]]]
+    anchors = archive.anchors
+    anchors = anchors[(anchors[:, 0] >= rows.start) & (anchors[:, 0] < rows.stop) & inside[anchors[:, 1]]]
     edges = [
         replace(edge, source=int(numbers[edge.source]), target=int(numbers[edge.target]))
         for edge in archive.edges
@@ -138,7 +138,7 @@ def _cut(part: Part, rows: slice) -> Part:
         tried={
             (int(numbers[one]), int(numbers[other])) for one, other in archive.tried if inside[one] and inside[other]
         },
-        followers=np.stack([followers[:, 0] - rows.start, numbers[followers[:, 1]]], 1),
+        anchors=np.stack([anchors[:, 0] - rows.start, numbers[anchors[:, 1]]], 1),
     )
     decisions = [
         replace(each, source=each.source - rows.start, target=each.target - rows.start)
@@ -187,7 +187,7 @@ def _concatenated(first: Part, second: Part, pose: np.ndarray) -> Part:
         one.tried | {(source + count, target + count) for source, target in other.tried},
         {**other.noise, **one.noise},
         one.settings,
-        np.concatenate([one.followers, other.followers + (frames, count)]),
+        np.concatenate([one.anchors, other.anchors + (frames, count)]),
     )
     return Part(archive, np.concatenate([first.indices, second.indices]))
 

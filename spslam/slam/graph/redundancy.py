@@ -131,3 +131,22 @@ def moved_anchors(
             result.append(Anchor(anchor.frame, reference, pose))
     result += [Anchor(frames[one], to, compose(inverse(poses[to]), poses[one])) for one, to in out.items()]
     return sorted(result, key=lambda anchor: anchor.frame)
+
+
+def with_anchors(
+    rows: np.ndarray, poses: np.ndarray, anchors: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The frames that say how all others move: those of keyframes and of keyframes that were left out.
+
+    Args:
+        rows: int64 [K], frames of the keyframes.
+        poses: float64 [K, 4, 4] of these, T_world_camera.
+        anchors: as of `Anchor`: frames and references int64 [N], poses float64 [N, 4, 4].
+
+    Returns:
+        Frames int64 [K + N], ascending, and their poses float64 [K + N, 4, 4].
+    """
+    frames, references, relative = anchors
+    numbers = np.append(rows, frames)
+    order = np.argsort(numbers, kind="stable")
+    return numbers[order], np.concatenate([poses, compose(poses[references], relative)])[order]

@@ -66,10 +66,7 @@ class DoubtfulFrame:
         known = {row: features for row in rows if (features := self.history.features(row)) is not None}
         if not known:
             return {}
-        keyframes = self.problem.constraints.depth_keyframes
-        # As `Recovery` has it of the frame's own: without timing both are where depth is.
-        is_timed = keyframes is not None and keyframes.timing is not None
-        poses = self.history.color_poses(list(known), is_timed)
+        poses = self.history.color_poses(list(known), is_timed=self.problem.constraints.timing is not None)
         return dict(zip(known, self.image.matches_with(list(zip(known.values(), poses, strict=True))), strict=True))
 
     def with_speed(self, row: int, matches: Sequence[FeatureMatches]) -> "DoubtfulFrame":

@@ -234,8 +234,7 @@ class Recovery:
         read = rectified = features.extracted
         if problem.constraints.shutter is not None:
             rectified = self._rectifier.features(read, problem.constraints.shutter)
-        keyframes = problem.constraints.depth_keyframes
-        timing = None if keyframes is None else keyframes.timing
+        timing = problem.constraints.timing
         motion = None if timing is None else history.color_motion(timing.frame)
         floor, growth = problem.constraints.noise_numbers[:2]
         return FeatureAlignment(rectified, self._camera, motion, read, problem.predicted.device, (floor, growth))
