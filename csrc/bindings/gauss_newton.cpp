@@ -7,14 +7,16 @@
 namespace spslam::bindings {
 namespace {
 
-Tensor predict_pose(Tensor before, Tensor last) {
+Tensor predict_pose(Tensor before, Tensor last, double steps) {
   SPS_CHECK(before.numel() == kPoseSize && last.numel() == kPoseSize,
             "predict_pose: before and last must have 7 elements");
+  SPS_CHECK(steps > 0.0, "predict_pose: steps must be positive");
   DeviceScope scope(last);
   before = as_contiguous(before);
   last = as_contiguous(last);
   Tensor next = empty(last, {kPoseSize}, ScalarType::Float);
-  spslam::predict_pose(scope.context, data<float>(before), data<float>(last), mutable_data<float>(next));
+  spslam::predict_pose(scope.context, {data<float>(before), data<float>(last), static_cast<float>(steps)},
+                       mutable_data<float>(next));
   return next;
 }
 
@@ -83,7 +85,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> gauss_newton_poses(std::vector<Tensor
 
 #ifndef SPS_CUDA
 STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
-  m.def("predict_pose(Tensor before, Tensor last) -> Tensor");
+  m.def("predict_pose(Tensor before, Tensor last, float steps) -> Tensor");
   m.def("track_gauss_newton(" SPS_TRACKING_SCHEMA ") -> Tensor");
   m.def("gauss_newton_poses(" SPS_SCENE_SCHEMA
         ", Tensor pixels, Tensor poses, float[] intrinsics, float truncation, float kernel) "

@@ -91,24 +91,25 @@ std::tuple<Tensor, Tensor, Tensor> rectify_shutter_frame(Tensor records, Tensor 
   return {out, out_depth, out_intensity};
 }
 
-// The pose after rows `last` - 1 and `last` of a table of poses, the readout, and the records as that motion rectifies
-// them: all of them new.
+// The pose `steps` after rows `last` - 1 and `last` of a table of poses, the readout, and the records as that motion
+// rectifies them: all of them new.
 std::tuple<Tensor, Tensor, Tensor> predict_frame(Tensor poses, std::int64_t last, Tensor readout, Tensor records,
-                                                 std::vector<double> numbers, std::int64_t height, std::int64_t width) {
+                                                 std::vector<double> numbers, std::int64_t height, std::int64_t width,
+                                                 double steps) {
   constexpr char kName[] = "predict_frame";
   const Scalars<RecordScalar> scalars(kName, "scalars", numbers);
   check_records(kName, records, height, width);
   SPS_CHECK(has_shape(poses, {-1, kPoseSize}) && last >= 1 && last < poses.size(0), kName,
             ": poses must have shape [F, ", kPoseSize, "], and last be one of its rows after the first, got ", last);
   SPS_CHECK(readout.numel() == 1, kName, ": readout must have one element");
-  SPS_CHECK(scalars[RecordScalar::kSeconds] > 0.0, kName, ": seconds must be positive");
+  SPS_CHECK(scalars[RecordScalar::kSeconds] > 0.0 && steps > 0.0, kName, ": seconds and steps must be positive");
   DeviceScope scope(records);
   records = as_contiguous(records), poses = as_contiguous(poses), readout = as_contiguous(readout);
   Tensor pose = empty(poses, {kPoseSize}, ScalarType::Float);
   Tensor out_readout = empty(poses, {1}, ScalarType::Float);
   Tensor out = empty(records, {records.size(0), 3}, ScalarType::Int);
   const float* const at = data<float>(poses) + kPoseSize * last;
-  spslam::predict_frame(scope.context, at - kPoseSize, at, data<float>(readout),
+  spslam::predict_frame(scope.context, {at - kPoseSize, at, static_cast<float>(steps)}, data<float>(readout),
                         scalars.as<float>(RecordScalar::kSeconds), data<std::int32_t>(records), records.size(0),
                         {load_intrinsics(scalars), height, width},
                         {mutable_data<float>(pose), mutable_data<float>(out_readout), mutable_data<std::int32_t>(out)});
@@ -129,8 +130,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(spslam, m) {
       "rectify_shutter_frame(Tensor records, Tensor depth, Tensor intensity, Tensor before, Tensor pose, Tensor "
       "readout, float[] scalars, int height, int width) -> (Tensor, Tensor, Tensor)");
   m.def(
-      "predict_frame(Tensor poses, int last, Tensor readout, Tensor records, float[] scalars, int height, int width) "
-      "-> (Tensor, Tensor, Tensor)");
+      "predict_frame(Tensor poses, int last, Tensor readout, Tensor records, float[] scalars, int height, int width, "
+      "float steps) -> (Tensor, Tensor, Tensor)");
 }
 #endif
 

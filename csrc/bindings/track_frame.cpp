@@ -14,6 +14,7 @@ enum class MotionScalar {
   kHeight,
   kWidth,
   kSeconds,
+  kSteps,
   kUnit,
   kBentTurn,
   kFarWay,
@@ -50,8 +51,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> track_frame(
             ": depth and intensity must have one shape [H, W], at least two rows and columns");
   SPS_CHECK(has_shape(poses, {2, kPoseSize}), kName, ": poses must have shape [2, ", kPoseSize, "]");
   SPS_CHECK(readout.numel() == 1, kName, ": readout must have one element");
-  SPS_CHECK(moved[MotionScalar::kSeconds] > 0.0 && moved[MotionScalar::kUnit] > 0.0, kName,
-            ": seconds and unit must be positive");
+  SPS_CHECK(
+      moved[MotionScalar::kSeconds] > 0.0 && moved[MotionScalar::kSteps] > 0.0 && moved[MotionScalar::kUnit] > 0.0,
+      kName, ": seconds, steps and unit must be positive");
   DeviceScope scope(records);
   const TrackingArguments arguments(
       kName,
@@ -69,8 +71,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> track_frame(
       data<std::int32_t>(records),
       count,
       {data<std::uint16_t>(depth), data<std::uint8_t>(intensity), unit},
-      data<float>(poses),
-      data<float>(poses) + kPoseSize,
+      {data<float>(poses), data<float>(poses) + kPoseSize, moved.as<float>(MotionScalar::kSteps)},
       data<float>(readout),
       moved.as<float>(MotionScalar::kSeconds),
       {arguments.options.intrinsics, height, width},

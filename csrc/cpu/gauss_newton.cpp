@@ -129,8 +129,8 @@ void sum_pixels(const SceneView& scene, const PackedMlp<float>& net, const Measu
 }  // namespace
 
 template <>
-void predict_pose<Cpu>(Cpu device, const float* before, const float* last, float* next) {
-  for_each(device, 1, [=](std::int64_t) { constant_speed_pose(before, last, next); });
+void predict_pose<Cpu>(Cpu device, const RecentMotion& motion, float* next) {
+  for_each(device, 1, [=](std::int64_t) { constant_speed_pose(motion, next); });
 }
 
 template <>

@@ -100,12 +100,12 @@ void rectify_shutter_features(Cpu, const float* positions, const float* points, 
 }
 
 template <>
-void predict_frame<Cpu>(Cpu device, const float* before, const float* last, const float* readout, float seconds,
+void predict_frame<Cpu>(Cpu device, const RecentMotion& motion, const float* readout, float seconds,
                         const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,
                         const PredictedFrame& out) {
-  constant_speed_pose(before, last, out.pose);
+  constant_speed_pose(motion, out.pose);
   *out.readout = *readout;
-  rectify_shutter_records(device, records, num_records, {last, out.pose, readout, seconds}, camera, out.records);
+  rectify_shutter_records(device, records, num_records, {motion.last, out.pose, readout, seconds}, camera, out.records);
 }
 
 }  // namespace spslam

@@ -221,8 +221,9 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <>
-void predict_pose<Cuda>(Cuda device, const float* before, const float* last, float* next) {
-  for_each(device, 1, [=] __device__(std::int64_t) { constant_speed_pose(before, last, next); });
+void predict_pose<Cuda>(Cuda device, const RecentMotion& recent, float* next) {
+  const RecentMotion motion = recent;
+  for_each(device, 1, [=] __device__(std::int64_t) { constant_speed_pose(motion, next); });
 }
 
 template <>

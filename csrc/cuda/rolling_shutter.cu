@@ -54,18 +54,19 @@ void rectify_shutter_frame<Cuda>(Cuda device, const std::int32_t* records, std::
 }
 
 template <>
-void predict_frame<Cuda>(Cuda device, const float* before, const float* last, const float* readout, float seconds,
+void predict_frame<Cuda>(Cuda device, const RecentMotion& recent, const float* readout, float seconds,
                          const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,
                          const PredictedFrame& out) {
+  const RecentMotion motion = recent;
   for_each(device, num_records > 0 ? num_records : 1, [=] __device__(std::int64_t i) {
     float pose[kPoseSize];
-    constant_speed_pose(before, last, pose);
+    constant_speed_pose(motion, pose);
     if (i == 0) {
       for (int c = 0; c < kPoseSize; ++c) out.pose[c] = pose[c];
       *out.readout = *readout;
     }
     if (i >= num_records) return;
-    rectify_record(readout_motion({last, pose, readout, seconds}), camera, records + kPixelWords * i,
+    rectify_record(readout_motion({motion.last, pose, readout, seconds}), camera, records + kPixelWords * i,
                    out.records + kPixelWords * i);
   });
 }

@@ -289,14 +289,27 @@ SPS_INLINE void store_pose_equations(const double* terms, std::int64_t frame, st
   out.inliers[frame] = static_cast<float>(share);
 }
 
-// The pose after `before` and `last` at constant speed, T1 T0^-1 T1, its w not negative.
-SPS_INLINE void constant_speed_pose(const float* before, const float* last, float* next) {
+// Where a camera that moves on as it did from T0 to T1 is `steps` such times later, (T1 T0^-1)^steps T1, its w not
+// negative. That is a screw: the way along its axis grows with time, the way around it is the chord of a longer arc.
+SPS_INLINE void constant_speed_pose(const RecentMotion& motion, float* next) {
+  const float *before = motion.before, *last = motion.last;
   const Quaternion<double> q0 = normalized(Quaternion<double>{before[0], before[1], before[2], before[3]});
   const Quaternion<double> q1 = normalized(Quaternion<double>{last[0], last[1], last[2], last[3]});
-  const Quaternion<double> turn = q1 * Quaternion<double>{q0.w, -q0.x, -q0.y, -q0.z};
-  const Quaternion<double> q = normalized(turn * q1);
   const Vec3<double> t0{before[4], before[5], before[6]}, t1{last[4], last[5], last[6]};
-  const Vec3<double> t = rotation(turn) * (t1 - t0) + t1;
+  Quaternion<double> turn = q1 * Quaternion<double>{q0.w, -q0.x, -q0.y, -q0.z}, between = turn;
+  Vec3<double> way = t1 - t0;
+  if (motion.steps != 1.0F) {
+    const double steps = motion.steps;
+    const Vec3<double> omega = quaternion_log(turn);
+    const double square = dot(omega, omega), half = 0.5 * std::sqrt(square);
+    const double around = half > 1e-6 ? std::sin(steps * half) / std::sin(half) : steps;
+    const double along = half > 1e-6 ? (steps - around) * dot(omega, way) / square : 0.0;
+    way = around * way + along * omega;
+    turn = quaternion_exp(steps * omega);
+    between = quaternion_exp(0.5 * (1.0 + steps) * omega);  // from the middle of one arc to that of the other
+  }
+  const Quaternion<double> q = normalized(turn * q1);
+  const Vec3<double> t = rotation(between) * way + t1;
   const double sign = q.w < 0.0 ? -1.0 : 1.0;
   const double pose[7] = {sign * q.w, sign * q.x, sign * q.y, sign * q.z, t.x, t.y, t.z};
   for (int i = 0; i < 7; ++i) next[i] = static_cast<float>(pose[i]);

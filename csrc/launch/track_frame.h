@@ -19,8 +19,8 @@ struct TrackFrameLaunch {
   std::int64_t bytes() const { return memory_.used(); }
 
   void run(const TrackedFrameOutput& out) {
-    predict_frame(device_, call_.before, call_.last, call_.readout, call_.seconds, call_.records, call_.num_records,
-                  call_.camera, {out.predicted, out.readout, out.predicted_records});
+    predict_frame(device_, call_.recent, call_.readout, call_.seconds, call_.records, call_.num_records, call_.camera,
+                  {out.predicted, out.readout, out.predicted_records});
     start(out);
     track(out.predicted_records, call_.options, out.first);
     decide(out);
@@ -38,7 +38,7 @@ struct TrackFrameLaunch {
   }
 
   ShutterMotion motion(const TrackedFrameOutput& out, const float* pose) const {
-    return {call_.last, pose, out.readout, call_.seconds};
+    return {call_.recent.last, pose, out.readout, call_.seconds};
   }
 
   void track(const std::int32_t* records, const GaussNewtonOptions& options, const TrackedPose& out) {

@@ -27,6 +27,7 @@ complement) and which then takes its own step, of at most 0.2.
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,18 +41,19 @@ from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
 
 
 @public_op()
-def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
-    """The pose after two given ones at constant speed, T1 T0^-1 T1; reads nothing back to the host.
+def predict_pose(before: torch.Tensor, last: torch.Tensor, steps: float = 1.0) -> torch.Tensor:
+    """The pose after two given ones at constant speed, (T1 T0^-1)^steps T1; reads nothing back to the host.
 
     Args:
         before: float32 [7] T0 = T_world_camera, quaternion (w, x, y, z) and translation (m).
         last: float32 [7] T1.
+        steps: time from T1 to the pose, in times from T0 to T1; above 0.
 
     Returns:
         float32 [7], its quaternion of norm 1 with w >= 0; not finite where a pose is not.
 
     Raises:
-        TypeError, ValueError: a tensor of another dtype, shape or device.
+        TypeError, ValueError: a tensor of another dtype, shape or device; steps that are not above 0 and finite.
 
     Example:
         >>> still = torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
@@ -61,7 +63,9 @@ def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
     """
     check_tensor("predict_pose", "last", last, (7,), torch.float32)
     check_tensor("predict_pose", "before", before, (7,), torch.float32, like=last)
-    return trusted.predict_pose(before, last)
+    if not 0 < steps < math.inf:
+        raise ValueError(f"predict_pose: steps must be above 0 and finite, got {steps}")
+    return trusted.predict_pose(before, last, steps)
 
 
 def _scalar(default: Any = dataclasses.MISSING, **bound: float) -> Any:
@@ -245,7 +249,7 @@ def gauss_newton_poses(
 
 
 @torch.library.register_fake("spslam::predict_pose")
-def _(before, last):
+def _(before, last, _):
     return last.new_empty(7)
 
 

@@ -42,6 +42,7 @@ class MovingFrame(NamedTuple):
         poses: float32 [2, 7] of the two frames before, the last one second.
         readout: float32 [1] s.
         seconds: from the last frame to this one.
+        steps: the same time, in times from the first of the two frames to the last one.
         size: rows and columns of the images that the records are of.
         image_intrinsics: of `depth` and `intensity`.
         unit: m.
@@ -53,6 +54,7 @@ class MovingFrame(NamedTuple):
     poses: torch.Tensor
     readout: torch.Tensor
     seconds: float
+    steps: float
     size: tuple[int, int]
     image_intrinsics: Intrinsics
     unit: float
@@ -89,9 +91,9 @@ _NO_REFERENCE: tuple[list, list] = ([], [])
 _NO_KEYFRAMES: tuple[list, list, list] = ([], [], [])
 
 
-def predict_pose(before: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+def predict_pose(before: torch.Tensor, last: torch.Tensor, steps: float) -> torch.Tensor:
     """See `spslam.ops.predict_pose`."""
-    return torch.ops.spslam.predict_pose(before, last)
+    return torch.ops.spslam.predict_pose(before, last, steps)
 
 
 def predict_frame(
@@ -99,6 +101,7 @@ def predict_frame(
     last: int,
     readout: torch.Tensor,
     seconds: float,
+    steps: float,
     records: torch.Tensor,
     intrinsics: Intrinsics,
     size: tuple[int, int],
@@ -110,6 +113,7 @@ def predict_frame(
         last: that row.
         readout: float32 [1] s.
         seconds: from the last frame to the next one.
+        steps: as of `predict_pose`.
         records: int32 [P, 3] of the next frame, not changed.
         intrinsics: of the images that the records are of.
         size: rows and columns of these.
@@ -118,7 +122,7 @@ def predict_frame(
         float32 [7] the pose; float32 [1] the readout, a copy; int32 [P, 3] the records, rectified by the motion from
         the last pose to this one.
     """
-    return torch.ops.spslam.predict_frame(poses, last, readout, records, [*intrinsics, seconds], *size)
+    return torch.ops.spslam.predict_frame(poses, last, readout, records, [*intrinsics, seconds], *size, steps)
 
 
 def track_gauss_newton(
@@ -186,7 +190,7 @@ def track_frame(
         *(_NO_REFERENCE if reference is None else reference.arguments()),
         *(_NO_KEYFRAMES if depth_keyframes is None else depth_keyframes.arguments()),
         # The enum MotionScalar in csrc/bindings/track_frame.cpp.
-        [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, *limits, again_iterations],
+        [*frame.image_intrinsics, *frame.size, frame.seconds, frame.steps, frame.unit, *limits, again_iterations],
     )
 
 

@@ -17,6 +17,8 @@ from spslam.slam.state import SlamState
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
 RECENT_COMPARED = 16
 LEAST_MOTION_S = 1e-9  # ops count in whole nanoseconds; nearer stamps are of one moment
+UNEVEN_STEPS = 1.4  # times between frames differ by less where they are of one rate, and stamps are late or early
+MAX_STEPS = 4.0
 MAX_MOTION_S = 0.12  # between two frames; over a longer time the camera hardly moves evenly
 # At least between the two that say where a color image was taken. What a pose is off by moves the color image that the
 # next one is found by: with color half of that time before depth it would be off as much to the other side, and with
@@ -44,7 +46,8 @@ class FrameHistory:
         state: of the system; not changed.
 
     Attributes:
-        coming_s: time stamp of the frame that is localized, s; minus infinity where that is not known.
+        coming_s: when the depth image of the frame that is localized was taken, s; minus infinity where that is not
+            known.
     """
 
     def __init__(self, state: SlamState):
@@ -75,7 +78,23 @@ class FrameHistory:
     @property
     def interval_s(self) -> float:
         """From the last frame to the one that is localized, s; 0 where that is not known."""
-        return max(self.coming_s - float(self._state.frames.timestamps[-1]), 0.0)
+        frames = self._state.frames
+        return max(self.coming_s - frames.depth_time(len(frames) - 1), 0.0)
+
+    @property
+    def steps(self) -> float:
+        """`interval_s`, in times between the last two frames: 1 where these are even, or not known.
+
+        So far the camera is predicted to go on. At most `MAX_STEPS`, as no camera keeps its speed for long.
+        """
+        frames, interval = self._state.frames, self.interval_s
+        if interval == 0 or len(frames) < 2:
+            return 1.0
+        before = frames.depth_time(len(frames) - 1) - frames.depth_time(len(frames) - 2)
+        if before <= 0:
+            return 1.0
+        steps = interval / before
+        return 1.0 if 1 / UNEVEN_STEPS < steps < UNEVEN_STEPS else min(steps, MAX_STEPS)
 
     def seconds_since(self, row: int) -> float:
         """From the frame in a row to the one that is localized, s.
@@ -83,7 +102,7 @@ class FrameHistory:
         Where nobody says when that comes, it comes as long after the last one as that after the one before. Infinite
         where that is not known: with one frame only, or where time does not go on.
         """
-        times, interval = self._state.frames.timestamps, self.interval_s
+        times, interval = self._state.frames.depth_times, self.interval_s
         if interval == 0 and len(times) > 1:
             interval = float(times[-1] - times[-2])
         since = float(times[-1] - times[row])

@@ -149,7 +149,7 @@ class FramePipeline:
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
-        read, self.history.coming_s = self._receive(frame, events), frame.timestamp
+        read, self.history.coming_s = self._receive(frame, events), frame.depth_time
         features = self.features.of(read)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
@@ -291,7 +291,8 @@ class FramePipeline:
                 self._other_maps.find_camera(read, number, self.history.noise, has_depth), None, read
             )
         elif self._has_too_little_depth(read):
-            found = LocalizedFrame(TrackedFrame.untracked(self.tracker.predict(state.frames), lost=True), None, read)
+            predicted = self.tracker.predict(state.frames, self.history.steps)
+            found = LocalizedFrame(TrackedFrame.untracked(predicted, lost=True), None, read)
         else:
             seconds = None
             if self._measures_timing:

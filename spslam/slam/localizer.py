@@ -94,11 +94,11 @@ class Localizer:
         """
         read, number, pixels = features.pixels, len(state.frames), None
         if seconds is None:
-            predicted = self._tracker.predict(state.frames)
+            predicted = self._tracker.predict(state.frames, history.steps)
             problem = TrackingProblem(state.scene, read.records, predicted, number, constraints)
             return LocalizedFrame(self.localize(problem, read, features, history, to_be_mapped, meanwhile), None, read)
         if self._tracker.can_follow(state.frames):
-            moving, bent_turn = self._rectifier.moving(read, state, seconds), self._rectifier.bent_turn
+            moving, bent_turn = self._rectifier.moving(read, state, seconds, history.steps), self._rectifier.bent_turn
             found = self._tracker.follow(state.scene, moving, bent_turn, number, constraints, meanwhile)
             tracked, motion = self._recovery.settled(found.estimate, history, to_be_mapped), found.motion
             if tracked is None or found.outcome == FrameOutcome.FAR:
@@ -107,7 +107,7 @@ class Localizer:
                 records, depth, intensity = found.rectified
                 pixels = read.having(records=records, depth_image=depth, intensity_image=intensity)
         else:
-            motion, predicted_pixels = self._rectifier.predict(read, state, seconds)
+            motion, predicted_pixels = self._rectifier.predict(read, state, seconds, history.steps)
             constraints = replace(constraints, shutter=motion)
             problem = TrackingProblem(state.scene, predicted_pixels.records, motion.pose, number, constraints)
             tracked = self.localize(problem, predicted_pixels, features, history, to_be_mapped, meanwhile)

@@ -52,7 +52,9 @@ class ShutterRectifier:
             return None
         return motion.seconds
 
-    def predict(self, pixels: FramePixels, state: SlamState, seconds: float) -> tuple[ops.ShutterMotion, FramePixels]:
+    def predict(
+        self, pixels: FramePixels, state: SlamState, seconds: float, steps: float
+    ) -> tuple[ops.ShutterMotion, FramePixels]:
         """How the camera is predicted to move, at constant velocity, and the frame with its records rectified by that.
 
         Without a speed it is predicted to stay, and the records too are as they were read.
@@ -61,6 +63,7 @@ class ShutterRectifier:
             pixels: of the frame; images, normals and thumbnail stay as they were read.
             state: before the frame.
             seconds: from the last frame to this one.
+            steps: as of `FrameHistory`.
         """
         frames, readout, last = state.frames, state.noise.readout, len(state.frames) - 1
         before = frames.pose_rows[last]
@@ -68,7 +71,7 @@ class ShutterRectifier:
         if not frames.knows_speed:
             return ops.ShutterMotion(before, before.clone(), seconds, readout.clone()), pixels
         predicted, readout, records = ops.trusted.predict_frame(
-            frames.pose_rows, last, readout, seconds, pixels.records, self._intrinsics, self._size
+            frames.pose_rows, last, readout, seconds, steps, pixels.records, self._intrinsics, self._size
         )
         return ops.ShutterMotion(before, predicted, seconds, readout), pixels.having(records=records)
 
@@ -77,7 +80,7 @@ class ShutterRectifier:
         """As of `Tracker.follow`, rad."""
         return 2 * BENT_PX / self._image_intrinsics.fy  # a readout takes no longer than a frame
 
-    def moving(self, pixels: FramePixels, state: SlamState, seconds: float) -> ops.trusted.MovingFrame:
+    def moving(self, pixels: FramePixels, state: SlamState, seconds: float, steps: float) -> ops.trusted.MovingFrame:
         """A frame as it was read, for `Tracker.follow`; the arguments are those of `predict`."""
         count = len(state.frames)
         return ops.trusted.MovingFrame(
@@ -87,6 +90,7 @@ class ShutterRectifier:
             state.frames.pose_rows[count - 2 : count],
             state.noise.readout,
             seconds,
+            steps,
             self._size,
             self._image_intrinsics,
             self._unit,

@@ -143,12 +143,15 @@ class Tracker:
         self._score_kernel_m = score_kernel_m
         self._graph = ops.LaunchGraph()
 
-    def predict(self, frames: FrameTable) -> torch.Tensor:
-        """The next pose at constant velocity, float32 [7]; the last pose after one frame only, or a lost one."""
+    def predict(self, frames: FrameTable, steps: float = 1.0) -> torch.Tensor:
+        """The next pose at constant velocity, float32 [7]; the last pose after one frame only, or a lost one.
+
+        `steps` as of `FrameHistory`.
+        """
         if not frames.knows_speed:
             return frames.poses[-1].clone()
         poses = frames.poses
-        return ops.trusted.predict_pose(poses[-2], poses[-1])
+        return ops.trusted.predict_pose(poses[-2], poses[-1], steps)
 
     def track(self, problem: TrackingProblem, meanwhile: Callable[[], None] | None = None) -> PoseEstimate:
         """Optimizes the pose from the predicted one, with the configured optimizer.

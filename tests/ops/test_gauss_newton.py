@@ -1,5 +1,6 @@
 """Gauss-Newton tracking: normal equations against autograd, recovery of a known pose, determinism."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -103,6 +104,26 @@ def test_prediction_is_constant_speed(device, shift_m, angle_deg):
     assert predicted[0] >= 0
 
 
+@pytest.mark.parametrize("shift_m, angle_deg", [(0.0, 0.0), (0.03, 2.0), (0.03, 0.0), (0.5, 25.0)])
+def test_a_camera_at_constant_speed_goes_on_as_far_as_the_time_is_long(device, shift_m, angle_deg):
+    first = POSE
+    second = moved_pose(POSE, shift_m * np.array([0.6, -0.64, 0.48]), np.radians(angle_deg))
+    third = constant_speed(first, second)
+    fourth = constant_speed(second, third)
+    fifth = constant_speed(third, fourth)
+    for before, last, steps, expected in (
+        (first, second, 2.0, fourth),
+        (second, fourth, 0.5, fifth),
+        (first, third, 1.0, fifth),
+        (first, second, 3.0, fifth),
+    ):
+        predicted = ops.predict_pose(pose7(before, device), pose7(last, device), steps).cpu()
+        torch.testing.assert_close(predicted, pose7(expected), rtol=1e-5, atol=2e-6)
+    for steps in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="predict_pose: steps must be above 0 and finite, got"):
+            ops.predict_pose(pose7(first, device), pose7(second, device), steps)
+
+
 def test_same_bits_for_any_number_of_threads(generator):
     scene = make_scene(generator, random_decoder=False)
     records = corner_pixels(POSE, generator)
@@ -169,7 +190,7 @@ def test_opcheck(device, generator):
     frame = [records, pose, torch.rand(4)]
     call = (*scene.arguments(), frame, *options.arguments(INTRINSICS), [], [], [], [], [])
     opcheck(torch.ops.spslam.track_gauss_newton.default, call, device)
-    opcheck(torch.ops.spslam.predict_pose.default, (pose, pose), device)
+    opcheck(torch.ops.spslam.predict_pose.default, (pose, pose, 2.5), device)
     arguments = (records[None], pose[None], list(INTRINSICS), 0.08, 0.02)
     opcheck(torch.ops.spslam.gauss_newton_poses.default, (*scene.arguments(), *arguments), device)
 

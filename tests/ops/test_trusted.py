@@ -62,17 +62,17 @@ def test_rectifying_a_frame_is_rectifying_records_and_images(device):
     assert not torch.equal(got[0], records["records"])
 
 
-@pytest.mark.parametrize("rows", [200, 0])
-def test_predicting_a_frame_is_predicting_its_pose_and_rectifying_its_records(device, rows):
+@pytest.mark.parametrize("rows, steps", [(200, 1.0), (200, 2.5), (0, 1.0)])
+def test_predicting_a_frame_is_predicting_its_pose_and_rectifying_its_records(device, rows, steps):
     _, _, call, _ = frames(device, rows)
     motion, size = call["motion"], (call["height"], call["width"])
     unused = torch.full((7,), torch.nan, device=device)
     table, readout = torch.stack([unused, motion.before, motion.pose, unused]), motion.readout + 0.01
-    pose = ops.predict_pose(motion.before, motion.pose)
+    pose = ops.predict_pose(motion.before, motion.pose, steps)
     onwards = ops.ShutterMotion(motion.pose, pose, motion.seconds, readout)
     records = torch.empty_like(call["records"])
     ops.rectify_shutter_records_(**{**call, "out": records, "motion": onwards})
-    got = ops.trusted.predict_frame(table, 2, readout, motion.seconds, call["records"], call["intrinsics"], size)
+    got = ops.trusted.predict_frame(table, 2, readout, motion.seconds, steps, call["records"], call["intrinsics"], size)
     assert all(torch.equal(one, other) for one, other in zip(got, (pose, readout, records), strict=True))
     assert got[1].data_ptr() != readout.data_ptr()
     assert rows == 0 or not torch.equal(records, call["records"])
@@ -106,6 +106,7 @@ def moving_frame(device, rows=60):
         poses,
         records["motion"].readout + 0.01,
         records["motion"].seconds,
+        1.5,
         (records["height"], records["width"]),
         images["intrinsics"],
         images["unit"],
@@ -129,8 +130,9 @@ def step_by_step(frame, call, is_bent):
         arguments = call["scene"], records, start, call["intrinsics"], options, call["noise"], call["reference"]
         return ops.trusted.track_gauss_newton(*arguments, keyframes)[7:]
 
-    arguments = frame.poses, 1, frame.readout, frame.seconds, frame.records, call["intrinsics"], frame.size
-    predicted, readout, records = ops.trusted.predict_frame(*arguments)
+    predicted, readout, records = ops.trusted.predict_frame(
+        frame.poses, 1, frame.readout, frame.seconds, frame.steps, frame.records, call["intrinsics"], frame.size
+    )
     motion = ops.ShutterMotion(frame.poses[1], predicted, frame.seconds, readout)
     first = tracked(records, predicted, call["options"], call["depth_keyframes"])
     found = torch.cat([first[:43], first[-7:].repeat(AGAIN)])
@@ -196,7 +198,7 @@ def raw_calls(device):
     rectified = [records["records"], images["depth"], images["intensity"], motion.before, motion.pose, motion.readout]
     numbers = [*records["intrinsics"], *images["intrinsics"], motion.seconds, images["unit"]]
     size, poses = [records["height"], records["width"]], torch.stack([motion.before, motion.pose])
-    predicted = [poses, 1, motion.readout, records["records"], [*records["intrinsics"], motion.seconds], *size]
+    predicted = [poses, 1, motion.readout, records["records"], [*records["intrinsics"], motion.seconds], *size, 2.0]
     return (
         (torch.ops.spslam.measure_frame_.default, [*measured, *keyframes.arguments()]),
         (torch.ops.spslam.rectify_shutter_frame.default, [*rectified, numbers, *size]),
@@ -210,7 +212,7 @@ def raw_tracking(device):
     frame, call = moving_frame(device)
     scene, options = call["scene"].arguments(), call["options"].arguments(call["intrinsics"])
     tensors = [frame.records, frame.depth, frame.intensity, frame.poses, frame.readout, call["noise"]]
-    numbers = [*frame.image_intrinsics, *frame.size, frame.seconds, frame.unit, NEVER, NEVER, NEVER, AGAIN]
+    numbers = [*frame.image_intrinsics, *frame.size, frame.seconds, frame.steps, frame.unit, NEVER, NEVER, NEVER, AGAIN]
     return [*scene, tensors, *options, *call["reference"].arguments(), *call["depth_keyframes"].arguments(), numbers]
 
 
@@ -251,6 +253,8 @@ def test_opcheck(device):
         (3, 11, lambda numbers: [*numbers[:4], 1, *numbers[5:]]),
         (3, 11, lambda numbers: [*numbers[:6], 0.0, *numbers[7:]]),
         (3, 11, lambda numbers: [*numbers[:7], 0.0, *numbers[8:]]),
+        (3, 11, lambda numbers: [*numbers[:8], 0.0, *numbers[9:]]),
+        (2, 7, lambda _: 0.0),
         (3, 3, lambda tensors: [*tensors[:3], tensors[3][:1], *tensors[4:]]),
     ],
 )

@@ -8,7 +8,7 @@ import torch
 
 from spslam.datasets.base import RgbdFrame
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix, rotation_angle
-from spslam.slam.frame_history import FrameHistory
+from spslam.slam.frame_history import MAX_STEPS, FrameHistory
 from spslam.slam.pixels import sample_frame
 from spslam.slam.poses import pose_matrix, pose_tensor
 from spslam.slam.recovery.free_space import surface_counts, surface_shares
@@ -58,11 +58,22 @@ def test_the_next_frame_is_expected_at_the_same_interval(dataset, pixels):
     assert history.interval_s == pytest.approx(1 / 30 + 0.1)
     history.coming_s = 0.0  # as where time does not go on
     assert history.interval_s == 0
-    state.frames.timestamps[-1] = state.frames.timestamps[-2]
+    times = state.frames.depth_times
+    times[-1] = times[-2]
     assert history.seconds_since(0) == np.inf
-    state.frames.timestamps[-1] = 1.0
-    state.frames.timestamps[0] = 2.0  # of an opened map
+    times[-1], times[0] = 1.0, 2.0  # of an opened map
     assert history.seconds_since(0) == np.inf
+
+
+def test_a_camera_moves_on_as_long_as_the_time_to_the_next_frame(dataset, pixels):
+    state = state_of(dataset, pixels)
+    history, times = FrameHistory(state), state.frames.depth_times
+    assert history.steps == 1  # nobody says when it comes
+    for intervals, steps in ((1.0, 1.0), (1.3, 1.0), (0.8, 1.0), (1.5, 1.5), (2.0, 2.0), (0.5, 0.5), (90.0, MAX_STEPS)):
+        history.coming_s = float(times[-1]) + intervals / 30
+        assert history.steps == pytest.approx(steps)
+    times[-2] = times[-1]  # stamps that do not go on say nothing
+    assert history.steps == 1
 
 
 def test_without_timing_color_images_are_where_depth_images_are(dataset, pixels):

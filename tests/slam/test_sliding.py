@@ -64,9 +64,12 @@ def test_features_are_asked_of_what_may_have_slid():
     unknown = replace(firm, prediction_error_cm=float("nan"), prediction_error_deg=float("nan"))
     assert not may_have_slid(unknown) and not is_consistent(unknown)
     weak = replace(firm, min_eigenvalue=0.009)
-    assert not may_have_slid(weak) and not may_have_slid(weak, 0.1)
-    assert may_have_slid(weak, 0.15)  # so near the prediction by chance, or because nothing drew it away
-    assert not may_have_slid(firm, 0.15)
+    often, rare = (SimpleNamespace(interval_s=seconds, steps=1.0) for seconds in (0.1, 0.15))
+    assert not may_have_slid(weak) and not may_have_slid(weak, often)
+    assert may_have_slid(weak, rare)  # so near the prediction by chance, or because nothing drew it away
+    assert not may_have_slid(firm, rare)
+    far, late = replace(firm, prediction_error_cm=2.5), SimpleNamespace(interval_s=0.1, steps=3.0)
+    assert not may_have_slid(far, often) and may_have_slid(far, late) and not may_have_slid(unpredicted, late)
 
 
 def test_a_camera_that_is_carried_leaves_the_prediction_between_frames_far_apart():

@@ -7,6 +7,7 @@
 #include "core/philox.h"
 #include "spslam/scene_view.h"
 #include "spslam/types/depth_noise.h"
+#include "spslam/types/recent_motion.h"
 
 namespace spslam {
 
@@ -93,9 +94,9 @@ struct GaussNewtonOptions {
 };
 #undef SPS_DECLARE_FIELD
 
-// next [7]: the pose after `before` [7] and `last` [7] at constant speed.
+// next [7]: the pose at constant speed, (T1 T0^-1)^steps T1.
 template <class Device>
-void predict_pose(Device device, const float* before, const float* last, float* next);
+void predict_pose(Device device, const RecentMotion& motion, float* next);
 
 // Bytes of scratch for the launches below.
 template <class Device>

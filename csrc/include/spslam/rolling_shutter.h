@@ -5,6 +5,7 @@
 
 #include "core/device.h"
 #include "spslam/types/camera.h"
+#include "spslam/types/recent_motion.h"
 
 namespace spslam {
 
@@ -65,10 +66,10 @@ struct PredictedFrame {
   std::int32_t* records;
 };
 
-// predict_pose after the poses `before` and `last`, and the records of a frame `seconds` after `last` as the motion
-// from there to the predicted pose rectifies them.
+// predict_pose, and the records of a frame `seconds` after the last pose as the motion from there to the predicted pose
+// rectifies them.
 template <class Device>
-void predict_frame(Device device, const float* before, const float* last, const float* readout, float seconds,
+void predict_frame(Device device, const RecentMotion& motion, const float* readout, float seconds,
                    const std::int32_t* records, std::int64_t num_records, const ShutterCamera& camera,
                    const PredictedFrame& out);
 

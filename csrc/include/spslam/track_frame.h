@@ -26,10 +26,10 @@ struct FrameTracking {
   std::int64_t again_iterations;  // of the second one, which begins near: with kernel_end, and keyframes from the start
   const std::int32_t* records;    // [num_records, 3] as they were read
   std::int64_t num_records;
-  FrameImages images;          // as they were read
-  const float *before, *last;  // [7] poses of the two frames before
-  const float* readout;        // [1] s
-  float seconds;               // from the last frame to this one
+  FrameImages images;    // as they were read
+  RecentMotion recent;   // of the two frames before
+  const float* readout;  // [1] s
+  float seconds;         // from the last frame to this one
   ShutterCamera camera, image_camera;
   PredictionLimits limits;
 };

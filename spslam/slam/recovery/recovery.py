@@ -125,7 +125,7 @@ class Recovery:
     def _may_have_slid(self, tracked: TrackedFrame, history: FrameHistory) -> bool:
         """Whether image features are used, and asked of this pose."""
         tracking = self._config.tracking
-        return tracking.features and tracking.recovery and may_have_slid(tracked.fit, history.interval_s)
+        return tracking.features and tracking.recovery and may_have_slid(tracked.fit, history)
 
     def _held(
         self,

@@ -16,16 +16,21 @@ CARRIED_CM_S, CARRIED_DEG_S = 150.0, 120.0
 CARRIED_CM_S2, CARRIED_DEG_S2 = 1000.0, 800.0
 
 
-def may_have_slid(fit: Fit, interval_s: float = 0.0) -> bool:
+def may_have_slid(fit: Fit, history: FrameHistory | None = None) -> bool:
     """Whether image features are to be asked: where surface leaves a direction free, and where the pose surprises.
 
     Args:
         fit: of the pose.
-        interval_s: from the frame before to this one, s; 0 where that is not known.
+        history: the frames before, which say how long ago the last one was; None asks for what holds of a camera's
+            usual 30 frames/s.
     """
     if fit.prediction_error_cm >= CONSISTENT_CM or fit.prediction_error_deg >= CONSISTENT_DEG:
         return True
-    if fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG or interval_s > RARE_S:
+    # A step longer than any that was seen does not say where the camera is if it leads elsewhere.
+    if history is not None and history.steps > 1 and fit.is_far_from_prediction:
+        return True
+    is_rare = history is not None and history.interval_s > RARE_S
+    if fit.prediction_error_cm > UNSURE_CM or fit.prediction_error_deg > UNSURE_DEG or is_rare:
         return fit.min_eigenvalue < UNSURE_EIGENVALUE or fit.deviation_m > UNSURE_DEVIATION_M
     return fit.min_eigenvalue < WEAK_EIGENVALUE
 
