@@ -43,7 +43,10 @@ SPS_INLINE TsdfSample sample_tsdf(const TsdfView& view, const Vec3<float>& world
   float colored = 0.0f;
   for (int c = 0; c < kCellCorners; ++c) {
     const std::int64_t place = voxel_place(view, cell_corner(corner, c));
-    if (place < 0 || !(view.weights[place] >= view.min_weight)) return {0.0f, {0.0f, 0.0f, 0.0f}, false};
+    if (place < 0) return {0.0f, {0.0f, 0.0f, 0.0f}, false};
+    // A voxel in which nothing was measured has distance 0, which is no surface.
+    const float voxel_weight = view.weights[place];
+    if (!(voxel_weight > 0.0f && voxel_weight >= view.min_weight)) return {0.0f, {0.0f, 0.0f, 0.0f}, false};
     const float weight = ((c & 1) ? local.x : 1.0f - local.x) * ((c & 2) ? local.y : 1.0f - local.y) *
                          ((c & 4) ? local.z : 1.0f - local.z);
     sample.sdf += weight * view.sdf[place];

@@ -63,7 +63,7 @@ struct TouchOptions {
   std::int32_t step;
 };
 
-// A field that is only read, and the weight from which a voxel counts as known.
+// A field that is only read, and the weight from which a voxel counts as known; one without any never does.
 struct TsdfView {
   VoxelTable table;
   const float* sdf;
