@@ -68,12 +68,12 @@ class NewestFrame:
         return features
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """All that a checkpoint needs."""
+        """All that a checkpoint needs; images as copies, as a segment may have the same ones."""
         pixels = self._read.pixels
         return {
             "frame": torch.tensor([self.number]),
-            "depth": pixels.depth_image,
-            "intensity": pixels.intensity_image,
+            "depth": pixels.depth_image.clone(),
+            "intensity": pixels.intensity_image.clone(),
             "poses": self._poses,
             "readout": self._readout,
             "seconds": torch.tensor([self._seconds], dtype=torch.float64),

@@ -90,8 +90,9 @@ def test_frames_seen_while_lost_get_poses_and_a_map(joined):
     assert ((rows >= KNOWN + BLACK) & (rows < len(ORDER) - len(BACK))).sum() >= 2
 
 
-def test_resumed_within_a_segment_it_gives_the_same_bytes(frames, joined, tmp_path):
-    resumed = lost_and_back(frames, KNOWN + BLACK + 4, tmp_path / "system")
+@pytest.mark.parametrize("stop_at", [KNOWN + BLACK + 4, COUNT - 1])  # both maps know the last two frames
+def test_resumed_within_a_segment_it_gives_the_same_bytes(frames, joined, tmp_path, stop_at):
+    resumed = lost_and_back(frames, stop_at, tmp_path / "system")
     resumed.finish()
     np.testing.assert_array_equal(resumed.trajectory().poses, joined.trajectory().poses)
     one, other = (system.state.scene.volume for system in (resumed, joined))
