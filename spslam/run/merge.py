@@ -89,7 +89,7 @@ def _config_of(folder: RunFolder) -> Config:
 def _merge(request: MergeRequest, config: Config, device: torch.device) -> dict[str, Any]:
     output = _output_of(request)
     archives = _archives(request, config)
-    joined = _joined(request.folders, archives, config)
+    joined, order = _joined(request.folders, archives, config)
     state = joined_state(RunFolder(request.folders[0]), joined, config, device)
     make_map(state, config)
     archive = archive_of(state, None, joined.settings)
@@ -97,7 +97,7 @@ def _merge(request: MergeRequest, config: Config, device: torch.device) -> dict[
     with temporary.locked():
         try:
             _empty(temporary.path)
-            metrics = _write(temporary, request, config, state, archive)
+            metrics = _write(temporary, request, config, state, archive, order)
             _rename(temporary.path, output)
         except BaseException:  # Ctrl-C among them: only a killed merge leaves its folder
             shutil.rmtree(temporary.path, ignore_errors=True)
@@ -143,9 +143,15 @@ def _archives(request: MergeRequest, config: Config) -> list[KeyframeArchive]:
     return archives
 
 
-def _joined(folders: Sequence[Path], archives: Sequence[KeyframeArchive], config: Config) -> KeyframeArchive:
-    """One map of all; each is joined as soon as it shares a place with those before."""
+def _joined(
+    folders: Sequence[Path], archives: Sequence[KeyframeArchive], config: Config
+) -> tuple[KeyframeArchive, list[int]]:
+    """One map of all, and its recordings' numbers in the order of the runs.
+
+    Each is joined as soon as it shares a place with those before, whose recordings then come first in the map.
+    """
     joined, waiting = archives[0], dict(zip(folders[1:], archives[1:], strict=True))
+    runs = [folders[0]] * len(joined.recordings)
     while waiting:
         reasons, before = {}, len(waiting)
         for folder, archive in list(waiting.items()):
@@ -154,12 +160,13 @@ def _joined(folders: Sequence[Path], archives: Sequence[KeyframeArchive], config
                 reasons[folder] = found
             else:
                 joined = found
+                runs += [folder] * len(archive.recordings)
                 del waiting[folder]
         if len(waiting) == before:
             break
     for folder, reason in reasons.items() if waiting else ():
         raise OutputError(f"{folder}: shares no place with {folders[0]}: {reason}")
-    return joined
+    return joined, sorted(range(len(runs)), key=lambda recording: folders.index(runs[recording]))
 
 
 def joined_state(folder: RunFolder, joined: KeyframeArchive, config: Config, device: torch.device) -> SlamState:
@@ -191,19 +198,26 @@ def make_map(state: SlamState, config: Config) -> None:
 
 
 def _write(
-    folder: OutputFolder, request: MergeRequest, config: Config, state: SlamState, archive: KeyframeArchive
+    folder: OutputFolder,
+    request: MergeRequest,
+    config: Config,
+    state: SlamState,
+    archive: KeyframeArchive,
+    order: Sequence[int],
 ) -> dict[str, Any]:
+    """Writes all results; `order` says which recordings of the archive are the runs', in their order."""
     atomic_write(folder.config, dump_config(config, provenance(config, state.scene.device)))
     state.scene.save(folder.map)
     archive.save(folder.keyframes)
-    for number, recording in enumerate(archive.recordings):
+    recordings = [archive.recordings[number] for number in order]
+    for number, recording in enumerate(recordings):
         recording.trajectory.save_tum(folder.trajectory_of(number))
-    lost = [int(each.trajectory.lost.sum()) for each in archive.recordings]
+    lost = [int(each.trajectory.lost.sum()) for each in recordings]
     metrics: dict[str, Any] = {
         **origin(config, state.scene.device, request.command),
         "merged": [str(folder) for folder in request.folders],
-        "recordings": [each.name for each in archive.recordings],
-        "frames": sum(len(each.trajectory) for each in archive.recordings),
+        "recordings": [each.name for each in recordings],
+        "frames": sum(len(each.trajectory) for each in recordings),
         "lost_frames": sum(lost),
         **scene_figures(state.scene),
         **graph_figures(len(archive.keyframes), archive.edges),

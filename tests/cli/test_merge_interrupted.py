@@ -15,7 +15,7 @@ def request_of(tmp_path, monkeypatch):
     """A function that makes a request to merge runs, whose maps are stubs and whose results one file."""
     for name in ("_archives", "make_map", "archive_of"):
         monkeypatch.setattr(merge, name, lambda *_: None)
-    monkeypatch.setattr(merge, "_joined", lambda *_: SimpleNamespace(settings=None))
+    monkeypatch.setattr(merge, "_joined", lambda *_: (SimpleNamespace(settings=None), []))
     monkeypatch.setattr(merge, "joined_state", lambda *_: None)
     monkeypatch.setattr(merge, "_config_of", lambda _: SimpleNamespace())
 
@@ -81,12 +81,17 @@ def test_maps_are_joined_in_any_order_that_works(monkeypatch, order):
     """`far` shares a place with `near` only."""
     shared = [{"one", "near"}, {"near", "far"}]
 
+    def of(names):
+        return SimpleNamespace(recordings=list(names))
+
     def join(first, second, _):
-        return first | second if any({a, b} in shared for a in first for b in second) else "no place is shared"
+        one, other = first.recordings, second.recordings
+        return of(one + other) if any({a, b} in shared for a in one for b in other) else "no place is shared"
 
     monkeypatch.setattr(merge, "join_archives", join)
     monkeypatch.setattr(merge, "registrar_of", lambda *_: None)
-    joined = merge._joined([Path(name) for name in order], [{name} for name in order], None)
-    assert joined == {"one", "near", "far"}
+    joined, rows = merge._joined([Path(name) for name in order], [of([name]) for name in order], None)
+    assert joined.recordings == ["one", "near", "far"]
+    assert tuple(joined.recordings[row] for row in rows) == order
     with pytest.raises(OutputError, match="far: shares no place with one: no place is shared"):
-        merge._joined([Path("one"), Path("far")], [{"one"}, {"far"}], None)
+        merge._joined([Path("one"), Path("far")], [of(["one"]), of(["far"])], None)

@@ -10,6 +10,7 @@ from spslam.config import load_config
 from spslam.datasets import open_dataset
 from spslam.errors import ConfigError, OutputError, SpslamError
 from spslam.evaluation.run_output import match_times
+from spslam.run import merge
 from spslam.run.merge import MergeRequest, merge_runs
 from spslam.run.sequence import RunRequest, run_sequence
 from spslam.run_folder import RunFolder
@@ -156,6 +157,27 @@ def test_merged_runs_are_in_one_world(runs, tmp_path):
     system = SlamSystem(settings(), dataset.camera)
     system.open_map(again)
     assert np.abs(system.process(dataset[60]).pose - dataset.poses()[60]).max() < 0.02
+
+
+def test_trajectories_are_in_the_order_of_the_runs_whichever_joins_first(runs, tmp_path, monkeypatch):
+    third, output = run(tmp_path / "third", slice(66, 86), "scene.first_pose=identity"), tmp_path / "merged"
+    join = merge.join_archives
+
+    def later(joined, archive, registrar):
+        """As if the third shared no place but with the second."""
+        is_third = len(archive.recordings[0].trajectory) == 20
+        return "not yet" if is_third and len(joined.recordings) == 1 else join(joined, archive, registrar)
+
+    monkeypatch.setattr(merge, "join_archives", later)
+    folders = [runs / "first", third, runs / "second"]
+    assert merge_runs(MergeRequest(folders, output, mesh=False))["merged"] == list(map(str, folders))
+    for number, folder in enumerate(folders):
+        expected, found = (
+            Trajectory.load_tum(path)
+            for path in (RunFolder(folder).trajectory, RunFolder(output).trajectory_of(number))
+        )
+        assert found.timestamps.tolist() == expected.timestamps.tolist()
+        assert error_cm(found, open_dataset(settings().dataset)) < 1.5
 
 
 def test_other_places_are_not_merged(runs, tmp_path):
