@@ -28,6 +28,7 @@ from spslam.run_folder import RunFolder
 from spslam.scene import Scene
 from spslam.slam.graph.archive import KeyframeArchive
 from spslam.slam.graph.joined import join_archives, registrar_of
+from spslam.slam.graph.joining import MIN_LOOPS
 from spslam.slam.mapper import Mapper
 from spslam.slam.opened_map import (
     archive_of,
@@ -130,7 +131,7 @@ def _empty(path: Path) -> None:
 
 def _archives(request: MergeRequest, config: Config) -> list[KeyframeArchive]:
     """Those of the runs, of different recordings and alike in what must be alike."""
-    archives = [load_archive(RunFolder(folder)) for folder in request.folders]
+    archives = [load_archive(RunFolder(folder), MIN_LOOPS) for folder in request.folders]
     settings = map_settings(config, load_prior(config.prior.weights, config.prior.neighborhood))
     for folder, archive in zip(request.folders, archives, strict=True):
         check_settings(folder, archive, settings)

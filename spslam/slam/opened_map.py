@@ -55,8 +55,8 @@ def check_settings(path: Path, archive: KeyframeArchive, settings: dict[str, Any
         raise ConfigError(f"{option} must be {in_yaml(known)}, that of the map {path}, got {in_yaml(value)}")
 
 
-def load_archive(folder: RunFolder) -> KeyframeArchive:
-    """The keyframes of a finished run; raises OutputError where it has none, or they can't be read."""
+def load_archive(folder: RunFolder, least: int = 1) -> KeyframeArchive:
+    """The keyframes of a finished run; raises OutputError where it has fewer than so many, or they can't be read."""
     if not folder.path.is_dir():
         raise OutputError(f"{folder.path}: must be the output folder of a finished run, but is no folder")
     for required in (folder.metrics, folder.map):
@@ -69,6 +69,10 @@ def load_archive(folder: RunFolder) -> KeyframeArchive:
     archive = KeyframeArchive.load(folder.keyframes)
     if not archive.keyframes:
         raise OutputError(f"{folder.path}: its map has no keyframes")
+    if len(archive.keyframes) < least:
+        raise OutputError(
+            f"{folder.path}: its map has one keyframe, and a place is known by two that agree; let the camera move more"
+        )
     return archive
 
 

@@ -18,6 +18,7 @@ from spslam.scene import Scene
 from spslam.slam.arrival import FrameArrival
 from spslam.slam.frame_pipeline import FramePipeline, PoseCallback
 from spslam.slam.frame_report import FrameReport
+from spslam.slam.graph.joining import MIN_LOOPS
 from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.opened_map import check_settings, load_archive, map_settings, open_map
 from spslam.slam.prepared_frame import PreparedFrame
@@ -89,7 +90,8 @@ class SlamSystem(FramePipeline):
             folder: output folder of the run.
 
         Raises:
-            OutputError: the folder is not that of a finished run with a keyframe graph, or a file is damaged.
+            OutputError: the folder is not that of a finished run with a keyframe graph, its map has a single keyframe,
+                or a file is damaged.
             ConfigError: an option by which the maps can't be one.
             ValueError: frames were processed already.
         """
@@ -100,7 +102,7 @@ class SlamSystem(FramePipeline):
         if not self.config.tracking.features:
             raise ConfigError("a map can be opened with tracking.features=true only: they find the camera")
         path = Path(folder)
-        archive = load_archive(RunFolder(path))
+        archive = load_archive(RunFolder(path), MIN_LOOPS)
         check_settings(path, archive, self.map_settings())
         open_map(self.state, Scene.load(RunFolder(path).map, self.device), archive)
 

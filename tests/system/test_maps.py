@@ -233,6 +233,18 @@ def test_folders_that_hold_no_map_are_refused(runs, tmp_path):
         assert str(folder) in str(error.value) and "\n" not in str(error.value)
 
 
+def test_a_map_of_one_keyframe_is_refused_as_no_two_can_agree(runs, tmp_path):
+    """Even the frame that it is of was said to show no place of it."""
+    still = run(tmp_path / "still", slice(0, 1))
+    message = f"{still}: its map has one keyframe, and a place is known by two that agree"
+    with pytest.raises(OutputError, match=message):
+        run(tmp_path / "run", slice(0, 4), map=still)
+    for folders in ([runs / "second", still], [still, runs / "second"]):
+        with pytest.raises(OutputError, match=message):
+            merge_runs(MergeRequest(folders, tmp_path / "out"))
+    assert [path.name for path in tmp_path.iterdir()] == ["still"]
+
+
 def test_merges_that_can_not_be_are_refused(runs, tmp_path):
     for folders, message in (
         ([runs / "first"], "two finished runs"),
