@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from spslam.config import Config, dump_config, load_config
-from spslam.errors import OutputError
+from spslam.errors import ConfigError, OutputError
 from spslam.io import atomic_write
 from spslam.prior import load_prior
 from spslam.run.device import explained_failures, resolve_device
@@ -131,6 +131,11 @@ def _empty(path: Path) -> None:
 
 def _archives(request: MergeRequest, config: Config) -> list[KeyframeArchive]:
     """Those of the runs, of different recordings and alike in what must be alike."""
+    if not config.tracking.features:
+        raise ConfigError(
+            f"{request.folders[0]}: a merge has the first run's options, and maps are joined with "
+            "tracking.features=true only; name another run first"
+        )
     archives = [load_archive(RunFolder(folder), MIN_LOOPS) for folder in request.folders]
     settings = map_settings(config, load_prior(config.prior.weights, config.prior.neighborhood))
     for folder, archive in zip(request.folders, archives, strict=True):

@@ -2,11 +2,12 @@
 
 import json
 import os
+import shutil
 
 import numpy as np
 import pytest
 
-from spslam.config import load_config
+from spslam.config import dump_config, load_config
 from spslam.datasets import open_dataset
 from spslam.errors import ConfigError, OutputError, SpslamError
 from spslam.evaluation.run_output import match_times
@@ -256,6 +257,15 @@ def test_merges_that_can_not_be_are_refused(runs, tmp_path):
     (tmp_path / "out" / "file").write_text("")
     with pytest.raises(OutputError, match="is not an empty folder"):
         merge_runs(MergeRequest([runs / "first", runs / "second"], tmp_path / "out"))
+
+
+def test_a_merge_looks_for_places_with_the_options_of_the_first_run(runs, tmp_path):
+    plain = tmp_path / "plain"
+    shutil.copytree(runs / "first", plain)
+    config = settings("tracking.features=false")
+    RunFolder(plain).config.write_text(dump_config(config))
+    with pytest.raises(ConfigError, match="plain: a merge has the first run's options.*tracking.features=true only"):
+        merge_runs(MergeRequest([plain, runs / "second"], tmp_path / "out"))
 
 
 @pytest.mark.slow
