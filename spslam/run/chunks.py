@@ -181,7 +181,8 @@ def _task(request: RunRequest, chunk: Chunk, device: str) -> Task:
     changes: dict[str, dict[str, Any]] = {"run": dict(previews=0)}
     if chunk.number:
         # The first one defines the world, and what a look at the first frames finds is found there.
-        changes["run"]["data_check"] = "warn"
+        if config.run.data_check == "stop":
+            changes["run"]["data_check"] = "warn"
         changes["scene"] = {"first_pose": "identity"}
     values = config.model_dump(mode="json")
     for section, options in changes.items():

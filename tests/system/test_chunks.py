@@ -71,6 +71,15 @@ def test_chunks_cover_a_recording():
     assert len(cut(300, ChunkOptions(4))) == 4
 
 
+@pytest.mark.parametrize(("choice", "later"), [("stop", "warn"), ("warn", "warn"), ("skip", "skip")])
+def test_later_chunks_look_at_their_first_frames_but_do_not_stop(tmp_path, choice, later):
+    executor = Broken()
+    with pytest.raises(SpslamError, match="2 of 2 chunks failed"):
+        run_chunks(request(tmp_path / "run", f"run.data_check={choice}"), OPTIONS, executor)
+    found = {task.key: task.arguments["config"]["run"]["data_check"] for task in executor.started}
+    assert found == {"chunk-1": choice, "chunk-2": later}
+
+
 def test_results_are_those_of_one_run(joined, tmp_path):
     one_piece = run_sequence(request(tmp_path / "one", mesh=False))
     output = RunOutput.read(joined)
@@ -126,13 +135,14 @@ class Broken:
     slots = None
 
     def __init__(self):
-        self.keys = []
+        self.keys, self.started = [], []
 
     def prepare(self, tasks):
         pass
 
     def start(self, task):
         self.keys.append(task.key)
+        self.started.append(task)
 
     def wait(self):
         return TaskEnd(self.keys.pop(), "out of luck")
