@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -188,7 +189,8 @@ def _task(request: RunRequest, chunk: Chunk, device: str) -> Task:
     for section, options in changes.items():
         values[section] |= options
     values["device"] = device
-    data = None if request.data_dir is None else str(Path(request.data_dir).resolve())
+    # Not what a link leads to: its name may tell the camera.
+    data = None if request.data_dir is None else os.path.abspath(request.data_dir)
     if config.prior.weights is not None:
         values["prior"]["weights"] = str(Path(config.prior.weights).resolve())
     chosen = request.frames or slice(None)

@@ -23,7 +23,7 @@ from spslam.tasks.local import LocalExecutor
 from spslam.tasks.task import TaskEnd
 from spslam.trajectory import Trajectory
 from tests.cli.command import assert_refused, spslam
-from tests.system.sequences import settings
+from tests.system.sequences import settings, write_room
 from tests.system.test_maps import SETTINGS
 from tests.system.test_segments import Frames
 from tests.tasks.examples import InThisProcess
@@ -78,6 +78,15 @@ def test_later_chunks_look_at_their_first_frames_but_do_not_stop(tmp_path, choic
         run_chunks(request(tmp_path / "run", f"run.data_check={choice}"), OPTIONS, executor)
     found = {task.key: task.arguments["config"]["run"]["data_check"] for task in executor.started}
     assert found == {"chunk-1": choice, "chunk-2": later}
+
+
+def test_chunks_read_the_recording_under_the_name_that_was_given(tmp_path):
+    """By which the camera of some is known, such as freiburg1."""
+    link, executor = tmp_path / "named", Broken()
+    link.symlink_to(write_room(tmp_path / "stored", 12))
+    with pytest.raises(SpslamError, match="2 of 2 chunks failed"):
+        run_chunks(RunRequest(load_config("7scenes"), link, tmp_path / "run"), ChunkOptions(2, 4), executor)
+    assert {task.arguments["data"] for task in executor.started} == {str(link)}
 
 
 def test_results_are_those_of_one_run(joined, tmp_path):
