@@ -12,7 +12,7 @@ from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.errors import DatasetError, OutputError
 from spslam.evaluation.run_output import RunOutput, match_times
 
-# Intrinsics of one calibration agree to this, px: what rounding of a file or of another machine changes.
+# Intrinsics of one calibration agree to this, px.
 _SAME_PX = 0.01
 
 
@@ -70,7 +70,7 @@ def data_of_run(run: RunOutput, dataset: RgbdDataset) -> tuple[RunData, list[str
     Raises:
         OutputError: the camera is not the run's.
     """
-    if run.camera is not None and not _same(run.camera, dataset.camera):
+    if run.camera is not None and not is_same_camera(run.camera, dataset.camera):
         raise OutputError(
             f"{run.folder.path}: the data has changed since the run, whose camera was {_in_words(run.camera)}; that of "
             f"{dataset.name} is {_in_words(dataset.camera)}: restore the data, or run it again"
@@ -83,7 +83,8 @@ def data_of_run(run: RunOutput, dataset: RgbdDataset) -> tuple[RunData, list[str
     return RunData(dataset), [f"{missing} of {_frames(len(known))} of the run {lost}"]
 
 
-def _same(one: Camera, other: Camera) -> bool:
+def is_same_camera(one: Camera, other: Camera) -> bool:
+    """Whether two cameras are one, up to what rounding of a file or of another machine changes."""
     numbers = [np.array([camera.fx, camera.fy, camera.cx, camera.cy]) for camera in (one, other)]
     sizes = [(camera.width, camera.height) for camera in (one, other)]
     return sizes[0] == sizes[1] and bool(np.abs(numbers[0] - numbers[1]).max() <= _SAME_PX)

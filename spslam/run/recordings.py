@@ -12,6 +12,8 @@ import pydantic
 from spslam.datasets import open_sequence
 from spslam.datasets.base import RgbdDataset
 from spslam.errors import SpslamError
+from spslam.evaluation.run_data import is_same_camera
+from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh
 from spslam.options import DatasetOptions, MeshOptions
 from spslam.run.mesh import EarlierFrames, MeshJob, TextureWish, noise_of_model, write_mesh
@@ -81,11 +83,17 @@ def write_map_mesh(
 
 
 def _open_again(recording: Recording) -> RgbdDataset | str:
-    """The dataset of a recording; in words why it can't be read."""
+    """The dataset of a recording; in words why it can't be read, or is another one now."""
     options = recording.source.get("dataset")
     if not isinstance(options, dict):
         return "its frames came once"
     try:
-        return open_sequence(DatasetOptions(**options))
+        dataset = open_sequence(DatasetOptions(**options))
     except (SpslamError, pydantic.ValidationError, TypeError) as error:
         return f"its frames can't be read again ({' '.join(str(error).split())[:200]})"
+    if not is_same_camera(recording.camera, dataset.camera):
+        return f"{dataset.name} is of another camera now"
+    known = recording.trajectory.timestamps[~recording.trajectory.lost]
+    if len(known) and bool((match_times(dataset.timestamps(), known) < 0).all()):
+        return f"none of its frames is in {dataset.name} any more"
+    return dataset

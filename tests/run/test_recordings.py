@@ -1,8 +1,13 @@
 """The frames of a map's recordings, read again."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from spslam.config import load_config
+from spslam.datasets import open_dataset
 from spslam.run.recordings import read_again
 from spslam.slam.graph.archive import KeyframeArchive, Recording
 from spslam.trajectory import Trajectory
@@ -27,9 +32,29 @@ def test_without_any_the_first_fault_is_named(tmp_path):
     assert frames[0].dataset is None and "its frames can't be read again" in missing[0]
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda each: replace(each, camera=replace(each.camera, fx=each.camera.fx + 1)), "is of another camera now"),
+        (lambda each: replace(each, trajectory=shifted(each.trajectory)), "none of its frames is in .* any more"),
+    ],
+)
+def test_other_data_in_its_place_is_not_taken_for_it(tmp_path, change, reason):
+    """It was fused with its own camera, or ended the run because no frame of it had a pose."""
+    recording = change(of(write_folder(tmp_path / "frames")))
+    frames, missing = read_again(KeyframeArchive([recording], [], [], None, [], set(), {}), [recording])
+    assert frames[0].dataset is None
+    assert re.fullmatch(f"the mesh is of the map alone where frames was: .*{reason}", missing[0])
+
+
+def shifted(trajectory):
+    return Trajectory(trajectory.timestamps + 1000.0, trajectory.poses, trajectory.lost)
+
+
 def of(folder):
     config = load_config("folder", None, [f"dataset.path={folder}"])
     count = len(list((folder / "color").iterdir()))
     poses = np.tile(np.eye(4), (count, 1, 1))
-    trajectory = Trajectory(np.arange(float(count)), poses, np.zeros(count, bool))
-    return Recording("frames", {"dataset": config.dataset.model_dump(mode="json")}, None, trajectory)
+    dataset = open_dataset(config.dataset)
+    trajectory = Trajectory(dataset.timestamps(), poses, np.zeros(count, bool))
+    return Recording("frames", {"dataset": config.dataset.model_dump(mode="json")}, dataset.camera, trajectory)
