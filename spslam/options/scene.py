@@ -26,7 +26,7 @@ class SceneOptions(Section):
     plane_cell_m: float = option("edge length of a tri-plane cell", "m", gt=0, le=4)
     position_scale: float = option("scale of the position that the geometry decoder takes as input", "1/m", gt=0)
     first_pose: Literal["dataset", "identity"] = option(
-        "pose of the first frame: the dataset's ground truth if there is one, or the identity"
+        "pose of the frame that the map begins with: the dataset's ground truth if there is one, or the identity"
     )
     max_voxels: int = option("maximum number of voxel vertices in the volume", "vertices", ge=1000)
     max_texels: int = option("maximum number of texels in the tri-planes", "texels", ge=1000)

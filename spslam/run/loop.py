@@ -6,6 +6,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+import numpy as np
+
 from spslam.errors import DatasetError
 from spslam.run.checkpoint_writer import CheckpointWriter
 from spslam.run.frame_feed import FrameFeed
@@ -37,6 +39,8 @@ class RunLoop:
         progress: called after each frame with (frames done, total frames, report of the frame or None if the frame
             could not be read).
         observer: watches the run and may pause it between two frames.
+        first_poses: float64 [N, 4, 4] by the frames' index, where the map begins; NaN where that is not known. None
+            where it begins at the system's first pose.
     """
 
     def __init__(
@@ -46,8 +50,10 @@ class RunLoop:
         session: RunSession,
         progress: Progress | None,
         observer: RunObserver | None = None,
+        first_poses: np.ndarray | None = None,
     ):
         self.system, self.feed, self.session, self.progress = system, feed, session, progress
+        self.first_poses = first_poses
         self.observer = observer or RunObserver()
         self._pending: deque[tuple[int, PendingReport | None]] = deque()
         self._logs_meanwhile, self._logged = False, 0.0
@@ -116,6 +122,8 @@ class RunLoop:
         if isinstance(item, DatasetError):
             self.session.folder.record_skipped(position, item)
             return None
+        if self.first_poses is not None:
+            self.system.begin_at(self.first_poses[item.index])
         pending = self.system.submit(item)
         self.feed.want_features(self.system.features.are_expected)
         return pending

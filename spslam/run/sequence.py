@@ -19,7 +19,7 @@ from spslam.run.observer import ObservedRun, RunObserver
 from spslam.run.output_folder import OutputFolder
 from spslam.run.request import RunRequest
 from spslam.run.results import RunInput, write_results
-from spslam.run.session import RunSession, finished_metrics, open_session
+from spslam.run.session import finished_metrics, open_session
 from spslam.run.threads import kernel_threads_limited, library_threads_limited
 from spslam.run.warm_up import warm_up
 from spslam.slam.interpreter import interpreter_shared
@@ -89,32 +89,32 @@ def _run(
             earlier = session.folder.read_log() if session.start else []
             observer.begin(ObservedRun.of(request, dataset, earlier), system.state)
             with FrameFeed(dataset, request.config, device, session.start, system.state.frames.processed) as feed:
-                _process(feed, system, session, progress, observer, started)
+                poses = first_poses(request.config, dataset)
+                _process(feed, RunLoop(system, feed, session, progress, observer, poses), started)
             frames = system.state.frames
             indices = frames.indices[frames.opened :].tolist()
             source = RunInput.of_dataset(dataset, indices, request.config.run.previews)
             return write_results(system, source, request, session)
 
 
-def _process(
-    feed: FrameFeed,
-    system: SlamSystem,
-    session: RunSession,
-    progress: Progress | None,
-    observer: RunObserver,
-    started: float,
-) -> None:
+def _process(feed: FrameFeed, loop: RunLoop, started: float) -> None:
+    system = loop.system
     device = system.device
     if device.type == "cuda":
         warm_up(system.config, system.camera, device)
         torch.cuda.reset_peak_memory_stats(device)
     feed.prepare()
-    session.clock.start_s = time.perf_counter() - started
+    loop.session.clock.start_s = time.perf_counter() - started
     with kernel_threads_limited(device), interpreter_shared():
-        RunLoop(system, feed, session, progress, observer).run()
+        loop.run()
 
 
 def first_pose(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
     """The pose that a run over a dataset begins at, float64 [4, 4]; None where it is to be the identity."""
-    poses = dataset.poses() if config.scene.first_pose == "dataset" else None
+    poses = first_poses(config, dataset)
     return poses[0] if poses is not None and bool(np.isfinite(poses[0]).all()) else None
+
+
+def first_poses(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
+    """Where a run begins if its map begins with a later frame, as of `RunLoop`."""
+    return dataset.poses() if config.scene.first_pose == "dataset" else None

@@ -53,7 +53,7 @@ class FramePipeline:
         config: options of the run.
         camera: of all frames.
         device: where the map lives.
-        first_pose: float64 [4, 4] T_world_camera of the first frame.
+        first_pose: float64 [4, 4] T_world_camera of the first frame, or of the one that the map begins with.
         state: everything known between two frames.
         features: keeps image features of frames, and knows whether those of the next ones will be asked for.
         while_tracking: called in each frame while the device tracks it, for what the host has to do in any case.
@@ -111,6 +111,16 @@ class FramePipeline:
         check_first_pose(first_pose)
         self.first_pose = first_pose
         self.adopt(SlamState.start(self.config, self.camera, first_pose, self._decoder, self.device))
+
+    def begin_at(self, pose: np.ndarray) -> None:
+        """Says where the next frame is, float64 [4, 4], in case the map begins with it; not finite, it says nothing.
+
+        Raises:
+            DatasetError: as `SlamSystem`.
+        """
+        if not self._has_map and bool(np.isfinite(pose).all()):
+            check_first_pose(pose)
+            self.first_pose = pose
 
     def adopt(self, state: SlamState) -> None:
         """Goes on from a state of the same options and camera; map and trajectory as they were are forgotten."""

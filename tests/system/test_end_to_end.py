@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from spslam.errors import DatasetError
 from spslam.evaluation.trajectory_metrics import ate
 from spslam.scene import Scene
 from spslam.slam.system import SlamSystem
@@ -96,6 +97,21 @@ def test_the_first_pose_is_the_datasets_or_the_identity(monkeypatch, tmp_path):
         run_on(monkeypatch, dataset, output, f"scene.first_pose={first_pose}")
         found = Trajectory.load_tum(output / "trajectory.txt").poses[0]
         np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("is_readable", [True, False])
+def test_where_the_first_frames_show_nothing_a_later_one_is_where_the_dataset_says(monkeypatch, tmp_path, is_readable):
+    def change(frame):
+        if frame.index < 4 and not is_readable:
+            raise DatasetError("broken")
+        if frame.index < 8:
+            frame.depth[:] = 0
+
+    dataset = Recorded(12, change, is_random_access=True)
+    run_on(monkeypatch, dataset, tmp_path / "out", "run.data_check=skip", "mapping.iterations=3")
+    found = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt")
+    assert (~found.lost).sum() == 4
+    np.testing.assert_allclose(found.poses[-4:, :3, 3], dataset.poses()[-4:, :3, 3], atol=0.005)
 
 
 @pytest.mark.parametrize("distance_m", [pytest.param(1000.0, marks=pytest.mark.slow), 5000.0])
