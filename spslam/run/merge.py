@@ -192,9 +192,14 @@ def joined_state(folder: RunFolder, joined: KeyframeArchive, config: Config, dev
 
 
 def make_map(state: SlamState, config: Config) -> None:
-    """Makes the map of a state again from all keyframes, and optimizes it over all of them, some at a time."""
+    """Makes the map of a state again from all keyframes, and optimizes it over all of them, some at a time.
+
+    Without `mapping.first_iterations` it is as the keyframes are fused.
+    """
     prior = load_prior(config.prior.weights, config.prior.neighborhood)
     remake_map(state, prior, config)
+    if config.mapping.first_iterations == 0:
+        return
     mapper = Mapper(config, state.frames.camera, prior)
     rows = state.usable.nonzero()[:, 0].to(state.scene.device)
     parts = -(-len(rows) // config.mapping.frames)

@@ -259,11 +259,21 @@ def test_merges_that_can_not_be_are_refused(runs, tmp_path):
         merge_runs(MergeRequest([runs / "first", runs / "second"], tmp_path / "out"))
 
 
+def with_options(run_folder, folder, *overrides):
+    """A copy of a run, as if it had been made with other options."""
+    shutil.copytree(run_folder, folder)
+    RunFolder(folder).config.write_text(dump_config(settings(*overrides)))
+    return folder
+
+
+def test_a_map_that_is_not_optimized_is_merged(runs, tmp_path):
+    plain = with_options(runs / "first", tmp_path / "plain", "mapping.iterations=0", "mapping.first_iterations=0")
+    metrics = merge_runs(MergeRequest([plain, runs / "second"], tmp_path / "out", mesh=False))
+    assert metrics["voxels"] > 1000
+
+
 def test_a_merge_looks_for_places_with_the_options_of_the_first_run(runs, tmp_path):
-    plain = tmp_path / "plain"
-    shutil.copytree(runs / "first", plain)
-    config = settings("tracking.features=false")
-    RunFolder(plain).config.write_text(dump_config(config))
+    plain = with_options(runs / "first", tmp_path / "plain", "tracking.features=false")
     with pytest.raises(ConfigError, match="plain: a merge has the first run's options.*tracking.features=true only"):
         merge_runs(MergeRequest([plain, runs / "second"], tmp_path / "out"))
 
