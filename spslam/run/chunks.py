@@ -77,8 +77,10 @@ def run_chunks(
         SpslamError: as `run_sequence`; a chunk failed; or two chunks share no place.
         ConfigError: too many chunks, or a run without a keyframe graph.
     """
-    if not request.config.graph.enabled:
-        raise ConfigError("--chunks needs graph.enabled=true: chunks are joined by their keyframes")
+    if not (request.config.graph.enabled and request.config.prior.enabled):
+        raise ConfigError(
+            "--chunks needs graph.enabled=true and prior.enabled=true: chunks are joined by their keyframes"
+        )
     dataset = open_sequence(request.config.dataset, request.data_dir, request.frames)
     chunks = cut(len(dataset), options)
     folder = OutputFolder(Path(request.output_dir))

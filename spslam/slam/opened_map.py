@@ -64,7 +64,8 @@ def load_archive(folder: RunFolder, least: int = 1) -> KeyframeArchive:
             raise OutputError(f"{folder.path}: must be the output folder of a finished run, but has no {required.name}")
     if not folder.keyframes.is_file():
         raise OutputError(
-            f"{folder.path}: has no {folder.keyframes.name}, which runs with graph.enabled=true write; run it again"
+            f"{folder.path}: has no {folder.keyframes.name}, which runs with graph.enabled=true and prior.enabled=true "
+            "write; run it again"
         )
     archive = KeyframeArchive.load(folder.keyframes)
     if not archive.keyframes:

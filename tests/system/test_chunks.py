@@ -281,6 +281,7 @@ def test_a_chunk_that_fails_is_named(tmp_path):
         (("--chunks", "2", "--copy-data"), "--copy-data needs --cluster"),
         (("--chunks", "9", "--frames", "0:90"), "--chunks must leave more frames in each than the 60"),
         (("--chunks", "2", "--set", "graph.enabled=false"), "--chunks needs graph.enabled=true"),
+        (("--chunks", "2", "--set", "prior.enabled=false"), "--chunks needs graph.enabled=true and prior.enabled=true"),
     ],
 )
 def test_what_does_not_go_together_is_refused(tmp_path, arguments, message):

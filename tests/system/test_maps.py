@@ -225,7 +225,7 @@ def test_folders_that_hold_no_map_are_refused(runs, tmp_path):
     for folder, message in (
         (tmp_path / "missing", "is no folder"),
         (tmp_path, "must be the output folder of a finished run"),
-        (plain, "runs with graph.enabled=true write"),
+        (plain, "runs with graph.enabled=true and prior.enabled=true write"),
         (broken, "not a readable keyframe archive"),
         (old, "not a keyframe archive of format"),
     ):
