@@ -106,7 +106,10 @@ def _path_of(config: Config) -> str | None:
 
 def with_absolute_path(config: Config) -> Config:
     """The options as they hold in any working directory."""
-    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"path": _path_of(config)})})
+    weights = config.prior.weights
+    prior = config.prior.model_copy(update={"weights": None if weights is None else os.path.abspath(weights)})
+    dataset = config.dataset.model_copy(update={"path": _path_of(config)})
+    return config.model_copy(update={"dataset": dataset, "prior": prior})
 
 
 def finished_metrics(request: RunRequest, dataset: RgbdDataset) -> dict[str, Any] | None:

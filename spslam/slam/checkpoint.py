@@ -5,6 +5,7 @@ One safetensors file, written to a temporary file, synced and renamed: a kill at
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ def fingerprint(config: Config) -> str:
     for section in ("device", "preset", "run", "mesh"):
         content.pop(section)
     content["dataset"].pop("path")
+    weights = content["prior"]["weights"]
+    content["prior"]["weights"] = None if weights is None else os.path.abspath(weights)  # as config.yaml has it
     # A run that reached a limit can continue when the limit is raised.
     for limit in ("max_voxels", "max_texels"):
         content["scene"].pop(limit)

@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,8 +11,10 @@ import time
 
 import pytest
 
+from spslam.config import load_config
 from spslam.datasets import registry
 from spslam.errors import DatasetError, OutputError
+from spslam.prior.encoder import shipped_weights
 from spslam.run import loop as run_loop
 from spslam.run.output_folder import OutputFolder
 from spslam.run.sequence import RunRequest, run_sequence
@@ -277,3 +280,13 @@ def test_ctrl_c_while_the_map_is_completed_ends_the_run(monkeypatch, tmp_path):
     run_on(monkeypatch, Recorded(4), tmp_path / "out", resume=True)
     run_on(monkeypatch, Recorded(4), tmp_path / "whole")
     assert results(tmp_path / "out") == results(tmp_path / "whole")
+
+
+def test_options_that_were_saved_hold_in_any_working_directory(monkeypatch, tmp_path):
+    """Weights that were named by a relative path too: `spslam merge` reads them from wherever it is called."""
+    shutil.copy(shipped_weights(64), tmp_path / "own.safetensors")
+    monkeypatch.chdir(tmp_path)
+    metrics = run_on(monkeypatch, Recorded(2), tmp_path / "out", "prior.weights=own.safetensors")
+    assert load_config(tmp_path / "out" / "config.yaml").prior.weights == str(tmp_path / "own.safetensors")
+    again = run_on(monkeypatch, Recorded(2), tmp_path / "out", "prior.weights=own.safetensors", resume=True)
+    assert again == metrics
