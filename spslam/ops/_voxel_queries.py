@@ -25,8 +25,10 @@ def vertices_around(points: torch.Tensor, voxel_size: float, band: float) -> tor
 
     Points that are not finite, or whose vertices are out of range, have none.
     """
-    lower = torch.floor((points.double() - band) / voxel_size)
-    upper = torch.floor((points.double() + band) / voxel_size) + 1
+    # As look-ups round: a point on a side of a cell is in the same one of both for them.
+    at = (points * (1 / torch.tensor(voxel_size, dtype=points.dtype))).double()
+    lower = torch.floor(at - band / voxel_size)
+    upper = torch.floor(at + band / voxel_size) + 1
     in_range = ((lower >= VOXEL_COORD_MIN) & (upper <= VOXEL_COORD_MAX)).all(1)
     low, high = lower[in_range].long(), upper[in_range].long()
     keys, spans = pack(low), high - low

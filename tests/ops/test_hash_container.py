@@ -132,6 +132,18 @@ def test_vertices_around_points(band, device, generator):
     assert len(limited) == 0
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("voxel_size", [0.01, 0.03, 0.04, 0.05])
+def test_points_on_sides_of_voxels_are_in_the_cells_around_them(dtype, voxel_size, device):
+    """Such as those of a wall at a round number: insertion and look-up must round alike."""
+    sides = voxel_size * torch.arange(-200, 200, dtype=torch.float64)
+    points = torch.stack([sides, sides.flip(0), 0.3 * sides], 1).to(device, dtype)
+    for band in (0.0, voxel_size):
+        cells = ops.VoxelHash(device=device)
+        cells.insert_points(points, voxel_size, band)
+        assert (cells.lookup(points, voxel_size)[0][:, 0] >= 0).all()
+
+
 def test_copies_and_words(device, generator):
     cells = filled(generator, device, max_voxels=1000)
     assert tuple(cells.voxel_coords[3].tolist()) in cells
