@@ -101,6 +101,13 @@ def test_time_of_flight_wiggles_with_distance():
     assert np.ptp(bias) == pytest.approx(2 * WIGGLE_M, rel=0.4)
 
 
+@pytest.mark.parametrize("level", [0.02, 0.2, 1.0])
+def test_time_of_flight_measures_nothing_beyond_its_phase(level):
+    """Down an arcade one sees farther than the phase is long; the little light of it is noise at the whole level."""
+    for depth_m in (14.0, 18.7, 22.0, 40.0):
+        assert not read("time_of_flight", wall(depth_m), level=level)[0].any(), depth_m
+
+
 @pytest.mark.parametrize("depth_m", [1.0, 3.0])
 def test_phone_lidar_errs_as_its_spots_do(depth_m):
     found, _ = deviation("phone_lidar", depth_m, crop=slice(0, 240))

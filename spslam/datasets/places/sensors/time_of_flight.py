@@ -26,8 +26,9 @@ from spslam.camera import Camera
 # Deviation of depth at 1 m on a white surface seen at a right angle.
 DEVIATION_M = 0.0005
 WIGGLE_M, WIGGLE_PERIOD_M = 0.004, 0.47
-# The phase's length: of the lowest of several frequencies, so that depth in the range is unique.
-_AMBIGUITY_M = 18.0
+# The phase's length: of the lowest of several frequencies, so that depth in the range is unique. What is farther than
+# the most that is told apart measures as this, which is out of range: at low levels little of it is lost by amplitude.
+_AMBIGUITY_M, _MOST_TOLD_APART_M = 18.0, 17.5
 # A pixel's footprint relative to its size; mixed pixels are kept unless amplitude is lost.
 _FOOTPRINT_PX = 0.6
 _LEAST_AMPLITUDE = 0.008
@@ -49,7 +50,7 @@ def measure_time_of_flight(
     strength = amplitude(depth, color, camera)
     lengths = np.linalg.norm(camera.ray_directions(), axis=2)
     distance = depth * lengths
-    phase = distance * np.float32(2 * np.pi / _AMBIGUITY_M)
+    phase = np.minimum(distance, np.float32(_MOST_TOLD_APART_M)) * np.float32(2 * np.pi / _AMBIGUITY_M)
     mixed = [
         cv2.GaussianBlur(strength * wave(phase), (3, 3), _FOOTPRINT_PX * min(level, 1.0) + 1e-3)
         for wave in (np.cos, np.sin)
