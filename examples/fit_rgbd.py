@@ -22,7 +22,8 @@ def surface_points(frame, camera, generator):
     """World points and unit normals [N, 3], towards the camera, at random pixels of a frame."""
     depth = torch.from_numpy(frame.depth)
     measured = depth.flatten().nonzero()[:, 0]
-    drawn = measured[torch.randint(max(len(measured), 1), (PIXELS,), generator=generator)]
+    count = PIXELS if len(measured) else 0  # a lens may have been covered
+    drawn = measured[torch.randint(max(len(measured), 1), (count,), generator=generator)]
     u, v, z = drawn % camera.width, drawn // camera.width, depth.flatten()[drawn]
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     normals = ops.depth_normals(depth, torch.stack([u, v], 1).int(), *intrinsics, step_px=4, max_jump=0.05)
@@ -47,7 +48,8 @@ def main():
     if dataset.poses() is None:
         parser.error(f"{args.data}: must have poses.txt")
     generator = torch.Generator().manual_seed(0)
-    measured = [surface_points(frame, dataset.camera, generator) for frame in dataset]
+    frames = (frame for frame in dataset if frame.pose is not None)  # NaN in the file
+    measured = [surface_points(frame, dataset.camera, generator) for frame in frames]
     points, normals = (torch.cat(parts).to(args.device) for parts in zip(*measured, strict=True))
     cells = ops.VoxelHash(device=args.device)
     cells.insert_points(points, VOXEL_M)

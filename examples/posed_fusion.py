@@ -25,7 +25,8 @@ def surface_points(frame, camera, device):
     depth = torch.from_numpy(frame.depth).to(device)
     measured = depth.flatten().nonzero()[:, 0]
     key = 0, ops.RandomStream.ENCODER_POINTS, frame.index, 0
-    drawn = measured[ops.sample_indices(*key, POINTS, max(len(measured), 1), device)]
+    count = POINTS if len(measured) else 0  # a lens may have been covered
+    drawn = measured[ops.sample_indices(*key, count, max(len(measured), 1), device)]
     u, v, z = drawn % camera.width, drawn // camera.width, depth.flatten()[drawn]
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     normals = ops.depth_normals(depth, torch.stack([u, v], 1).int(), *intrinsics, step_px=4, max_jump=0.05)
@@ -40,6 +41,8 @@ def fuse(frames, camera, prior, device):
     cells = ops.VoxelHash(device=device)
     embeddings, weights = torch.zeros(0, 8, device=device), torch.zeros(0, device=device)
     for frame in frames:
+        if frame.pose is None:  # NaN in the file
+            continue
         points, normals = surface_points(frame, camera, device)
         encoded = ops.encode_points(points, normals, prior.encoder_params, VOXEL_M, prior.neighborhood)
         keep = encoded[2] > MIN_WEIGHT

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from spslam.datasets.room import Room
+from tests.examples.recordings import write_with_gaps
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,6 +43,13 @@ def test_room_is_fitted(tmp_path):
     # Voxels of 8 cm with a smooth field in them: edges of furniture are rounded.
     assert np.median(distance) < 0.005
     assert np.mean(distance < 0.02) > 0.85
+
+
+def test_frames_without_pose_or_depth_are_left_out(tmp_path):
+    write_with_gaps(tmp_path / "recording", 4)
+    finished = run("fit_rgbd.py", tmp_path / "room.obj", "--data", tmp_path / "recording", "--steps", 5)
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stdout.startswith("3 frames, ")
 
 
 def test_poses_are_needed(tmp_path):

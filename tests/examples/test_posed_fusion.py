@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from spslam.datasets.room import Room
+from tests.examples.recordings import write_with_gaps
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "examples" / "posed_fusion.py"
@@ -36,6 +37,13 @@ def test_poses_are_needed(tmp_path):
     finished = run(tmp_path / "mesh.ply", "--data", tmp_path)
     assert finished.returncode != 0
     assert not (tmp_path / "mesh.ply").exists()
+
+
+def test_frames_without_pose_or_depth_are_left_out(tmp_path):
+    write_with_gaps(tmp_path / "recording", 4)
+    finished = run(tmp_path / "mesh.ply", "--data", tmp_path / "recording")
+    assert finished.returncode == 0, finished.stderr
+    assert (tmp_path / "mesh.ply").exists()
 
 
 @pytest.mark.cuda
