@@ -47,5 +47,5 @@ def random_parameters(shape: MlpShape, seed: int, purpose: int) -> torch.Tensor:
         float32 [shape.parameters], the same on every machine.
     """
     uniform = ops.philox_uniform(seed, ops.RandomStream.INITIALIZATION, 0, purpose, shape.parameters)
-    bounds = torch.cat([torch.full((rows * columns + rows,), 1 / math.sqrt(columns)) for rows, columns in shape.layers])
-    return (2 * uniform - 1) * bounds
+    bounds = [uniform.new_full((rows * columns + rows,), 1 / math.sqrt(columns)) for rows, columns in shape.layers]
+    return (2 * uniform - 1) * torch.cat(bounds)

@@ -61,8 +61,8 @@ class SparseVolume:
         self.voxel_size_m = float(voxel_size_m)
         self.device = torch.device(device)
         self.cells = ops.VoxelHash(capacity, self.device, max_voxels)
-        self._embeddings = torch.zeros((self.capacity, FEATURES), device=self.device)
-        self._weights = torch.zeros(self.capacity, device=self.device)
+        self._embeddings = torch.zeros((self.capacity, FEATURES), dtype=torch.float32, device=self.device)
+        self._weights = torch.zeros(self.capacity, dtype=torch.float32, device=self.device)
 
     @property
     def num_voxels(self) -> int:

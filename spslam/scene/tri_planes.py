@@ -56,7 +56,7 @@ class TriPlanes:
         self.cell_size_m = float(cell_size_m)
         self.seed = seed
         self.max_texels = max_texels
-        self.texels = torch.zeros(0, FEATURES, device=device)
+        self.texels = torch.zeros(0, FEATURES, dtype=torch.float32, device=device)
         self.layout = [0] * 15
 
     def interpolate(self, points: torch.Tensor) -> torch.Tensor:
@@ -171,7 +171,7 @@ class TriPlanes:
         """
         u, v, size_u, size_v = rectangle
         device = self.texels.device
-        texels = torch.empty(size_u, size_v, FEATURES, device=device)
+        texels = torch.empty(size_u, size_v, FEATURES, dtype=torch.float32, device=device)
         blocks = [
             (block_u, block_v)
             for block_u in range(u // _BLOCK, (u + size_u - 1) // _BLOCK + 1)

@@ -9,6 +9,7 @@ import torch
 
 from spslam.errors import OutputError, SpslamError
 from spslam.scene import Scene, SceneSettings
+from tests.ops.test_in_place import default_dtype
 
 SETTINGS = SceneSettings(0.04, 0.08, plane_cell_m=0.04, position_scale=0.25, max_voxels=10**6, max_texels=10**6)
 
@@ -248,6 +249,19 @@ def test_a_file_that_is_not_a_map_gives_a_one_line_error(scene, tmp_path):
 def test_a_missing_folder_is_an_output_error(scene, tmp_path):
     with pytest.raises(OutputError, match="can't be written"):
         scene.save(tmp_path / "none" / "map.safetensors")
+
+
+def test_another_default_dtype_changes_nothing():
+    scenes = []
+    for dtype in (torch.float32, torch.float64):
+        with default_dtype(dtype):
+            scenes.append(Scene(SETTINGS, seed=0))
+            scenes[-1].volume.insert(torch.zeros(1, 3, dtype=torch.int32))
+            scenes[-1].planes.cover(torch.ones(1, 3))
+            scenes[-1].view().check("test")
+    state = scenes[0].state_dict()
+    assert all(torch.equal(tensor, state[name]) for name, tensor in scenes[1].state_dict().items())
+    assert all(tensor.dtype == state[name].dtype for name, tensor in scenes[1].state_dict().items())
 
 
 def test_a_view_is_kept_until_the_scene_is_another(scene):
