@@ -8,6 +8,7 @@ FLOATING = (torch.float32, torch.float64)
 # Of tables that are read in float32 where they are smaller.
 TABLES = (*FLOATING, torch.float16, torch.bfloat16)
 INTEGERS = (torch.int32, torch.int64)
+_KEY_RANGE = 2**32
 
 
 def check(condition: bool, function: str, argument: str, rule: str, actual: object) -> None:
@@ -20,6 +21,12 @@ def check_count(function: str, argument: str, count: int, least: int = 1) -> Non
     """Checks how many rays, points, iterations or channels there are to be: products of them must fit 64 bits."""
     check(count >= least, function, argument, f"be at least {least}", count)
     check(count <= 2**30, function, argument, "be at most 2^30", count)
+
+
+def check_key(function: str, frame: int, iteration: int = 0) -> None:
+    """Checks the parts of a draw's key that Philox has 32 bits for: larger ones would draw what smaller ones do."""
+    for argument, number in (("frame", frame), ("iteration", iteration)):
+        check(0 <= number < _KEY_RANGE, function, argument, "be in [0, 2^32 - 1]", number)
 
 
 def check_tensor(

@@ -7,7 +7,7 @@ there. Computed in float64, so that CPU and CUDA agree.
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_count, check_tensor
+from spslam.ops._checks import check, check_count, check_key, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.ray_sampling import RandomStream
 from spslam.ops.scene_view import Intrinsics, check_intrinsics
@@ -112,6 +112,7 @@ def select_covisible_frames(
     for argument, number in (("num_covisible", num_covisible), ("count", count)):
         check(number >= 0, name, argument, "be at least 0", number)
     check(0 <= threshold <= 1, name, "threshold", "be in [0, 1]", threshold)
+    check_key(name, frame)
     # The enum Integer in csrc/bindings/covisibility.cpp.
     counts = [num_points, num_covisible, count]
     integers = [current, thumbnail_step, *counts, seed, int(RandomStream.COVISIBILITY), frame]

@@ -34,7 +34,7 @@ from typing import Any
 import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
-from spslam.ops._checks import check, check_count, check_tensor
+from spslam.ops._checks import check, check_count, check_key, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.earlier_frames import DepthKeyframes, ReferenceImage
 from spslam.ops.scene_view import Intrinsics, SceneView, check_intrinsics
@@ -111,6 +111,7 @@ class GaussNewtonOptions:
         """Raises ValueError, naming `function`, where a number is out of range."""
         check_count(function, "num_pixels", self.num_pixels)
         check_count(function, "iterations", self.iterations)
+        check_key(function, self.frame)
         for name, bounds in _SCALARS.items():
             value = getattr(self, name)
             if value is not None and "above" in bounds:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam.ops import _library, trusted  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_key, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.scene_view import Intrinsics
 
@@ -128,6 +128,7 @@ def sample_frame_pixels(
         sampling.depth_image_step,
     )
     check(sampling.depth_image_unit > 0, name, "depth_image_unit", "be positive", sampling.depth_image_unit)
+    check_key(name, frame)
     buffer, num_valid = torch.ops.spslam.sample_frame_pixels(
         depth, color, *_arguments(sampling, (fx, fy, cx, cy), (seed, stream, frame))
     )

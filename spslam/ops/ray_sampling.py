@@ -5,7 +5,7 @@ from enum import IntEnum
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import FLOATING, check, check_tensor
+from spslam.ops._checks import FLOATING, check, check_key, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops._vmap import register_each_vmap
 
@@ -53,7 +53,7 @@ def philox_uniform(
         True
     """
     check(count >= 0, "philox_uniform", "count", "be at least 0", count)
-    _check_key("philox_uniform", frame, iteration)
+    check_key("philox_uniform", frame, iteration)
     out = torch.empty(count, dtype=torch.float32, device=device)
     torch.ops.spslam.philox_uniform(seed, stream, frame, iteration, out)
     return out
@@ -85,15 +85,10 @@ def sample_indices(
     """
     check(count >= 0, "sample_indices", "count", "be at least 0", count)
     check(1 <= upper <= 2**32, "sample_indices", "upper", "be in [1, 2^32]", upper)
-    _check_key("sample_indices", frame, iteration)
+    check_key("sample_indices", frame, iteration)
     out = torch.empty(count, dtype=torch.int64, device=device)
     torch.ops.spslam.sample_indices(seed, stream, frame, iteration, upper, out)
     return out
-
-
-def _check_key(name: str, frame: int, iteration: int) -> None:
-    for argument, number in (("frame", frame), ("iteration", iteration)):
-        check(0 <= number < _COUNTER_RANGE, name, argument, "be in [0, 2^32 - 1]", number)
 
 
 @public_op()
@@ -144,7 +139,7 @@ def sample_along_rays(
     check(near >= 0, name, "near", "be at least 0", near)
     check(near <= far, name, "far", f"be at least near ({near})", far)
     check(truncation >= 0, name, "truncation", "be at least 0", truncation)
-    _check_key(name, frame, iteration)
+    check_key(name, frame, iteration)
     elements = depth.shape[0] * (num_uniform + num_surface)
     check(elements <= _COUNTER_RANGE, name, "depth", "have at most 2^32 / S rays", depth.shape[0])
     return torch.ops.spslam.sample_along_rays(

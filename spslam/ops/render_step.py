@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from spslam.ops import _library  # noqa: F401
-from spslam.ops._checks import check, check_tensor
+from spslam.ops._checks import check, check_key, check_tensor
 from spslam.ops._public import public_op
 from spslam.ops.scene_view import COLOR_PARAMS, GEOMETRY_PARAMS, Intrinsics, SceneView, check_intrinsics
 
@@ -87,6 +87,7 @@ class RenderOptions:
         check(1 <= samples <= 65536, function, "num_uniform + num_surface", "be in [1, 65536]", samples)
         check(0 <= self.near <= self.far, function, "near and far", "be 0 <= near <= far", (self.near, self.far))
         check(self.truncation > 0, function, "truncation", "be positive", self.truncation)
+        check_key(function, self.frame, self.iteration)
         check(self.precision in PRECISIONS, function, "precision", f"be {' or '.join(PRECISIONS)}", self.precision)
 
     def arguments(self, intrinsics: Intrinsics) -> tuple[list[float], list[int]]:

@@ -51,7 +51,7 @@ def drawn_points(records, pose, seed, frame):
 
 
 def choose(frames, records, current, candidates, device, **options):
-    settings = {"num_covisible": 40, "count": 100, "threshold": 0.3, **options}
+    settings = {"num_covisible": 40, "count": 100, "threshold": 0.3, "frame": 7, **options}
     poses, depth_thumbnails = (tensor.to(device) for tensor in frames)
     return ops.select_covisible_frames(
         records.to(device),
@@ -63,7 +63,6 @@ def choose(frames, records, current, candidates, device, **options):
         thumbnail_step=STEP,
         num_points=POINTS,
         seed=5,
-        frame=7,
         **settings,
     )
 
@@ -149,6 +148,8 @@ def test_arguments_are_named(generator):
         choose(frames, records, 5, candidates, "cpu")
     with pytest.raises(ValueError, match="select_covisible_frames: count must be at least 0, got -1"):
         choose(frames, records, 4, candidates, "cpu", count=-1)
+    with pytest.raises(ValueError, match=r"select_covisible_frames: frame must be in \[0, 2\^32 - 1\], got -1"):
+        choose(frames, records, 4, candidates, "cpu", frame=-1)
     with pytest.raises(TypeError, match="select_covisible_frames: candidates must be int64, got int32"):
         choose(frames, records, 4, candidates.int(), "cpu")
     with pytest.raises(TypeError, match="frame_overlap: depth_thumbnails must be float16, got float32"):

@@ -167,6 +167,8 @@ def test_arguments_are_named(generator):
         ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, replace(OPTIONS, kernel_end=-0.1))
     with pytest.raises(ValueError, match="track_gauss_newton: score_kernel must be positive, got 0"):
         ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, replace(OPTIONS, score_kernel=0))
+    with pytest.raises(ValueError, match=r"track_gauss_newton: frame must be in \[0, 2\^32 - 1\], got -1"):
+        ops.track_gauss_newton(scene, records, pose7(POSE), INTRINSICS, replace(OPTIONS, frame=-1))
     with pytest.raises(ValueError, match=r"predict_pose: before must have shape \[7\], got \[8\]"):
         ops.predict_pose(torch.zeros(8), torch.zeros(7))
     with pytest.raises(ValueError, match="track_gauss_newton: pixels must have at least one row, got 0"):

@@ -204,8 +204,9 @@ def test_threads_sample_side_by_side(generator):
 def test_wrong_arguments_are_named(generator):
     depth, color = frame(generator)
 
-    def sample(depth=depth, color=color, fx=CAMERA[0], **change):
-        return ops.sample_frame_pixels(depth, color, fx, *CAMERA[1:], dataclasses.replace(SAMPLING, **change), *KEY)
+    def sample(depth=depth, color=color, fx=CAMERA[0], number=KEY[2], **change):
+        sampling = dataclasses.replace(SAMPLING, **change)
+        return ops.sample_frame_pixels(depth, color, fx, *CAMERA[1:], sampling, *KEY[:2], number)
 
     for change, message in (
         ({"count": -1}, r"count must be in \[0, 2\^30\], got -1"),
@@ -216,6 +217,8 @@ def test_wrong_arguments_are_named(generator):
         ({"depth_image_unit": 0.0}, "depth_image_unit must be positive, got 0.0"),
         ({"thumbnail_step": 0}, r"thumbnail_step must be in \[1, 65535\], got 0"),
         ({"fx": 0.0}, "fx must be positive, got 0.0"),
+        ({"number": -1}, r"frame must be in \[0, 2\^32 - 1\], got -1"),
+        ({"number": 2**32}, r"frame must be in \[0, 2\^32 - 1\], got 4294967296"),
         ({"color": color[1:]}, r"color must have shape \[50, 70, 3\], got \[49, 70, 3\]"),
         ({"depth": torch.zeros(1, 70_000), "color": color}, r"depth must fit 16 bits per side, got \(1, 70000\)"),
     ):

@@ -26,6 +26,8 @@ from tests.ops.step_inputs import gradient_buffers, noisy_rays
         (dict(num_surface=-1), ValueError, "render_step: num_surface must be at least 0, got -1"),
         (dict(num_uniform=0, num_surface=0), ValueError, r"num_uniform \+ num_surface must be in \[1, 65536\], got 0"),
         (dict(near=0.5, far=0.4), ValueError, r"near and far must be 0 <= near <= far, got \(0.5, 0.4\)"),
+        (dict(frame=2**32), ValueError, r"render_step: frame must be in \[0, 2\^32 - 1\], got 4294967296"),
+        (dict(iteration=-1), ValueError, r"render_step: iteration must be in \[0, 2\^32 - 1\], got -1"),
         (dict(truncation=0.0), ValueError, "render_step: truncation must be positive, got 0.0"),
         (dict(embeddings=torch.zeros(3, 8)), ValueError, "gradients.embeddings must have at least .* rows, got 3"),
         (dict(texel_stamps=torch.zeros(9)), TypeError, "gradients.texel_stamps must be int32, got float32"),
