@@ -21,9 +21,12 @@ void adam(const py::object& param, const py::object& grad, const py::object& exp
     const std::int64_t rows = p.size(0), channels = p.size(1);
     InOut<T> g({name, "grad"}, grad, {rows, channels}), m({name, "exp_avg"}, exp_avg, {rows, channels});
     InOut<T> v({name, "exp_avg_sq"}, exp_avg_sq, {rows, channels});
+    T *values = p.data(), *gradients = g.data(), *first = m.data(), *second = v.data();
     const auto run = [&](const std::int32_t* marks) {
-      sparse_adam(kCpu, AdamStep{lr, betas.first, betas.second, eps, step}, rows, channels, marks,
-                  static_cast<std::int32_t>(stamp), p.data(), g.data(), m.data(), v.data());
+      without_gil([&] {
+        sparse_adam(kCpu, AdamStep{lr, betas.first, betas.second, eps, step}, rows, channels, marks,
+                    static_cast<std::int32_t>(stamp), values, gradients, first, second);
+      });
     };
     if (stamps.is_none()) {
       run(nullptr);
@@ -58,7 +61,8 @@ py::object solve(const py::object& hessian, const py::object& gradient, double d
     using T = decltype(zero);
     const Input<T> h({name, "hessian"}, hessian, {"F", 6, 6}), g({name, "gradient"}, gradient, {h.size(0), 6});
     auto delta = empty<T>({h.size(0), 6});
-    solve_normal_equations(kCpu, h.size(0), h.data(), g.data(), damping, absolute_damping, delta.mutable_data());
+    T* steps = delta.mutable_data();
+    without_gil([&] { solve_normal_equations(kCpu, h.size(0), h.data(), g.data(), damping, absolute_damping, steps); });
     return delta;
   });
 }

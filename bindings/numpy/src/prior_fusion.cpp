@@ -75,7 +75,9 @@ py::array_t<float> random(const py::object& voxel_coords, std::int64_t seed, dou
   const Input<std::int32_t> coords({name, "voxel_coords"}, voxel_coords, {"M", 3});
   check(scale >= 0, {name, "scale"}, "be at least 0", scale);
   auto out = empty<float>({coords.size(0), kPriorFeatures});
-  random_embeddings(kCpu, coords.data(), coords.size(0), seed, static_cast<float>(scale), out.mutable_data());
+  float* embeddings = out.mutable_data();
+  without_gil(
+      [&] { random_embeddings(kCpu, coords.data(), coords.size(0), seed, static_cast<float>(scale), embeddings); });
   return out;
 }
 

@@ -8,16 +8,22 @@ namespace {
 constexpr std::int64_t kCounterRange = std::int64_t{1} << 32;
 constexpr std::int64_t kMaxSamples = 1 << 20;
 
-PhiloxKey philox_key(std::int64_t seed, std::int64_t stream, std::int64_t frame, std::int64_t iteration) {
+PhiloxKey checked_key(const char* name, std::int64_t seed, std::int64_t stream, std::int64_t frame,
+                      std::int64_t iteration) {
+  check(frame >= 0 && frame < kCounterRange, {name, "frame"}, "be in [0, 2^32 - 1]", frame);
+  check(iteration >= 0 && iteration < kCounterRange, {name, "iteration"}, "be in [0, 2^32 - 1]", iteration);
   return {static_cast<std::uint64_t>(seed), static_cast<std::uint32_t>(stream), static_cast<std::uint32_t>(frame),
           static_cast<std::uint32_t>(iteration)};
 }
 
 py::array_t<float> uniform(std::int64_t seed, std::int64_t stream, std::int64_t frame, std::int64_t iteration,
                            std::int64_t count) {
-  check(count >= 0, {"philox_uniform", "count"}, "be at least 0", count);
+  const char* name = "philox_uniform";
+  check(count >= 0, {name, "count"}, "be at least 0", count);
+  const PhiloxKey key = checked_key(name, seed, stream, frame, iteration);
   auto out = empty<float>({count});
-  philox_uniform(kCpu, philox_key(seed, stream, frame, iteration), count, out.mutable_data());
+  float* numbers = out.mutable_data();
+  without_gil([&] { philox_uniform(kCpu, key, count, numbers); });
   return out;
 }
 
@@ -26,8 +32,10 @@ py::array_t<std::int64_t> indices(std::int64_t seed, std::int64_t stream, std::i
   const char* name = "sample_indices";
   check(count >= 0, {name, "count"}, "be at least 0", count);
   check(upper >= 1 && upper <= kCounterRange, {name, "upper"}, "be in [1, 2^32]", upper);
+  const PhiloxKey key = checked_key(name, seed, stream, frame, iteration);
   auto out = empty<std::int64_t>({count});
-  sample_indices(kCpu, philox_key(seed, stream, frame, iteration), upper, count, out.mutable_data());
+  std::int64_t* drawn = out.mutable_data();
+  without_gil([&] { sample_indices(kCpu, key, upper, count, drawn); });
   return out;
 }
 
@@ -40,6 +48,7 @@ py::object along_rays(const py::object& depth, std::int64_t num_uniform, std::in
   check(near >= 0, {name, "near"}, "be at least 0", near);
   check(near <= far, {name, "far"}, "be at least near", far);
   check(truncation >= 0, {name, "truncation"}, "be at least 0", truncation);
+  const PhiloxKey key = checked_key(name, seed, stream, frame, iteration);
   return dispatch_floating({name, "depth"}, depth, [&](auto zero) -> py::object {
     using T = decltype(zero);
     const Input<T> measured({name, "depth"}, depth, {"R"});
@@ -49,9 +58,7 @@ py::object along_rays(const py::object& depth, std::int64_t num_uniform, std::in
                                   static_cast<T>(near), static_cast<T>(far), static_cast<T>(truncation)};
     auto out = empty<T>({rays, samples});
     T* t = out.mutable_data();
-    without_gil([&] {
-      sample_along_rays(kCpu, philox_key(seed, stream, frame, iteration), sampling, measured.data(), rays, t);
-    });
+    without_gil([&] { sample_along_rays(kCpu, key, sampling, measured.data(), rays, t); });
     return out;
   });
 }

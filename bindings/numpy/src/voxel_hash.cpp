@@ -54,7 +54,8 @@ struct Absent {
 
   py::array_t<std::int32_t> coords() const {
     auto coords = empty<std::int32_t>({found.count, 3});
-    voxel_hash_unpack(kCpu, packed.data(), found.count, coords.mutable_data());
+    std::int32_t* out = coords.mutable_data();
+    without_gil([&] { voxel_hash_unpack(kCpu, packed.data(), found.count, out); });
     return coords;
   }
 };
@@ -86,8 +87,12 @@ py::array_t<std::int32_t> insert(const py::object& hash_keys, const py::object& 
                              std::to_string(first_id) + " for a table with " + std::to_string(found.empty_slots) +
                              " empty slots of " + std::to_string(capacity));
   }
-  voxel_hash_assign(kCpu, keys.data(), values.data(), capacity, absent.packed.data(), found.count,
-                    static_cast<std::int32_t>(first_id));
+  std::int64_t* slots = keys.data();
+  std::int32_t* ids = values.data();
+  without_gil([&] {
+    voxel_hash_assign(kCpu, slots, ids, capacity, absent.packed.data(), found.count,
+                      static_cast<std::int32_t>(first_id));
+  });
   return absent.coords();
 }
 
@@ -104,9 +109,13 @@ void build(const py::object& hash_keys, const py::object& hash_values, const py:
   }
   check_room(name, capacity, n);
   std::vector<std::int64_t> packed(n);
-  voxel_hash_pack(kCpu, coords.data(), n, packed.data());
-  std::fill_n(keys.data(), capacity, kEmptyVoxelKey);
-  voxel_hash_assign(kCpu, keys.data(), values.data(), capacity, packed.data(), n, 0);
+  std::int64_t* slots = keys.data();
+  std::int32_t* ids = values.data();
+  without_gil([&] {
+    voxel_hash_pack(kCpu, coords.data(), n, packed.data());
+    std::fill_n(slots, capacity, kEmptyVoxelKey);
+    voxel_hash_assign(kCpu, slots, ids, capacity, packed.data(), n, 0);
+  });
 }
 
 py::array_t<std::int32_t> find(const py::object& hash_keys, const py::object& hash_values,

@@ -2,6 +2,8 @@
 
 import doctest
 import re
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +108,50 @@ def test_voxels_out_of_range_and_full_tables():
     assert (keys == -1).all()
     with refused(ValueError, "new_voxel_hash: capacity must be a power of two, got 3"):
         sn.new_voxel_hash(3)
+
+
+@pytest.mark.parametrize("number", [-1, 1 << 32])
+def test_keys_of_draws_out_of_range(number):
+    calls = {
+        "philox_uniform": lambda *key: sn.philox_uniform(0, 0, *key, 2),
+        "sample_indices": lambda *key: sn.sample_indices(0, 0, *key, 2, 6),
+        "sample_along_rays": lambda *key: sn.sample_along_rays(LOCAL[:, 0], 2, 1, 0.0, 1.0, 0.1, 0, 0, *key),
+    }
+    for name, call in calls.items():
+        with refused(ValueError, f"{name}: frame must be in [0, 2^32 - 1], got {number}"):
+            call(number, 0)
+        with refused(ValueError, f"{name}: iteration must be in [0, 2^32 - 1], got {number}"):
+            call(0, number)
+
+
+def test_other_threads_run_beside_a_kernel():
+    """Each call takes a tenth of a second or more: longer than what Python lets another thread have before it."""
+    tables = [np.ones((20_000_000, 1), np.float32) for _ in range(4)]
+    coords, equations = np.zeros((500_000, 3), np.int32), np.tile(np.eye(6), (200_000, 1, 1))
+    calls = {
+        "philox_uniform": lambda: sn.philox_uniform(0, 0, 0, 0, 20_000_000),
+        "sample_indices": lambda: sn.sample_indices(0, 0, 0, 0, 20_000_000, 6),
+        "random_embeddings": lambda: sn.random_embeddings(coords, 0),
+        "sparse_adam_": lambda: sn.sparse_adam_(*tables, lr=0.1, step=1),
+        "solve_normal_equations": lambda: sn.solve_normal_equations(equations, equations[:, 0].copy()),
+    }
+    awake, ended = [], threading.Event()
+
+    def wake():
+        while not ended.wait(0.001):
+            awake.append(time.perf_counter())
+
+    thread = threading.Thread(target=wake)
+    thread.start()
+    try:
+        for name, call in calls.items():
+            begin = time.perf_counter()
+            call()
+            tenth = (time.perf_counter() - begin) / 10
+            assert any(begin + tenth < moment < begin + 9 * tenth for moment in awake), name
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_empty_arrays():
