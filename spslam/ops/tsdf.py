@@ -21,6 +21,8 @@ COLOR_SIZE = 4
 NO_BLOCK = torch.iinfo(torch.int32).min
 
 _MAX_SIDE = 1 << 14
+# The smallest above 0: the distance of a voxel in which nothing was measured is 0, which is no surface.
+_LEAST_WEIGHT = torch.finfo(torch.float32).tiny
 
 
 @public_op()
@@ -214,7 +216,7 @@ def tsdf_query(
         colors: uint16 [B, 512, 4].
         points: float32 [N, 3], world, m.
         voxel_size: m.
-        min_weight: a voxel is known from this weight on.
+        min_weight: a voxel is known from this weight on; without any weight it never is.
 
     Returns:
         float32 [N] distance, m; float32 [N, 3] RGB in [0, 1], 0 where no voxel around has a color; bool [N] whether all
@@ -235,7 +237,8 @@ def tsdf_query(
     name = "tsdf_query"
     _check_field(name, (hash_keys, hash_values, sdf, weights, colors), voxel_size)
     check_tensor(name, "points", points, ("N", 3), torch.float32, like=sdf)
-    return torch.ops.spslam.tsdf_query(hash_keys, hash_values, sdf, weights, colors, points, voxel_size, min_weight)
+    least = max(min_weight, _LEAST_WEIGHT)
+    return torch.ops.spslam.tsdf_query(hash_keys, hash_values, sdf, weights, colors, points, voxel_size, least)
 
 
 @public_op()
@@ -264,7 +267,7 @@ def tsdf_ray_cast(
         size: width and height of the view, px.
         voxel_size: m.
         depth_range: least and most depth, m.
-        min_weight: a voxel is known from this weight on.
+        min_weight: a voxel is known from this weight on; without any weight it never is.
 
     Returns:
         float32 [H, W] depth along the optical axis, m, 0 without surface; float32 [H, W, 3] unit normals towards free
@@ -289,7 +292,7 @@ def tsdf_ray_cast(
     check(len(size) == 2 and min(size) >= 0 and max(size) <= _MAX_SIDE, name, "size", f"be 0 to {_MAX_SIDE} px", size)
     fits = len(depth_range) == 2 and 0 < depth_range[0] < depth_range[1]
     check(fits, name, "depth_range", "be two ascending positive numbers", depth_range)
-    numbers = list(intrinsics), list(size), list(depth_range), voxel_size, min_weight
+    numbers = list(intrinsics), list(size), list(depth_range), voxel_size, max(min_weight, _LEAST_WEIGHT)
     return torch.ops.spslam.tsdf_ray_cast(hash_keys, hash_values, sdf, weights, colors, pose, *numbers)
 
 

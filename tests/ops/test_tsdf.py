@@ -285,6 +285,25 @@ def test_blocks_without_rows_are_unknown(device):
     assert not cast.any()
 
 
+def test_voxels_in_which_nothing_was_measured_are_no_surface(device):
+    """Of a wall whose right half was not measured, seen along it: free space ends there, and unknown space begins."""
+    depth = wall((0, 0, 1), 1.5)
+    depth[:, 18:] = 0
+    volume = fused([depth], device)
+    half = math.sqrt(0.5)
+    along = torch.tensor([half, 0, half, 0, -1.0, 0, 1.5 - 1.5 * VOXEL], device=device)
+    cast, _, _ = ops.tsdf_ray_cast(*volume.field(), along, CAMERA, size=SIZE[::-1], voxel_size=VOXEL)
+    v, u = (cast > 0).nonzero().cpu().unbind(1)
+    off = 1.5 * VOXEL + cast[v, u].cpu() * (u - CAMERA[2]) / CAMERA[0]  # of the wall: the view's x axis is -z
+    assert len(off) > 50 and (off.abs() < 0.5 * VOXEL).all()
+    unknown = volume.weights == 0
+    assert unknown.any()
+    row, place = unknown.nonzero()[0].tolist()
+    voxel = 8 * volume.block_coords[row].cpu() + torch.tensor([place // 64, place // 8 % 8, place % 8])
+    point = (VOXEL * voxel)[None].to(device)
+    assert not ops.tsdf_query(*volume.field(), point, voxel_size=VOXEL)[2].any()
+
+
 def test_voxels_that_a_frame_does_not_see_keep_their_weight(device):
     volume = fused([wall((0, 0, 1), 1.5)], device)
     volume.weights.fill_(50.0)
