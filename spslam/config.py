@@ -216,14 +216,15 @@ def _pop_resolved(file: dict[str, Any], path: Path, preset: str) -> bool:
 
 
 def _preset_section(presets: Any, name: str) -> dict[str, Any]:
-    if not isinstance(presets, dict):
+    """Of the file's presets the one in use; one whose lines are all commented out changes nothing."""
+    if not isinstance(presets, dict | None):
         raise ConfigError(f"presets must be a section of options, got {shown(presets)}")
-    for key, value in presets.items():
+    for key, value in (presets or {}).items():
         if key not in PRESETS:
             raise ConfigError(f"presets.{brief(key)} is not an option; it must be one of {', '.join(PRESETS)}")
-        if not isinstance(value, dict):
+        if not isinstance(value, dict | None):
             raise ConfigError(f"presets.{key} must be a section of options, got {shown(value)}")
-    return presets.get(name, {})
+    return (presets or {}).get(name) or {}
 
 
 def _validate(values: dict[str, Any]) -> Config:

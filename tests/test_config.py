@@ -65,8 +65,9 @@ def test_exponents_without_a_point_are_numbers():
 
 
 def test_empty_section_changes_nothing(tmp_path):
-    path = write(tmp_path, "dataset: {type: replica}\ntracking:\n")
-    assert load_config(path).tracking == load_config("replica").tracking
+    for rest in ("tracking:", "presets:", "presets:\n  balanced:"):
+        path = write(tmp_path, f"dataset: {{type: replica}}\n{rest}\n")
+        assert load_config(path).tracking == load_config("replica").tracking
 
 
 def test_a_preset_that_is_given_twice():
