@@ -40,7 +40,7 @@ class PretrainSettings:
         patches_per_kind: solids of each kind per step.
         learning_rate: learning rate of Adam after the warm-up.
         final_learning_rate: learning rate at the end of the cosine decay.
-        warmup_steps: steps of the linear warm-up.
+        warmup_steps: steps of the linear warm-up; 0 for none.
         surface_emphasis: additional weight of a query on the surface; decreases over half a voxel.
         feature_penalty: weight of the mean norm of the interpolated features.
         neighborhood: see `spslam.ops.encode_points`.
@@ -48,7 +48,7 @@ class PretrainSettings:
         views: settings of the simulated observations.
 
     Raises:
-        ValueError: `steps`, `patches_per_kind` or `seed` is out of range.
+        ValueError: `steps`, `patches_per_kind`, `warmup_steps`, `seed` or `neighborhood` is out of range.
     """
 
     steps: int = 4000
@@ -67,13 +67,17 @@ class PretrainSettings:
         for name in ("steps", "patches_per_kind"):
             if getattr(self, name) < 1:
                 raise ValueError(f"PretrainSettings: {name} must be at least 1, got {getattr(self, name)}")
+        if self.warmup_steps < 0:
+            raise ValueError(f"PretrainSettings: warmup_steps must be at least 0, got {self.warmup_steps}")
+        if self.neighborhood not in (8, 64):
+            raise ValueError(f"PretrainSettings: neighborhood must be 8 or 64, got {self.neighborhood}")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"PretrainSettings: seed must be in [0, 2^31), got {self.seed}")
 
     def learning_rate_at(self, step: int) -> float:
         """The learning rate of a 0-based step: linear warm-up times cosine decay."""
         cosine = 0.5 + 0.5 * math.cos(math.pi * step / self.steps)
-        warm = min(1.0, (step + 1) / self.warmup_steps)
+        warm = min(1.0, (step + 1) / max(self.warmup_steps, 1))
         return self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * warm * cosine
 
 

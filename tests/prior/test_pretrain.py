@@ -131,7 +131,9 @@ def test_a_checkpoint_changed_from_outside_gives_one_line(tmp_path, tensors, hea
         load_state(path, settings)
 
 
-@pytest.mark.parametrize("change", [{"steps": 0}, {"seed": -1}, {"patches_per_kind": 0}])
+@pytest.mark.parametrize(
+    "change", [{"steps": 0}, {"seed": -1}, {"patches_per_kind": 0}, {"warmup_steps": -1}, {"neighborhood": 27}]
+)
 def test_settings_out_of_range_are_refused(change):
     with pytest.raises(ValueError, match=f"PretrainSettings: {next(iter(change))} must be"):
         PretrainSettings(**change)
@@ -142,6 +144,7 @@ def test_learning_rate_warms_up_and_decays():
     rates = [settings.learning_rate_at(step) for step in range(1000)]
     assert rates[0] < rates[10] < max(rates) <= settings.learning_rate
     assert rates[-1] == pytest.approx(settings.final_learning_rate, rel=0.1)
+    assert PretrainSettings(warmup_steps=0).learning_rate_at(0) == settings.learning_rate
 
 
 def test_first_zero_crossing():
