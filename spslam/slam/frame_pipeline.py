@@ -76,6 +76,7 @@ class FramePipeline:
             device: where the map lives and the kernels run.
 
         Raises:
+            ValueError: the first pose has another shape, or is no rigid motion.
             DatasetError: the first pose lies too far from the world's origin.
         """
         self.config = config
@@ -105,7 +106,7 @@ class FramePipeline:
             first_pose: as of `SlamSystem`; where not given, the next frame is where the first one was before.
 
         Raises:
-            DatasetError: as `SlamSystem`; nothing is forgotten then.
+            ValueError, DatasetError: as `SlamSystem`; nothing is forgotten then.
         """
         first_pose = self.first_pose if first_pose is None else np.array(first_pose, np.float64)
         check_first_pose(first_pose)

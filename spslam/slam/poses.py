@@ -7,15 +7,32 @@ from spslam.errors import DatasetError
 from spslam.geometry import matrix_to_pose7, pose7_to_matrix
 
 MAX_DISTANCE_M = 10_000.0  # a float32 still resolves a millimeter there
+# Of a rotation times its transpose: some digits may be missing, but a scale or the matrix of an image is none.
+_ROTATION_TOLERANCE, _LAST_ROW_TOLERANCE = 0.1, 1e-6
 
 
 def check_first_pose(pose: np.ndarray) -> None:
-    """Raises DatasetError where a system can't begin at a pose float64 [4, 4]: too far from the world's origin."""
+    """Raises an error where a system can't begin at a pose float64 [4, 4].
+
+    Raises:
+        ValueError: another shape, or no rigid motion.
+        DatasetError: too far from the world's origin.
+    """
+    if pose.shape != (4, 4):
+        raise ValueError(f"SlamSystem: first_pose must have shape (4, 4), got {pose.shape}")
     distance = float(np.linalg.norm(pose[:3, 3]))
     if not distance <= MAX_DISTANCE_M:
         raise DatasetError(
             f"the first pose must lie within {MAX_DISTANCE_M / 1000:.0f} km of the world's origin, got "
             f"{distance / 1000:.0f} km; scene.first_pose=identity starts at the origin instead"
+        )
+    rotation = pose[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    is_motion = off <= _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    if not is_motion or not np.abs(pose[3] - [0, 0, 0, 1]).max() <= _LAST_ROW_TOLERANCE:
+        raise ValueError(
+            "SlamSystem: first_pose must be a rotation and a translation, camera to world, above the row (0, 0, 0, 1), "
+            f"got {pose.tolist()}"
         )
 
 

@@ -175,6 +175,25 @@ def test_first_pose_too_far_away_is_one_line():
         SlamSystem(settings(), Recorded(1).camera, pose)
 
 
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.eye(3), r"must have shape \(4, 4\), got \(3, 3\)"),
+        (np.array([1.0, 0, 0, 0, 0, 0, 0]), r"must have shape \(4, 4\), got \(7,\)"),
+        (np.diag([2.0, 2, 2, 1]), "must be a rotation and a translation"),
+        (np.diag([1.0, 1, -1, 1]), "must be a rotation and a translation"),
+        (
+            np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]),
+            r"must be .* above the row \(0, 0, 0, 1\), got",
+        ),
+    ],
+    ids=["rotation", "row", "scaled", "mirrored", "transposed"],
+)
+def test_first_poses_that_are_none_are_refused(pose, message):
+    with pytest.raises(ValueError, match=f"SlamSystem: first_pose {message}"):
+        SlamSystem(settings(), Recorded(1).camera, pose)
+
+
 @pytest.fixture
 def tiny_disk():
     """Limits the size of files, as on a full disk; Python turns the signal into an OSError."""
