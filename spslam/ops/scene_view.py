@@ -1,5 +1,6 @@
 """Input of the fused ops that describes a scene: the tensors of a map, its sizes and the layout of its planes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,8 +24,10 @@ class Intrinsics(NamedTuple):
 
 
 def check_intrinsics(function: str, intrinsics: Sequence[float], argument: str = "intrinsics") -> None:
-    """Raises ValueError unless `intrinsics` has four numbers."""
+    """Raises ValueError unless `intrinsics` has four numbers, the first two positive and finite."""
     check(len(intrinsics) == 4, function, argument, "be (fx, fy, cx, cy)", tuple(intrinsics))
+    usable = 0 < intrinsics[0] < math.inf and 0 < intrinsics[1] < math.inf
+    check(usable, function, argument, "have positive finite focal lengths", tuple(intrinsics))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """The signed distance field on sparse blocks as an object that grows where surface is measured."""
 
 import itertools
-import math
 
 import torch
 
@@ -209,7 +208,6 @@ class TsdfVolume:
         """
         name = "TsdfVolume.make_room"
         check_intrinsics(name, intrinsics)
-        check(0 < intrinsics[0] < math.inf, name, "intrinsics", "have a positive finite fx", intrinsics[0])
         reach = 0.5 * BLOCK_SIDE * self.voxel_size / _FAR_M * intrinsics[0]
         step = min(max(int(reach), 1), _MOST_TOUCH_STEP)
         sizes = self.voxel_size, self.truncation, noise, step

@@ -273,3 +273,7 @@ def test_a_camera_has_four_numbers(name, device, generator):
         for wrong in (get(call, path)[:3], (*get(call, path), 1.0)):
             with pytest.raises(ValueError, match=rf"{name}: .*intrinsics must be \(fx, fy, cx, cy\), got \("):
                 run(name, changed(call, path, wrong))
+        fx, fy, *center = get(call, path)
+        for wrong in ((0.0, fy, *center), (fx, -fy, *center), (math.nan, fy, *center), (fx, math.inf, *center)):
+            with pytest.raises(ValueError, match=rf"{name}: .*intrinsics must have positive finite focal lengths"):
+                run(name, changed(call, path, wrong))

@@ -419,10 +419,14 @@ def test_noise_does_not_move_a_surface(device):
     assert abs(vertices[:, 2].mean().item() - 1) < 0.1 * deviation
 
 
-@pytest.mark.parametrize("focal", [0.0, math.nan, math.inf])
+@pytest.mark.parametrize("focal", [0.0, -8.0, math.nan, math.inf])
 def test_intrinsics_that_can_not_be_are_named(focal):
     volume, pose = ops.TsdfVolume(0.05), torch.tensor([1.0, 0, 0, 0, 0, 0, 0])
-    with pytest.raises(ValueError, match=r"TsdfVolume.make_room: intrinsics must have a positive finite fx"):
-        volume.integrate(torch.full((8, 8), 2.0), pose, (focal, 8.0, 3.5, 3.5))
+    planes = torch.zeros(8, 8, 5)
+    for wrong in ((focal, 8.0, 3.5, 3.5), (8.0, focal, 3.5, 3.5)):
+        with pytest.raises(ValueError, match=r"measure_planes: intrinsics must have positive finite focal lengths"):
+            volume.integrate(torch.full((8, 8), 2.0), pose, wrong)
+        with pytest.raises(ValueError, match=r"TsdfVolume.make_room: intrinsics must have positive finite focal"):
+            volume.make_room(planes, pose, wrong)
     volume.integrate(torch.full((8, 8), 2.0), pose, (8.0, 8.0, 3.5, 3.5))
     assert len(volume)
