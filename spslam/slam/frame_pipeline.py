@@ -113,16 +113,6 @@ class FramePipeline:
         self.first_pose = first_pose
         self.adopt(SlamState.start(self.config, self.camera, first_pose, self._decoder, self.device))
 
-    def begin_at(self, pose: np.ndarray) -> None:
-        """Says where the next frame is, float64 [4, 4], in case the map begins with it; not finite, it says nothing.
-
-        Raises:
-            DatasetError: as `SlamSystem`.
-        """
-        if not self._has_map and bool(np.isfinite(pose).all()):
-            check_first_pose(pose)
-            self.first_pose = pose
-
     def adopt(self, state: SlamState) -> None:
         """Goes on from a state of the same options and camera; map and trajectory as they were are forgotten."""
         self.state = state

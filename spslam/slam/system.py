@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from spslam.datasets.base import RgbdFrame
@@ -21,6 +22,7 @@ from spslam.slam.frame_report import FrameReport
 from spslam.slam.graph.joining import MIN_LOOPS
 from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.opened_map import check_settings, load_archive, map_settings, open_map
+from spslam.slam.poses import check_first_pose
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.saved_system import SystemSettings, load_state, read_settings, save_system
 from spslam.trajectory import Trajectory
@@ -79,6 +81,21 @@ class SlamSystem(FramePipeline):
     @cached_property
     def _arrival(self) -> FrameArrival:
         return FrameArrival(self.config, self.camera, self.device)
+
+    def begin_at(self, first_pose: np.ndarray) -> None:
+        """Says where the next frame is, if the map begins with it: no frame before could be used.
+
+        Args:
+            first_pose: float64 [4, 4] T_world_camera. No effect where a number isn't finite, or once there is a map.
+
+        Raises:
+            ValueError, DatasetError: as of the system's first pose.
+        """
+        if self._has_map or not np.isfinite(first_pose).all():
+            return
+        check_first_pose(first_pose)
+        self.first_pose = np.array(first_pose, np.float64)
+        self.state.scene.origin = torch.from_numpy(self.first_pose[:3, 3].copy())
 
     def open_map(self, folder: str | os.PathLike) -> None:
         """Goes on in the map of a finished run; call it before the first frame.
