@@ -9,7 +9,7 @@ import pytest
 
 from spslam.camera import Camera
 from spslam.cli.check_data import _rows
-from spslam.datasets import open_dataset, registry, thinning
+from spslam.datasets import inspection, open_dataset, registry, thinning
 from spslam.datasets.base import RgbdDataset, RgbdFrame, Subset
 from spslam.datasets.clock import CaptureOffsets
 from spslam.datasets.findings import Finding
@@ -189,7 +189,23 @@ def test_no_depth_at_all_is_reported():
     room.holes = 48
     found = inspect_dataset(room)
     assert found.depth is None
-    assert "no depth at all in the frames looked at" in found.problems
+    assert found.problems == ["no depth at all in the frames looked at"]
+
+
+def test_poses_are_not_judged_by_intrinsics_that_are_wrong():
+    room = BoxRoom()
+    room.camera = replace(CAMERA, fx=110.0, fy=110.0, cx=63.0, cy=47.0)  # of twice the size
+    (problem,) = inspect_dataset(room).problems
+    assert problem.startswith("the principal point lies at 99% of the width and 99% of the height")
+
+
+def test_a_convention_that_images_and_depth_agree_on_is_said_once(monkeypatch):
+    text = "the poses look like world-to-camera; camera-to-world is needed"
+    monkeypatch.setattr(inspection, "with_whole", lambda *_: [Finding("poses", text, "convert the poses")])
+    room = BoxRoom()
+    room.given_poses = inverse(room.gt_poses)
+    found = [problem for problem in inspect_dataset(room).problems if text in problem]
+    assert found == [f"{text}; convert the poses"]
 
 
 def test_jumps_and_gaps_are_reported():
