@@ -3,8 +3,9 @@
 `color/` (or `rgb/`, `image/`, or `NAME-color/`) and `depth/` (or `NAME-depth-clean/` and its like) with `000000.jpg` or
 Redwood's `0000001-000000033369.jpg` (number and microseconds); depth of 16 bits. The camera is in
 `camera_intrinsic.json` or `intrinsic.json` (with `depth_scale` where Open3D's recorder wrote it), else PrimeSense's
-(525, 525, 319.5, 239.5 at 640x480), with millimeters. Poses are those of a `.log` file (three whole numbers, the first
-the frame's, then a 4x4 camera to world) named `trajectory.log`, `NAME_trajectory.log` or `NAME-traj.txt`.
+(525, 525, 319.5, 239.5 at 640x480), with millimeters, which is a doubt where names are not Redwood's. Poses are those
+of a `.log` file (three whole numbers, the first the frame's, then a 4x4 camera to world) named `trajectory.log`,
+`NAME_trajectory.log` or `NAME-traj.txt`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from spslam.camera import Camera
 from spslam.datasets.calibration_files import INTRINSICS_FILES, read_calibration
 from spslam.datasets.clock import AT_ONCE, CaptureOffsets
 from spslam.datasets.files import FramePaths, paired, require_folder
+from spslam.datasets.findings import Finding
 from spslam.datasets.folder import check_scale, file_recording
 from spslam.datasets.image_files import first_depth_size
 from spslam.datasets.images import first_size
@@ -28,12 +30,19 @@ from spslam.datasets.reference_poses import ReferencePoses
 from spslam.datasets.text import checked_poses, motion_fault, read_numbers
 from spslam.errors import DatasetError
 
-_COLOR_FOLDERS, _DEPTH_FOLDERS = ("color", "rgb", "image", "*-color"), ("depth", "*-depth*")
+_REDWOOD_COLOR = "*-color"
+_COLOR_FOLDERS, _DEPTH_FOLDERS = ("color", "rgb", "image", _REDWOOD_COLOR), ("depth", "*-depth*")
 _IMAGE = re.compile(r"(\d{1,12})(?:-(\d{1,15}))?\.(png|jpg|jpeg)")
 _PRIMESENSE = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _UNITS_PER_METER = 1000.0
 _FRAMES_PER_SECOND = 30.0
 _NUMBERS_PER_POSE = 19
+_DEFAULT_CAMERA = Finding(
+    "default camera",
+    "the camera is not known: there are no intrinsics, so that PrimeSense's is taken, with a focal length of 525 px at "
+    "640x480",
+    "write intrinsics.txt with fx fy cx cy (px) of the color images",
+)
 
 
 def open_open3d(folder: Path, depth_scale: float | None = None, view: View = "depth") -> Recording:
@@ -52,16 +61,19 @@ def open_open3d(folder: Path, depth_scale: float | None = None, view: View = "de
     size = first_size(frame.color for frame in paths)
     depth_size = first_depth_size([frame.depth for frame in paths][:50])
     scale: float | None = _UNITS_PER_METER
+    doubts: tuple[Finding, ...] = ()
     if any((folder / name).is_file() for name in INTRINSICS_FILES):
         calibration, stored = read_calibration(folder, size, depth_size)
         scale = stored or scale
     else:
         calibration = Calibration.of_one_view(Lens(_PRIMESENSE.resized(*size)), depth_size or size)
+        is_redwood = find_folder(folder, (_REDWOOD_COLOR,)) is not None or _has_redwood_names(paths)
+        doubts = () if is_redwood else (_DEFAULT_CAMERA,)
     scale = depth_scale or scale
     check_scale([frame.depth for frame in paths if frame.fault is None], scale)
     reference = _reference_poses(folder, len(frames))
     dataset = file_recording(f"open3d/{folder.name}", paths, calibration, reference.poses, scale, None, 0, view)
-    dataset.doubts = reference.doubts
+    dataset.doubts = (*doubts, *reference.doubts)
     return dataset
 
 
@@ -99,6 +111,12 @@ def _frames(folder: Path) -> dict[int, FramePaths]:
             for number, frame in frames.items()
         }
     return frames
+
+
+def _has_redwood_names(frames: list[FramePaths]) -> bool:
+    """Whether an image has a time in its name, as PrimeSense's have that Redwood's recorder wrote."""
+    match = _IMAGE.fullmatch(frames[0].color.name)
+    return match is not None and match[2] is not None
 
 
 def _numbered(folder: Path) -> dict[int, tuple[Path, int | None]]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from spslam.camera import Camera
 from spslam.datasets.files import FileDataset, find_numbered, pair_numbered, require_folder
+from spslam.datasets.findings import Finding
 from spslam.datasets.images import first_size
 from spslam.datasets.reference_poses import file_poses
 from spslam.datasets.registration import ColorToDepth
@@ -39,6 +40,11 @@ _COLOR_FROM_DEPTH = np.array(
         [0, 0, 0, 1],
     ]
 )
+_GUESSED_CAMERA = Finding(
+    "default camera",
+    f"the camera is not known: there is no {INTRINSICS_FILE}, so that of 7-Scenes is taken, whose images are 640x480",
+    f"write {INTRINSICS_FILE} with fx fy cx cy (px)",
+)
 _MOST_DIGITS = 9  # of a sequence's number
 _COLOR_NAME = r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"
 _DEPTH_NAME = r"frame-(\d+)\.depth\.png"
@@ -50,7 +56,8 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None, registere
 
     The camera is that of `camera-intrinsics.txt` in the sequence or the scene, else the dataset's default
     (585, 585, 320, 240), scaled to the image size. A frame without pose file, or with a non-finite or malformed pose,
-    has no pose; the last is a doubt. A frame with an image missing is one that raises when it is read.
+    has no pose; the last is a doubt, and so is the default camera for images that are not 640x480. A frame with an
+    image missing is one that raises when it is read.
 
     Args:
         folder: the scene (with `seq-XX` in it) or a sequence itself.
@@ -70,7 +77,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None, registere
             f"{sequence_folder}: must contain 7-Scenes frames (frame-000000.color.png, .depth.png), got none; "
             + _hint(sequence_folder)
         )
-    camera = _find_camera(sequence_folder, list(colors.values()))
+    camera, doubts = _find_camera(sequence_folder, list(colors.values()))
     frames = pair_numbered(colors, depths, FRAMES_PER_SECOND)
     reference = file_poses(list(frames), find_numbered(sequence_folder, _POSE_NAME))
     registration = None if _is_registered(camera, registered) else _registration(camera)
@@ -83,7 +90,7 @@ def open_seven_scenes(folder: Path, sequence: str | int | None = None, registere
         invalid_depth=(65535,),
         registration=registration,
         is_registered=registration is not None,  # what is taken as one camera's need not be
-        doubts=reference.doubts,
+        doubts=(*doubts, *reference.doubts),
     )
 
 
@@ -133,12 +140,14 @@ def _sequence_name(sequence: str | int) -> str:
     return f"seq-{int(digits.group()):02d}" if digits and has_number else str(sequence)
 
 
-def _find_camera(sequence_folder: Path, colors: list[Path]) -> Camera:
+def _find_camera(sequence_folder: Path, colors: list[Path]) -> tuple[Camera, tuple[Finding, ...]]:
+    """The camera of a sequence, and the doubt that it is a guess: the dataset's, for images of another size."""
     width, height = first_size(colors)
     for folder in (sequence_folder, sequence_folder.parent):
         if (folder / INTRINSICS_FILE).is_file():
-            return read_intrinsics_matrix(folder / INTRINSICS_FILE, width, height)
-    return _DEFAULT_CAMERA.resized(width, height)
+            return read_intrinsics_matrix(folder / INTRINSICS_FILE, width, height), ()
+    is_its_own = (width, height) == (_DEFAULT_CAMERA.width, _DEFAULT_CAMERA.height)
+    return _DEFAULT_CAMERA.resized(width, height), () if is_its_own else (_GUESSED_CAMERA,)
 
 
 def _is_registered(camera: Camera, registered: bool | None) -> bool:

@@ -134,10 +134,19 @@ def test_redwoods_names_and_its_camera(tmp_path):
             file.rename(file.with_name(f"{number + 1:07d}-{late:012d}{file.suffix}"))
     dataset = open_path(recording, "dataset.depth_scale=5000")
     assert dataset.camera.fx == 525 / 20
+    assert not dataset.doubts  # Redwood's recordings are PrimeSense's
     assert dataset.timestamps()[1] == pytest.approx(0.033869)
     assert dataset[1].offsets.color == pytest.approx(-0.0005)
     np.testing.assert_allclose(dataset.poses(), poses(COUNT), atol=1e-8)
     np.testing.assert_allclose(dataset[2].depth, depth_meters(2), atol=2e-4)
+
+
+def test_a_camera_of_open3d_that_is_guessed_is_a_doubt(tmp_path):
+    recording = write.write_open3d(tmp_path / "mine", COUNT)
+    assert not open_path(recording).doubts
+    (recording / "intrinsic.json").unlink()
+    (doubt,) = open_path(recording, "dataset.depth_scale=5000").doubts
+    assert str(doubt).startswith("the camera is not known: there are no intrinsics, so that PrimeSense's is taken")
 
 
 def test_a_pose_of_open3d_that_is_no_motion_is_unknown(tmp_path):

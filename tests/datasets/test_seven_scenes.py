@@ -38,8 +38,11 @@ def test_a_scene(tmp_path):
 def test_a_sequence_folder_directly_takes_the_scene_s_intrinsics(tmp_path):
     scene = write_seven_scenes(tmp_path)
     assert open_seven_scenes(scene / "seq-01").camera.fx == 30
+    assert not open_seven_scenes(scene / "seq-01").doubts
     (scene / "camera-intrinsics.txt").unlink()
-    assert open_seven_scenes(scene / "seq-01").camera == Camera(640, 480, 585, 585, 320, 240).resized(32, 24)
+    guessed = open_seven_scenes(scene / "seq-01")
+    assert guessed.camera == Camera(640, 480, 585, 585, 320, 240).resized(32, 24)
+    assert [doubt.kind for doubt in guessed.doubts] == ["default camera"]  # the data set's images are 640x480
 
 
 def test_sequences(tmp_path):
@@ -216,6 +219,7 @@ def test_color_of_the_kinect_comes_to_its_depth(tmp_path):
     dataset = open_seven_scenes(tmp_path)
     assert dataset.is_registered
     assert dataset.camera == Camera(640, 480, 585, 585, 320, 240)
+    assert not dataset.doubts
     frame = dataset[0]
     np.testing.assert_array_equal(frame.pose, np.eye(4))
     kept = frame.depth > 0
