@@ -55,7 +55,10 @@ def _frames(folder: Path) -> dict[int, FramePaths]:
     frames: dict[int, FramePaths] = {}
     for words in read_rows(path, columns=4):
         if not words[0].isdecimal() or len(words[0]) > 9:
-            raise DatasetError(f"{path}: must list `number depth number color`, got {brief(' '.join(words))!r}")
+            raise DatasetError(
+                f"{path}: must list `number depth number color`, as ICL-NUIM does, got {brief(' '.join(words))!r}; "
+                "images with time stamps belong into the lists rgb.txt and depth.txt, as in TUM's sequences"
+            )
         number = int(words[0])
         frames.setdefault(number, FramePaths(folder / words[3], folder / words[1], number / _FRAMES_PER_SECOND))
         if len(frames) > MAX_FRAMES:

@@ -60,11 +60,30 @@ def identify_recording(path: Path) -> Identified:
         if fits(path):
             return Identified(config, description)
     if path.is_dir():
-        looked = "color/ and depth/ with the intrinsics, a ROS bag, or the layout of a dataset in docs/datasets.md"
-        raise DatasetError(f"{path}: is no recording that is known: must contain {looked}; {_inside(path)}")
+        raise DatasetError(f"{path}: is no recording that is known: {_lacking(path)}; {_inside(path)}")
     raise DatasetError(
         f"{path}: is no recording that is known: must be a ROS bag ({', '.join(BAG_SUFFIXES)}), .mkv of Azure Kinect, "
         ".r3d of Record3D or .sens of ScanNet; a video needs a folder with its depth images beside it"
+    )
+
+
+def _lacking(path: Path) -> str:
+    """What a folder must have to be a recording: of the format that it comes near to, or else of any."""
+    for present, absent in (("rgb.txt", "depth.txt"), ("depth.txt", "rgb.txt")):
+        if (path / present).is_file():
+            return f"beside {present} must be {absent}, a line `timestamp file` for each image, as in TUM's sequences"
+    called = {item.name.lower(): item.name for item in path.iterdir() if item.is_dir()}
+    color, depth = next((name for name in COLOR_FOLDERS if name in called), None), "depth"
+    if color is None or depth not in called:
+        return (
+            "must contain color/ and depth/ with the intrinsics, a ROS bag, or the layout of a dataset in "
+            "docs/datasets.md"
+        )
+    renamed = [f"{called[name]} to {name}" for name in (color, depth) if called[name] != name]
+    if renamed:
+        return f"folders of images must have names in lower case, rename {' and '.join(renamed)}"
+    return (
+        f"beside {color}/ and depth/ must be the intrinsics of the color images: intrinsics.txt with fx fy cx cy (px)"
     )
 
 

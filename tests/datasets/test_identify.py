@@ -5,6 +5,7 @@ import json
 import pytest
 
 from spslam.datasets import identify_recording
+from spslam.errors import DatasetError
 from tests.datasets.layouts import write_folder, write_tum
 
 
@@ -52,3 +53,27 @@ def test_a_link_tells_the_name_as_well(tmp_path):
     (tmp_path / "rgbd_bonn_balloon").symlink_to(tmp_path / "balloon")
     assert config_of(tmp_path / "rgbd_bonn_balloon") == "bonn"
     assert config_of(tmp_path / "balloon") == "tum"
+
+
+@pytest.mark.parametrize(
+    ("write", "remove", "rename", "message"),
+    [
+        (
+            write_folder,
+            "intrinsics.txt",
+            {},
+            r"beside color/ and depth/ must be the intrinsics .*: intrinsics\.txt with fx",
+        ),
+        (write_folder, None, {"color": "RGB", "depth": "Depth"}, "in lower case, rename RGB to rgb and Depth to depth"),
+        (write_tum, "depth.txt", {}, r"beside rgb\.txt must be depth\.txt, a line `timestamp file` for each image"),
+        (write_tum, "rgb.txt", {}, r"beside depth\.txt must be rgb\.txt"),
+    ],
+)
+def test_what_a_folder_lacks_is_named(tmp_path, write, remove, rename, message):
+    folder = write(tmp_path / "mine")
+    if remove is not None:
+        (folder / remove).unlink()
+    for name, other in rename.items():
+        (folder / name).rename(folder / other)
+    with pytest.raises(DatasetError, match=f"mine: is no recording that is known: .*{message}.*; it contains "):
+        identify_recording(folder)

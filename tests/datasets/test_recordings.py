@@ -299,6 +299,7 @@ BROKEN = [
     ("open3d", put("intrinsic.json", '{"intrinsic_matrix": 3}'), "intrinsic_matrix must be nine numbers column by"),
     ("open3d", remove("depth/*"), "depth: must contain numbered images, got none"),
     ("icl_nuim", put("associations.txt", "a b c d"), "associations.txt: must list `number depth number color`"),
+    ("icl_nuim", put("associations.txt", "1.5 rgb/0.png 1.5 depth/0.png"), "time stamps belong into the lists rgb.txt"),
     ("icl_nuim", put("associations.txt", ""), "associations.txt: must list at least one image, got none"),
     ("video", cut("color.avi"), None),
     ("video", remove("intrinsics.txt"), "must contain the intrinsics in one of intrinsics.txt"),
