@@ -38,6 +38,8 @@ PLAUSIBLE_MEDIAN_M = (0.1, 20.0)
 # Scales that sensors and datasets use; the one that makes a depth plausible is suggested.
 _COMMON_SCALES = (1.0, 1000.0, 5000.0, 6553.5, 10000.0)
 _FRAMES_TRIED_FOR_SCALE = 5
+# Beyond what 16 bits hold, or not measured: no surface, but near in units of 0.1 mm.
+SATURATED = (65535,)
 
 
 def open_folder(
@@ -72,7 +74,8 @@ def open_folder(
     confidence = _confidence_files(folder / CONFIDENCE_FOLDER, frames) if min_confidence > 0 else None
     name = f"folder/{folder.name}"
     if confidence is None and _is_one_camera(calibration):
-        return FileDataset(name, calibration.color.camera, frames, reference.poses, scale, doubts=reference.doubts)
+        camera, poses = calibration.color.camera, reference.poses
+        return FileDataset(name, camera, frames, poses, scale, invalid_depth=SATURATED, doubts=reference.doubts)
     dataset = file_recording(name, frames, calibration, reference.poses, scale, confidence, min_confidence, view)
     dataset.doubts = reference.doubts
     return dataset
@@ -104,6 +107,7 @@ def file_recording(
             seconds,
             (depth.width, depth.height),
             units_per_meter,
+            SATURATED,
             confidence=confidence,
             min_confidence=min_confidence,
         ),
@@ -227,8 +231,8 @@ def check_scale(paths: Sequence[Path], scale: float | None) -> None:
     first_fault = None
     for path in paths[:: -(-len(paths) // _FRAMES_TRIED_FOR_SCALE) or 1]:
         try:
-            depth = read_depth(path, scale)
-            stored = read_depth(path, 1.0)
+            depth = read_depth(path, scale, SATURATED)
+            stored = read_depth(path, 1.0, SATURATED)
         except DatasetError:
             continue
         measured = depth[depth > 0]

@@ -13,7 +13,7 @@ import numpy as np
 
 from spslam.datasets.calibration_files import read_calibration
 from spslam.datasets.files import require_folder
-from spslam.datasets.folder import DEPTH_SUFFIXES, POSES_FILE, TIMES_FILE, check_scale, list_images
+from spslam.datasets.folder import DEPTH_SUFFIXES, POSES_FILE, SATURATED, TIMES_FILE, check_scale, list_images
 from spslam.datasets.image_files import DepthFiles, first_depth_size
 from spslam.datasets.images import DEPTH_SCALE_RULE, is_depth_scale
 from spslam.datasets.pairing import pair_by_time
@@ -58,7 +58,7 @@ def open_video_recording(
     check_scale(depths, scale)
     pairs, seconds = _pairs(folder, video, len(depths), tolerance_s)
     reference = table_poses(pairs[:, 1].tolist(), folder / POSES_FILE, (len(depths),))
-    stream = DepthFiles(depths, seconds, size, scale)
+    stream = DepthFiles(depths, seconds, size, scale, SATURATED)
     dataset = Recording(f"video/{folder.name}", video, stream, pairs, calibration, reference.poses, view=view)
     dataset.doubts = reference.doubts
     return dataset

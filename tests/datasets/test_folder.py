@@ -141,6 +141,22 @@ def test_a_hand_before_the_lens_at_first_is_no_wrong_scale(tmp_path):
     assert len(open_folder(folder)) == 12
 
 
+@pytest.mark.parametrize("distortion", [{}, {"k1": 0.01}])
+def test_the_largest_number_is_not_measured(tmp_path, distortion):
+    recording = write_folder(tmp_path, units_per_meter=10000)
+    values = {"fx": 30.0, "fy": 31.0, "cx": 15.5, "cy": 11.5, "depth_scale": 10000} | distortion
+    (recording / "intrinsics.txt").unlink()
+    (recording / "intrinsics.json").write_text(json.dumps(values))
+    for path in (recording / "depth").iterdir():
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        stored[:, :20] = 65535  # most of it: the median, too, must not be that of these
+        assert cv2.imwrite(str(path), stored)
+    depth = open_folder(recording)[0].depth
+    assert not depth[:, :16].any()
+    assert 1 < depth[12, 28] < 2.6
+    assert depth.max() < 2.6
+
+
 def test_floating_point_depth_is_in_meters(tmp_path):
     folder = write_folder(tmp_path, count=1)
     (folder / "depth" / "0.png").unlink()
