@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 from spslam.cli.arguments import add_config, choose_config, overrides
 from spslam.config import load_config
@@ -37,7 +38,7 @@ def _rows(found: Inspection) -> list[tuple[str, str]]:
     camera = found.camera
     rows = [
         ("data", found.name),
-        ("frames", f"{found.frames}, {found.frames_per_second:.1f} frames/s; depth of {found.frames_read} checked"),
+        ("frames", f"{found.frames}{_rate(found.frames_per_second)}; depth of {found.frames_read} checked"),
         ("size", f"{camera.width}x{camera.height} px"),
         ("intrinsics", f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f} px"),
     ]
@@ -52,6 +53,13 @@ def _rows(found: Inspection) -> list[tuple[str, str]]:
         mean, spread = (1000 * value for value in found.color_offset)
         rows.append(("color", f"{mean:+.1f} ms +- {spread:.1f} ms after depth, by time stamps"))
     return [*rows, *_pose_rows(found)]
+
+
+def _rate(frames_per_second: float) -> str:
+    """Of one frame, and of times that don't ascend, nothing; of stamps in another unit than seconds, a tiny number."""
+    if math.isnan(frames_per_second):
+        return ""
+    return f", {frames_per_second:.1f} frames/s" if frames_per_second >= 0.05 else f", {frames_per_second:.2g} frames/s"
 
 
 def _pose_rows(found: Inspection) -> list[tuple[str, str]]:

@@ -272,7 +272,9 @@ def test_the_scale_is_set_as_the_format_has_it(monkeypatch, kind, words):
 
 
 def test_one_frame_is_enough_to_look_at():
-    assert inspect_dataset(BoxRoom(1)).problems == ["only one frame"]
+    found = inspect_dataset(BoxRoom(1))
+    assert found.problems == ["only one frame"]
+    assert dict(_rows(found))["frames"] == "1; depth of 1 checked"
 
 
 RECORDINGS = {
