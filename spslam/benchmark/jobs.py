@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -179,7 +180,7 @@ def _locate(sequence: Sequence, data: Path | None) -> tuple[Path | None, str]:
         return None, "no --data given"
     for candidate in sequence.folders:
         if (data / candidate).is_dir():
-            return (data / candidate).resolve(), ""
+            return Path(os.path.abspath(data / candidate)), ""  # not what a link leads to: its name may tell the camera
     return None, f"none of {', '.join(sequence.folders)} in {data}; --folders FILE names other folders"
 
 

@@ -99,10 +99,9 @@ def _run_replay(args: argparse.Namespace, config: Config, output: Path) -> dict[
     dataset = open_sequence(config.dataset, data, args.frames)
 
     from spslam.live.replay import ReplaySource
-    from spslam.run.sequence import first_pose
 
     source = ReplaySource(dataset, args.rate, args.repeat)
-    return _run(args, config, output, source, data, first_pose(config, dataset))
+    return _run(args, config, output, source, data)
 
 
 def _run_realsense(args: argparse.Namespace, config: Config, output: Path) -> dict[str, Any]:
@@ -114,7 +113,7 @@ def _run_realsense(args: argparse.Namespace, config: Config, output: Path) -> di
 
 
 def _run(
-    args: argparse.Namespace, config: Config, output: Path, source: Any, data: Path | None = None, pose: Any = None
+    args: argparse.Namespace, config: Config, output: Path, source: Any, data: Path | None = None
 ) -> dict[str, Any]:
     from spslam.live.request import LiveRequest
     from spslam.live.session import run_live
@@ -133,7 +132,7 @@ def _run(
     )
     try:
         with opened_viewer(args, f"spslam live {args.source}") as viewer:
-            return run_live(request, source, progress, pose, viewer)
+            return run_live(request, source, progress, observer=viewer)
     finally:
         if progress is not None:
             progress.close()

@@ -90,6 +90,7 @@ class LiveLoop:
         clock: kept up to date.
         progress: called after each frame, and when the end begins.
         observer: watches the run; it is not asked to pause.
+        begins_at_truth: whether the map begins at the ground-truth pose of its first frame, where that has one.
 
     Attributes:
         status: where the run stands.
@@ -106,6 +107,7 @@ class LiveLoop:
         clock: RunClock,
         progress: LiveProgress | None,
         observer: RunObserver | None = None,
+        begins_at_truth: bool = False,
     ) -> None:
         self.observer = observer or RunObserver()
         self.system, self.capture, self.folder, self.clock = system, capture, folder, clock
@@ -116,6 +118,7 @@ class LiveLoop:
         self._queue: FrameQueue = capture.queue
         self._progress = progress
         self._frozen_depth = ArrivingFrozenDepth()
+        self._begins_at_truth = begins_at_truth
         self._record = event_recorder(system.device)
         mapping = system.config.mapping
         self._least = math.ceil(LEAST_SHARE * mapping.iterations / mapping.every)
@@ -169,7 +172,10 @@ class LiveLoop:
         """Tracks a frame; what need not be done before its pose is known is done then."""
         status = self.status
         known: list[float] = []
-        self.poses.append(item.frame.pose)
+        truth = item.frame.pose
+        self.poses.append(truth)
+        if self._begins_at_truth and truth is not None:
+            self.system.begin_at(truth)
         pending = self.system.submit(frame, lambda pose: known.append(time.monotonic()), defer_mapping=True)
         latency_ms = 1e3 * (known[0] - item.complete_s)
         self._frozen_depth.keep(item.frame)

@@ -54,7 +54,8 @@ def run_live(
         request: options and output folder.
         source: the camera; it is closed at the end.
         progress: called after each frame.
-        first_pose: float64 [4, 4] T_world_camera of the first frame; identity where not given.
+        first_pose: float64 [4, 4] T_world_camera of the first frame; where not given, by `scene.first_pose`, the
+            `RgbdFrame.pose` of the frame that the map begins with, or the identity where it has none.
         observer: watches the run, as the viewer does (`spslam.viewer`); it can't pause it. It is told of a frame after
             its pose is, so that its latency does not count this; the next frame waits for it.
 
@@ -99,7 +100,8 @@ def _run_on_device(
                 folder.create(resume=False)
                 atomic_write(folder.config, dump_config(system.config, provenance(system.config, device)))
                 clock = RunClock(start_s=time.perf_counter() - started)
-                return _run(request, source, system, folder, progress, observer, clock, unused)
+                at_truth = first_pose is None and request.config.scene.first_pose == "dataset"
+                return _run(request, source, system, folder, progress, observer, clock, unused, at_truth)
 
 
 def _refuse_interrupted(folder: OutputFolder) -> None:
@@ -117,6 +119,7 @@ def _run(
     observer: RunObserver | None,
     clock: RunClock,
     unused: contextlib.ExitStack,
+    begins_at_truth: bool,
 ) -> dict[str, Any]:
     recorder = None
     if request.record_dir is not None:
@@ -130,7 +133,7 @@ def _run(
                 observer.begin(_observed(source, system), system.state)
             capture = stack.enter_context(Capture(source, FrameQueue(request.max_wait_s), recorder))
             unused.pop_all()
-            loop = LiveLoop(system, capture, folder, clock, progress, observer)
+            loop = LiveLoop(system, capture, folder, clock, progress, observer, begins_at_truth)
             loop.run(interruption, request.seconds)
         metrics = _write(request, source, system, folder, loop)
     _raise_failure(loop, recorder, folder)

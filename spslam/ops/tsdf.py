@@ -21,8 +21,6 @@ COLOR_SIZE = 4
 NO_BLOCK = torch.iinfo(torch.int32).min
 
 _MAX_SIDE = 1 << 14
-# The smallest above 0: the distance of a voxel in which nothing was measured is 0, which is no surface.
-_LEAST_WEIGHT = torch.finfo(torch.float32).tiny
 
 
 @public_op()
@@ -237,8 +235,7 @@ def tsdf_query(
     name = "tsdf_query"
     _check_field(name, (hash_keys, hash_values, sdf, weights, colors), voxel_size)
     check_tensor(name, "points", points, ("N", 3), torch.float32, like=sdf)
-    least = max(min_weight, _LEAST_WEIGHT)
-    return torch.ops.spslam.tsdf_query(hash_keys, hash_values, sdf, weights, colors, points, voxel_size, least)
+    return torch.ops.spslam.tsdf_query(hash_keys, hash_values, sdf, weights, colors, points, voxel_size, min_weight)
 
 
 @public_op()
@@ -292,7 +289,7 @@ def tsdf_ray_cast(
     check(len(size) == 2 and min(size) >= 0 and max(size) <= _MAX_SIDE, name, "size", f"be 0 to {_MAX_SIDE} px", size)
     fits = len(depth_range) == 2 and 0 < depth_range[0] < depth_range[1]
     check(fits, name, "depth_range", "be two ascending positive numbers", depth_range)
-    numbers = list(intrinsics), list(size), list(depth_range), voxel_size, max(min_weight, _LEAST_WEIGHT)
+    numbers = list(intrinsics), list(size), list(depth_range), voxel_size, min_weight
     return torch.ops.spslam.tsdf_ray_cast(hash_keys, hash_values, sdf, weights, colors, pose, *numbers)
 
 

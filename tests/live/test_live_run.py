@@ -17,9 +17,10 @@ from spslam.live import FolderRecorder, LiveRequest, ReplaySource, capture, sess
 from spslam.live.frame_queue import FrameQueue
 from spslam.live.session import run_live
 from spslam.slam.system import SlamSystem
+from spslam.trajectory import Trajectory
 from tests.cli.command import ROOT, assert_refused, spslam
 from tests.live.sources import RoomCamera
-from tests.system.sequences import Recorded, settings
+from tests.system.sequences import Recorded, settings, without_depth
 
 FILES = {"config.yaml", "keyframes.safetensors", "log.jsonl", "map.safetensors", "metrics.json", "previews"}
 FILES |= {"report.html", "trajectory.txt"}
@@ -85,6 +86,12 @@ def test_a_replay_is_compared_with_its_ground_truth(tmp_path, device):
     assert (tmp_path / "out" / "previews" / "ground_truth.txt").is_file()
 
 
+def test_the_map_of_a_replay_begins_where_its_first_usable_frame_is(tmp_path):
+    run_live(request(tmp_path), ReplaySource(Recorded(6, without_depth(0, 1)), 100))
+    poses = Trajectory.load_tum(tmp_path / "out" / "trajectory.txt").poses
+    np.testing.assert_allclose(poses[2], Recorded(6).poses()[2], atol=1e-6)
+
+
 def test_late_frames_are_dropped_and_counted(tmp_path, monkeypatch):
     submit = SlamSystem.submit
     monkeypatch.setattr(SlamSystem, "submit", lambda *args, **more: time.sleep(0.03) or submit(*args, **more))
@@ -141,7 +148,7 @@ def test_without_a_frame_nothing_is_left_behind(tmp_path, camera, kind, message)
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        (["scene.max_voxels=16200", "mapping.every=1"], "max_voxels"),
+        (["scene.max_voxels=16200", "mapping.every=1", "scene.first_pose=identity"], "max_voxels"),
         (["pixels.budget_mb=0.01", "pixels.per_frame=200"], "pixels.budget_mb"),
     ],
 )

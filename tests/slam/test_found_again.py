@@ -173,7 +173,9 @@ def test_a_camera_that_has_jumped_may_be_anywhere(recovery, monkeypatch, changes
     monkeypatch.setattr(recovery, "_starts_at_last", lambda frame, first: (frame, []))
     monkeypatch.setattr(recovery, "_likeliest", lambda *args, **kwargs: found)
     monkeypatch.setattr(recovery, "_relocalize", lambda frame, candidates: asked.append(1) or found)
-    history = SimpleNamespace(consecutive_lost_frames=0, consistent_frames=0, interval_s=1 / 30, knows_speed=True)
+    history = SimpleNamespace(
+        consecutive_lost_frames=0, consistent_frames=0, interval_s=1 / 30, steps=1.0, knows_speed=True
+    )
     problem = SimpleNamespace(constraints=SimpleNamespace(reference=None))
     recovery._recover(problem, found, None, history, None)
     assert bool(asked) == asks

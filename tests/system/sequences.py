@@ -62,6 +62,16 @@ def settings(*overrides: str, preset: str | None = None) -> Config:
     return load_config("demo", preset, [*FAST_SETTINGS, *overrides])
 
 
+def without_depth(*indices: int) -> Change:
+    """Frames in which no pixel has depth."""
+
+    def change(frame: RgbdFrame) -> None:
+        if frame.index in indices:
+            frame.depth[:] = 0
+
+    return change
+
+
 def run_on(monkeypatch, dataset: RgbdDataset, output: Path, *overrides: str, **arguments) -> dict:
     """`run_sequence` over a dataset made by a test; returns the metrics."""
     config = settings(*overrides, preset=arguments.pop("preset", None))

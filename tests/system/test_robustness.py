@@ -12,15 +12,7 @@ from spslam.errors import DatasetError, OutputError, SpslamError
 from spslam.run.sequence import RunRequest, run_sequence
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
-from tests.system.sequences import Recorded, run_on, settings
-
-
-def without_depth(*indices):
-    def change(frame):
-        if frame.index in indices:
-            frame.depth[:] = 0
-
-    return change
+from tests.system.sequences import Recorded, run_on, settings, without_depth
 
 
 def unreadable(*indices):
