@@ -116,7 +116,8 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
     fits = [Fit(*line) for line in table[:, 3:].tolist()]
     model = PoseConfidenceModel.load()
     error_probabilities = {
-        "with colors": np.array([model.error_probability(fit) for fit in fits]),
+        # What looks elsewhere is not accepted, however probable.
+        "with colors": np.array([1.0 if model.looks_elsewhere(fit) else model.error_probability(fit) for fit in fits]),
         "without": np.array([model.error_probability(replace(fit, brightness_correlation=math.nan)) for fit in fits]),
     }
     brightness_correlation = np.array([fit.brightness_correlation for fit in fits])
@@ -130,7 +131,7 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
             shares = ", ".join(f"{(error_probability[group] <= bound).sum()} below {bound:g}" for bound in bounds)
             quantiles = " ".join(f"{value:.3f}" for value in np.quantile(error_probability[group], QUANTILES))
             print(f"  error probability {how:12s} {shares}; quantiles {QUANTILES}: {quantiles}")
-    print_reliability(error_probabilities["with colors"], is_wrong | wall)
+    print_reliability(np.array([model.error_probability(fit) for fit in fits]), is_wrong | wall)
 
 
 def print_reliability(stated: np.ndarray, is_wrong: np.ndarray) -> None:

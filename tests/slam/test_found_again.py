@@ -47,6 +47,15 @@ def test_likely_poses_must_agree_for_some_frames(recovery, before):
     assert result.consistent_frames == (before + 1 if result.lost else 0)
 
 
+@pytest.mark.parametrize(("correlation", "is_lost"), [(0.79, True), (0.84, True), (0.86, False), (math.nan, False)])
+def test_a_place_that_fits_but_looks_different_is_another_one(recovery, correlation, is_lost):
+    """Bays of an arcade: surface fits within millimeters, and frame by frame; 111 features of arches had agreed too."""
+    for fit in (CERTAIN, replace(CERTAIN, feature_inliers=111, feature_share=0.96), LIKELY):
+        result = found_again(recovery, replace(fit, brightness_correlation=correlation), CONSISTENT_FRAMES + 1)
+        assert result.error_probability < 0.1
+        assert (result.lost, result.consistent_frames) == (is_lost, 0)
+
+
 @pytest.mark.parametrize("far", [{"prediction_error_cm": 30.0}, {"prediction_error_deg": 10.0}])
 def test_poses_apart_do_not_agree(recovery, far):
     result = found_again(recovery, replace(LIKELY, **far), CONSISTENT_FRAMES + 1)

@@ -44,6 +44,7 @@ class PoseConfidenceModel:
         unknown_prediction_error, unknown_free_space_violation: used where the measure is NaN.
         expected_map_coverage: map coverage below which the mean robust weight is scaled up.
         min_brightness_correlation, min_feature_share: minima of correct poses.
+        min_relocalized_correlation: of brightness, least of a pose where the camera may be anywhere.
         max_occluded_share: above it the frame is occluded.
         min_feature_inliers: with as many the pose is known without the motion model.
         min_holding_inliers, min_holding_share: with as many the pose is held where surface leaves it free.
@@ -67,6 +68,7 @@ class PoseConfidenceModel:
     unknown_free_space_violation: float
     expected_map_coverage: float
     min_brightness_correlation: float
+    min_relocalized_correlation: float
     max_occluded_share: float
     min_feature_inliers: float
     per_missing_feature_share: float
@@ -129,6 +131,11 @@ class PoseConfidenceModel:
     def has_jumped(self, fit: Fit) -> bool:
         """Whether the pose is too far from the prediction to be followed; False where nothing is predicted."""
         return fit.prediction_error_cm > self.max_followed_cm or fit.prediction_error_deg > self.max_followed_deg
+
+    def looks_elsewhere(self, fit: Fit) -> bool:
+        """Whether earlier images show too different a brightness there: of places that are alike surface fits, image by
+        image. False where nothing was compared, as without texture."""
+        return fit.brightness_correlation < self.min_relocalized_correlation
 
     def has_many_features(self, fit: Fit) -> bool:
         """Whether as many image features agree with the pose as hold one.

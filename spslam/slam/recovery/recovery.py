@@ -355,11 +355,14 @@ class Recovery:
         The error probability is computed without the prediction error. It must be at most
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
         frames with consistent poses. Where surface leaves a direction free, poses that slide are consistent too: there
-        only the former counts, and many image features must agree.
+        only the former counts, and many image features must agree. Nowhere counts surface whose brightness was another
+        one in earlier images.
         """
         was_near = is_consistent(tracked.fit)
         fit = tracked.fit.unpredicted()
         tracked = self._judge.judged(replace(tracked, fit=fit))
+        if self._confidence.looks_elsewhere(fit):
+            return replace(tracked, lost=True, consistent_frames=0)
         is_firm = fit.min_eigenvalue >= WEAK_EIGENVALUE
         is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
         if is_certain and not tracked.lost and (is_firm or self._confidence.has_many_features(fit)):
