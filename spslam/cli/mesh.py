@@ -275,7 +275,10 @@ def _opened_again(run: RunOutput, config: Config, for_texture: bool) -> RgbdData
                 f"{run.folder.path}: a texture is made of the run's frames, which can't be read again ({error})"
             ) from None
         if not _is_live(run):
-            raise
+            raise OutputError(
+                f"{run.folder.path}: the run's frames can't be read again ({error}): put them back, or use --source "
+                "neural, which needs none"
+            ) from None
         raise OutputError(
             f"{run.folder.path}: the frames of a live run can't be read again; --source neural needs none ({error})"
         ) from None

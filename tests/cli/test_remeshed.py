@@ -116,6 +116,16 @@ def test_another_camera_is_refused(folder, command):
     assert contents(folder / "out") == before
 
 
+def test_frames_that_are_gone_are_not_needed_by_the_map_alone(folder):
+    (folder / "data").rename(folder / "moved")
+    advice = ": no such folder): put them back, or use --source neural, which needs none"
+    refused = spslam("mesh", "out", cwd=folder)
+    assert_refused(refused, "out: the run's frames can't be read again (")
+    assert advice in refused.stderr
+    result = spslam("mesh", "out", "--source", "neural", cwd=folder)
+    assert result.returncode == 0, result.stderr
+
+
 def test_missing_and_unreadable_frames_are_said(folder):
     times = folder / "data" / "times.txt"
     lines = times.read_text().splitlines()
