@@ -116,7 +116,7 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
     fits = [Fit(*line) for line in table[:, 3:].tolist()]
     model = PoseConfidenceModel.load()
     error_probabilities = {
-        # What looks elsewhere is not accepted, however probable.
+        # What looks elsewhere is not accepted, however probable, if colors are registered.
         "with colors": np.array([1.0 if model.looks_elsewhere(fit) else model.error_probability(fit) for fit in fits]),
         "without": np.array([model.error_probability(replace(fit, brightness_correlation=math.nan)) for fit in fits]),
     }

@@ -28,9 +28,9 @@ def recovery():
     return Recovery(config, camera, Tracker(config, camera, confidence.score_kernel_m), confidence)
 
 
-def found_again(recovery, fit, consistent_before):
+def found_again(recovery, fit, consistent_before, colors_are_registered=True):
     tracked = TrackedFrame(torch.zeros(7), 8, fit, error_probability=0.0, lost=False)
-    return recovery._accept_anywhere(tracked, consistent_before)
+    return recovery._accept_anywhere(tracked, consistent_before, colors_are_registered)
 
 
 def test_without_doubt_it_is_found_at_once(recovery):
@@ -54,6 +54,11 @@ def test_a_place_that_fits_but_looks_different_is_another_one(recovery, correlat
         result = found_again(recovery, replace(fit, brightness_correlation=correlation), CONSISTENT_FRAMES + 1)
         assert result.error_probability < 0.1
         assert (result.lost, result.consistent_frames) == (is_lost, 0)
+
+
+def test_colors_that_are_not_where_depth_is_tell_no_places_apart(recovery):
+    fit = replace(CERTAIN, brightness_correlation=0.75)
+    assert not found_again(recovery, fit, 0, colors_are_registered=False).lost
 
 
 @pytest.mark.parametrize("far", [{"prediction_error_cm": 30.0}, {"prediction_error_deg": 10.0}])

@@ -346,22 +346,24 @@ class Recovery:
         # Stored frames may confirm, where the last one shows too little, that the camera is where it was predicted.
         is_followed = not history.is_lost and not found.lost and is_consistent(found.fit)
         if not is_followed:
-            found = self._accept_anywhere(found, history.consistent_frames)
+            found = self._accept_anywhere(found, history.consistent_frames, frame.colors_are_registered)
         return replace(found, relocalized=is_new and not found.lost)
 
-    def _accept_anywhere(self, tracked: TrackedFrame, consistent_before: int) -> TrackedFrame:
+    def _accept_anywhere(
+        self, tracked: TrackedFrame, consistent_before: int, colors_are_registered: bool
+    ) -> TrackedFrame:
         """The result, accepted by stricter thresholds, as the camera may be anywhere and some places look alike.
 
         The error probability is computed without the prediction error. It must be at most
         `tracking.relocalization_threshold`, or at most `LIKELY_ERROR_PROBABILITY` in `CONSISTENT_FRAMES` consecutive
         frames with consistent poses. Where surface leaves a direction free, poses that slide are consistent too: there
-        only the former counts, and many image features must agree. Nowhere counts surface whose brightness was another
-        one in earlier images.
+        only the former counts, and many image features must agree. Where colors are where depth is, surface whose
+        brightness was another one in earlier images is elsewhere.
         """
         was_near = is_consistent(tracked.fit)
         fit = tracked.fit.unpredicted()
         tracked = self._judge.judged(replace(tracked, fit=fit))
-        if self._confidence.looks_elsewhere(fit):
+        if colors_are_registered and self._confidence.looks_elsewhere(fit):
             return replace(tracked, lost=True, consistent_frames=0)
         is_firm = fit.min_eigenvalue >= WEAK_EIGENVALUE
         is_certain = tracked.error_probability <= self._config.tracking.relocalization_threshold
