@@ -7,7 +7,8 @@ Every second frame of a sequence is mapped. At four places the camera is interru
 are shown to it one by one, each as the first after the failure: some show mapped surface, others do not. Every third of
 them is shown again as a wall of one color, 0.8 to 2.7 m away, that is nowhere in the map. The script prints how many
 poses are accepted, at once or if four frames agree, with and without the check of colors, and the reliability diagram:
-the error probability stated against the share of poses that are wrong. The first command measures one sequence, the
+the error probability stated against the share of poses that are wrong. "With colors" is as where these are registered:
+a pose that looks elsewhere is not accepted then. The first command measures one sequence, the
 second evaluates saved measurements.
 """
 
@@ -116,7 +117,6 @@ def judge(table: np.ndarray, bounds: tuple[float, float]) -> None:
     fits = [Fit(*line) for line in table[:, 3:].tolist()]
     model = PoseConfidenceModel.load()
     error_probabilities = {
-        # What looks elsewhere is not accepted, however probable, if colors are registered.
         "with colors": np.array([1.0 if model.looks_elsewhere(fit) else model.error_probability(fit) for fit in fits]),
         "without": np.array([model.error_probability(replace(fit, brightness_correlation=math.nan)) for fit in fits]),
     }

@@ -116,5 +116,6 @@ def first_pose(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
 
 
 def first_poses(config: Config, dataset: RgbdDataset) -> np.ndarray | None:
-    """Where a run begins if its map begins with a later frame, as of `RunLoop`."""
+    """Poses float64 [F, 4, 4] by frame, NaN where unknown, one of which the map begins at; None where it is to be the
+    identity."""
     return dataset.poses() if config.scene.first_pose == "dataset" else None

@@ -22,5 +22,6 @@ def test_the_camera_is_predicted_where_it_is_by_then(rolling_shutter_ms, device)
         fit = system.process(dataset[number]).fit
         if number >= 4:
             way_cm = 100 * np.linalg.norm(truth[number, :3, 3] - truth[before, :3, 3])
+            # Another step like the last one misses 0.5 to 2 of it where a step is half, twice or more as long.
             assert fit.prediction_error_cm < 0.4 * way_cm, number
     system.close()

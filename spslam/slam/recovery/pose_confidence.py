@@ -133,8 +133,8 @@ class PoseConfidenceModel:
         return fit.prediction_error_cm > self.max_followed_cm or fit.prediction_error_deg > self.max_followed_deg
 
     def looks_elsewhere(self, fit: Fit) -> bool:
-        """Whether earlier images show too different a brightness there: of places that are alike surface fits, image by
-        image. False where nothing was compared, as without texture."""
+        """Whether earlier images show too different a brightness there: in places that are alike surface fits, frame by
+        frame. False where nothing was compared."""
         return fit.brightness_correlation < self.min_relocalized_correlation
 
     def has_many_features(self, fit: Fit) -> bool:
