@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sys
 import time
@@ -37,12 +38,13 @@ class LiveProgress:
             self._counted = self._last, 0
         if now - self._last < self._interval and not status.ending:
             return
-        self._show(self._line(status, now))
+        with contextlib.suppress(BrokenPipeError):  # whoever read this has gone, which is no reason to end
+            self._show(self._line(status, now))
+            if status.ending and not self._was_ending:
+                self._was_ending = True
+                self.close()
+                print("ending: completing the map, writing the results", file=sys.stderr, flush=True)
         self._counted, self._last = (now, status.frames), now
-        if status.ending and not self._was_ending:
-            self._was_ending = True
-            self.close()
-            print("ending: completing the map, writing the results", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Ends the line on a terminal."""

@@ -73,6 +73,23 @@ def check_frame(function: str, color: np.ndarray, depth: np.ndarray, camera: Cam
             raise ValueError(f"{function}: {name} must have the camera's shape {shape}, got {image.shape}")
 
 
+def check_time(function: str, timestamp: float) -> None:
+    """Checks a frame's time stamp, of which motion between frames is predicted.
+
+    Args:
+        function: what messages begin with.
+        timestamp: must be a finite number, s.
+
+    Raises:
+        TypeError: no number.
+        ValueError: NaN or infinity.
+    """
+    if not isinstance(timestamp, Real):
+        raise TypeError(f"{function}: timestamp must be a number of seconds, got {type(timestamp).__name__}")
+    if not math.isfinite(timestamp):
+        raise ValueError(f"{function}: timestamp must be a finite number of seconds, got {timestamp}")
+
+
 def _check_color(color: np.ndarray) -> None:
     name = "RgbdFrame.from_arrays: color"
     if color.dtype != np.uint8:

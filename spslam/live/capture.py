@@ -9,13 +9,14 @@ from dataclasses import replace
 from types import TracebackType
 
 from spslam.datasets.base import RgbdFrame
-from spslam.datasets.frame_arrays import check_frame
+from spslam.datasets.frame_arrays import check_frame, check_time
 from spslam.errors import DatasetError, SourceError
 from spslam.live.frame_queue import FrameQueue
 from spslam.live.recorder import FolderRecorder
 from spslam.live.source import LiveFrame, LiveSource
 
 _END_S = 10.0  # for the source to yield once more after it was told to end
+_END_AT_ONCE_S = 1.0  # after a second Ctrl-C
 
 
 class Capture(contextlib.AbstractContextManager):
@@ -62,7 +63,11 @@ class Capture(contextlib.AbstractContextManager):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.stop()
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
+            self._ending.set()  # at once: a camera that does not answer is not waited for
+            self._thread.join(_END_AT_ONCE_S)
+        else:
+            self.stop()
 
     def _run(self) -> None:
         try:
@@ -88,6 +93,7 @@ class Capture(contextlib.AbstractContextManager):
         arrived = item if isinstance(item, LiveFrame) else LiveFrame(item, now)
         frame = arrived.frame
         check_frame(self.source.name, frame.color, frame.depth, self.source.camera)
+        check_time(self.source.name, frame.timestamp)
         numbered = LiveFrame(replace(frame, index=self._count - 1 + self.source.dropped), arrived.complete_s)
         if self.recorder is not None:
             self.recorder.offer(numbered.frame)

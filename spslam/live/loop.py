@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,13 +13,14 @@ import numpy as np
 
 from spslam.datasets.base import clear_border
 from spslam.datasets.frozen_depth import FROZEN, ArrivingFrozenDepth
-from spslam.errors import DatasetError, SpslamError
+from spslam.errors import DatasetError
 from spslam.live.capture import Capture
 from spslam.live.frame_queue import FrameQueue
 from spslam.live.latency import Latencies
 from spslam.live.previews import PreviewStore
 from spslam.live.source import LiveFrame
 from spslam.run.clock import RunClock
+from spslam.run.device import explained_failures
 from spslam.run.interruption import Interruption
 from spslam.run.observer import RunObserver
 from spslam.run.output_folder import OutputFolder, RunLog
@@ -96,7 +98,7 @@ class LiveLoop:
         status: where the run stands.
         previews: frames for the report.
         poses: ground truth of the frames tracked, float64 [4, 4] each, or None; one more where a frame could not be.
-        failure: why the loop ended early: the system could not go on.
+        failure: why the loop ended early: the system could not go on, or what it calls has raised.
     """
 
     def __init__(
@@ -114,7 +116,7 @@ class LiveLoop:
         self.status = LiveStatus()
         self.previews = PreviewStore(system.config.run.previews)
         self.poses: list[np.ndarray | None] = []
-        self.failure: SpslamError | None = None
+        self.failure: Exception | None = None
         self._queue: FrameQueue = capture.queue
         self._progress = progress
         self._frozen_depth = ArrivingFrozenDepth()
@@ -130,14 +132,21 @@ class LiveLoop:
         self.clock.start_loop()
         deadline = time.monotonic() + (float("inf") if seconds is None else seconds)
         with RunLog(self.folder.log) as log:
-            try:
+            with self._failures_kept():
                 while not (interruption.requested or self._queue.is_over or time.monotonic() > deadline):
                     self._take(log)
                     while self.system.mapping_left and not len(self._queue) and not interruption.requested:
                         self._map(1)
-            except SpslamError as error:  # a limit is reached: what there is up to here is still of use
-                self.failure = error
             self._end(log)
+
+    @contextlib.contextmanager
+    def _failures_kept(self) -> Iterator[None]:
+        """Notes what fails, be it a limit that is reached: what there is up to there can't be made again."""
+        try:
+            with explained_failures(self.system.device):
+                yield
+        except Exception as error:
+            self.failure = self.failure or error
 
     def _take(self, log: RunLog) -> None:
         """Processes the next frame, if one comes within a moment."""
@@ -232,10 +241,12 @@ class LiveLoop:
         self.status.ending = True
         self.status.dropped = self._dropped()
         self.status.received = self.capture.received - len(self._queue)
-        self._tell()
-        if self.failure is None:
-            self._map(self.system.mapping_left)
-            self.system.finish()
-        self._write_row(log)
-        self.observer.finish()
+        with self._failures_kept():
+            self._tell()
+            if self.failure is None:
+                self._map(self.system.mapping_left)
+                self.system.finish()
+        with self._failures_kept():
+            self._write_row(log)
+            self.observer.finish()
         self.clock.update(self.status.frames + self.status.skipped, self.clock.decode_s)

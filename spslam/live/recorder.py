@@ -75,9 +75,11 @@ class FolderRecorder(contextlib.AbstractContextManager):
             self._waiting.put(frame)
 
     def close(self) -> None:
-        """Writes the frames that wait. May be called again."""
+        """Writes the frames that wait; a folder without any is removed again. May be called again."""
         self._waiting.put(None)
         self._thread.join()
+        if not self.frames:
+            self._remove()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -102,6 +104,14 @@ class FolderRecorder(contextlib.AbstractContextManager):
                 except Exception as error:  # whatever it is: a thread that ends silently would look like a slow disk
                     self.failure = OutputError(f"{self.folder}: frame {self.frames} can't be written: {error}")
                     self.left_out += 1
+
+    def _remove(self) -> None:
+        """Removes a recording without a frame: nobody could run it, and the next one would be refused there."""
+        with contextlib.suppress(OSError):
+            for name in ("color", "depth"):
+                (self.folder / name).rmdir()
+            (self.folder / "intrinsics.json").unlink()
+            self.folder.rmdir()
 
     def _write(self, frame: RgbdFrame, files: contextlib.ExitStack) -> None:
         name = f"{self.frames:06d}"

@@ -66,7 +66,8 @@ def run_live(
         SpslamError: one line about what is wrong. If frames were tracked before, their results are written, and the
             line says so.
         KeyboardInterrupt: after a second Ctrl-C; results are then not written.
-        Exception: what a source of the program's own raised, after the results of the frames before are written.
+        Exception: what a source or `progress` of the program's own raised, after the results of the frames before are
+            written.
     """
     with contextlib.ExitStack() as unused:
         unused.callback(source.close)  # where something fails before `Capture` takes it over
@@ -152,8 +153,9 @@ def _write(
     """Writes the results; raises the camera's error where there are no frames."""
     status, capture = loop.status, loop.capture
     if status.frames == 0:
-        if isinstance(capture.failure or loop.failure, SpslamError):
-            raise capture.failure or loop.failure or AssertionError
+        failure = capture.failure if isinstance(capture.failure, SpslamError) else loop.failure
+        if failure is not None:
+            raise failure
         reason = f": {capture.failure}" if capture.failure else f"; {status.skipped} could not be used"
         raise SourceError(f"{source.name}: ended before a frame was tracked{reason}")
     timestamps = system.state.frames.timestamps.numpy()
@@ -199,11 +201,11 @@ def _raise_failure(loop: LiveLoop, recorder: FolderRecorder | None, folder: Outp
 
 @contextlib.contextmanager
 def _removed_if_empty(folder: OutputFolder) -> Iterator[None]:
-    """Removes the run's files again where it fails before a frame is logged: nobody could use them."""
+    """Removes the run's files again where it fails, or is ended, before a frame is logged: nobody could use them."""
     before = set(folder.path.iterdir())
     try:
         yield
-    except Exception:
+    except BaseException:
         if not folder.log.is_file() or folder.log.stat().st_size == 0:
             for path in set(folder.files()) - before:
                 path.unlink(missing_ok=True)

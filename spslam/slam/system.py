@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from spslam.datasets.base import RgbdFrame
-from spslam.datasets.frame_arrays import UNNUMBERED, check_frame
+from spslam.datasets.frame_arrays import UNNUMBERED, check_frame, check_time
 from spslam.errors import ConfigError
 from spslam.geometry import pose7_to_matrix
 from spslam.meshing import TriangleMesh, extract_mesh
@@ -58,11 +58,13 @@ class SlamSystem(FramePipeline):
             What happened to the frame. Its `pose` is None where it is lost.
 
         Raises:
-            TypeError, ValueError: an image of another dtype, or not of the camera's size. Nothing was done.
+            TypeError, ValueError: an image of another dtype, or not of the camera's size, or a time that is no finite
+                number. Nothing was done.
             SpslamError: the map or the pixels would pass a limit of the configuration. The frame has then been
                 processed in part, and the system must not be given another.
         """
         check_frame("SlamSystem.process", frame.color, frame.depth, self.camera)
+        check_time("SlamSystem.process", frame.timestamp)
         if frame.index == UNNUMBERED:
             frame = replace(frame, index=self.state.frames.processed)
         return self.submit(self.prepare(frame), on_pose, defer_mapping).result()

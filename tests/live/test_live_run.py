@@ -1,20 +1,25 @@
 """Live runs from start to end: results, latency, dropped frames, cameras that fail, Ctrl-C."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from spslam.cli.live_progress import LiveProgress
 from spslam.config import load_config
-from spslam.errors import DatasetError, OutputError, SourceError, SpslamError
+from spslam.errors import DatasetError, DeviceError, OutputError, SourceError, SpslamError
 from spslam.evaluation.run_output import RunOutput
 from spslam.live import FolderRecorder, LiveRequest, ReplaySource, capture, session
 from spslam.live.frame_queue import FrameQueue
+from spslam.live.loop import LiveStatus
 from spslam.live.session import run_live
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
@@ -139,7 +144,7 @@ def test_when_the_camera_fails_the_results_are_written_and_then_it_is_said(tmp_p
 )
 def test_without_a_frame_nothing_is_left_behind(tmp_path, camera, kind, message):
     with pytest.raises(kind, match=message):
-        run_live(request(tmp_path), camera)
+        run_live(request(tmp_path, record_dir=tmp_path / "recorded"), camera)
     assert not list(tmp_path.iterdir())
     assert camera.closed == 1
 
@@ -161,6 +166,63 @@ def test_a_limit_that_is_reached_leaves_the_results(tmp_path, has_poses, limits,
     assert not output.trajectory.lost.any()
     assert (output.ground_truth is not None) == has_poses
     np.testing.assert_allclose(np.linalg.norm(output.trajectory.poses[:, :3, :3], axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "kind", "message"),
+    [
+        (float("nan"), ValueError, "test camera: timestamp must be a finite number of seconds, got nan"),
+        (float("inf"), ValueError, "test camera: timestamp must be a finite number of seconds, got inf"),
+        (None, TypeError, "test camera: timestamp must be a number of seconds, got NoneType"),
+    ],
+)
+def test_a_time_that_is_none_leaves_the_results(tmp_path, time_s, kind, message):
+    camera = RoomCamera(6, change=lambda frame: replace(frame, timestamp=time_s) if frame.index == 3 else frame)
+    with pytest.raises(kind, match=message):
+        run_live(request(tmp_path), camera)
+    assert len(RunOutput.read(tmp_path / "out").trajectory) == 3
+
+
+@pytest.mark.parametrize(
+    ("where", "fault", "kind", "message"),
+    [
+        ("submit", torch.OutOfMemoryError("too much"), DeviceError, "out of memory.*the results of 3 frames are in"),
+        ("finish", SpslamError("a process has ended"), SpslamError, "has ended; the results of 4 frames are in"),
+    ],
+)
+def test_whatever_fails_in_the_system_leaves_the_results(tmp_path, monkeypatch, where, fault, kind, message):
+    def fail(system, *arguments, **more):
+        if system.state.frames.processed >= 3:
+            raise fault
+        return own(system, *arguments, **more)
+
+    own = getattr(SlamSystem, where)
+    monkeypatch.setattr(SlamSystem, where, fail)
+    monkeypatch.setattr(session, "warm_up", lambda *_: None)  # on a system of its own
+    with pytest.raises(kind, match=message):
+        run_live(request(tmp_path), RoomCamera(4))
+    assert len(RunOutput.read(tmp_path / "out").trajectory) == (3 if where == "submit" else 4)
+
+
+def test_a_progress_that_fails_leaves_the_results(tmp_path):
+    def progress(status):
+        assert status.frames < 3, "odd"
+
+    with pytest.raises(AssertionError, match="odd"):
+        run_live(request(tmp_path), RoomCamera(6), progress)
+    assert len(RunOutput.read(tmp_path / "out").trajectory) == 3
+
+
+def test_a_display_that_nobody_reads_any_more_is_no_reason_to_end(monkeypatch):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as closed:
+        monkeypatch.setattr(sys, "stderr", closed)
+        progress = LiveProgress(on_terminal=False)
+        progress(LiveStatus(frames=3, ending=True))
+        with pytest.raises(BrokenPipeError):
+            closed.flush()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), writing)  # for what is left of it
 
 
 @pytest.mark.parametrize("where", ["before the folder", "in the folder"])
@@ -252,6 +314,21 @@ def test_one_ctrl_c_does_not_cost_the_results_that_are_being_written(tmp_path, m
     write_results = session.write_results
     monkeypatch.setattr(session, "write_results", write)
     assert run_live(request(tmp_path), RoomCamera(2))["frames"] == 2
+
+
+def test_ctrl_c_twice_before_a_frame_leaves_nothing_behind(tmp_path):
+    def interrupted(frame):
+        os.kill(os.getpid(), signal.SIGINT)  # wakes the main thread
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGINT)  # wakes the main thread
+        return forever.wait(20) and frame
+
+    forever, began = threading.Event(), time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_live(request(tmp_path, record_dir=tmp_path / "recorded"), RoomCamera(1, change=interrupted))
+    assert time.monotonic() - began < 8  # a camera that does not answer is not waited for
+    assert not list(tmp_path.iterdir())
+    forever.set()
 
 
 def test_the_command_replays_and_records(tmp_path):

@@ -124,6 +124,13 @@ def test_a_frame_that_can_not_be_written_ends_the_recording_and_says_so(tmp_path
     assert (recorder.frames, recorder.left_out) == (1, 2)
 
 
+def test_a_recording_without_a_frame_is_removed(tmp_path):
+    for _ in range(2):
+        with FolderRecorder(tmp_path / "rec", Recorded(1).camera):
+            pass
+        assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_with_something_in_it_is_refused(tmp_path):
     (tmp_path / "note").touch()
     with pytest.raises(OutputError, match="is not empty; record into another folder"):

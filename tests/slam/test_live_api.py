@@ -205,6 +205,15 @@ def test_wrong_images_are_refused_before_anything_is_done(dataset, change, error
     assert len(system.trajectory()) == 0
 
 
+def test_a_time_that_is_no_finite_number_is_refused_before_anything_is_done(dataset):
+    system = new_system(dataset)
+    with pytest.raises(ValueError, match=r"SlamSystem\.process: timestamp must be a finite number of seconds, got nan"):
+        system.process(RgbdFrame(0, float("nan"), dataset[0].color, dataset[0].depth))
+    with pytest.raises(TypeError, match=r"SlamSystem\.process: timestamp must be a number of seconds, got str"):
+        system.process(RgbdFrame(0, "0.0", dataset[0].color, dataset[0].depth))
+    assert len(system.trajectory()) == 0
+
+
 def test_reprs_are_one_short_line(dataset):
     system = new_system(dataset)
     report = system.process(dataset[0])
