@@ -94,7 +94,10 @@ class Capture(contextlib.AbstractContextManager):
         frame = arrived.frame
         check_frame(self.source.name, frame.color, frame.depth, self.source.camera)
         check_time(self.source.name, frame.timestamp)
-        numbered = LiveFrame(replace(frame, index=self._count - 1 + self.source.dropped), arrived.complete_s)
+        # The source may write into its arrays again, while queue, recorder and previews keep the frame.
+        number = self._count - 1 + self.source.dropped
+        own = replace(frame, index=number, color=frame.color.copy(), depth=frame.depth.copy())
+        numbered = LiveFrame(own, arrived.complete_s)
         if self.recorder is not None:
             self.recorder.offer(numbered.frame)
         self.queue.put(numbered)

@@ -64,6 +64,8 @@ class LiveSource(ABC):
         - None: nothing came for a while. A source that waits for its camera does so about once per second, so that
           Ctrl-C can end it.
 
+        A frame's arrays are copied before the next frame is asked for, so they may be written again then.
+
         An exception that it raises ends the run, after the results of the frames before are written.
         """
 

@@ -15,6 +15,7 @@ import torch
 
 from spslam.cli.live_progress import LiveProgress
 from spslam.config import load_config
+from spslam.datasets import open_dataset
 from spslam.errors import DatasetError, DeviceError, OutputError, SourceError, SpslamError
 from spslam.evaluation.run_output import RunOutput
 from spslam.live import FolderRecorder, LiveRequest, ReplaySource, capture, session
@@ -118,6 +119,23 @@ def test_frames_that_cannot_be_used_are_noted(tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert [(row["index"], row["dropped"]) for row in rows] == [(0, 0), (1, 0), (3, 0), (4, 0)]
     assert "no depth" in (tmp_path / "out" / "skipped.jsonl").read_text()
+
+
+def test_a_camera_may_use_its_memory_again(tmp_path):
+    own = Recorded(8)
+    color, depth = np.empty_like(own[0].color), np.empty_like(own[0].depth)
+
+    def written_again(frame):
+        color[:], depth[:] = frame.color, frame.depth
+        return replace(frame, color=color, depth=depth)
+
+    run_live(request(tmp_path, record_dir=tmp_path / "recorded"), RoomCamera(8, change=written_again))
+    recorded = open_dataset(load_config("folder").dataset, tmp_path / "recorded")
+    for frame, other in zip(recorded, own, strict=True):
+        np.testing.assert_allclose(frame.depth, other.depth, atol=0.00051)
+        assert np.abs(frame.color.astype(int) - other.color).mean() < 3
+    for preview in RunOutput.read(tmp_path / "out").previews():
+        np.testing.assert_array_equal(preview.color, own[preview.row].color)
 
 
 @pytest.mark.parametrize(
