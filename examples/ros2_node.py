@@ -20,7 +20,6 @@ from std_msgs.msg import Header
 from tf2_ros import TransformBroadcaster
 
 import spslam
-from spslam.errors import SpslamError
 from spslam.geometry import matrix_to_quaternion
 from spslam.live import FrameQueue, LiveFrame
 
@@ -29,6 +28,7 @@ MAX_WAIT_S = 0.06  # frames that waited longer are dropped for newer ones
 CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
 DEPTH = {"16UC1": ("u2", 1000), "mono16": ("u2", 1000), "32FC1": ("f4", 1)}  # type, units per meter
 CLOUD_STEP_PX = 4
+PATH_POSES = 2000  # at most; a message takes time that grows with them
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class SlamNode(Node):
             self.depths = {time: depth for time, depth in self.depths.items() if time > partner}
         for images in (self.colors, self.depths):
             while len(images) > 10:
-                del images[min(images)]
+                del images[next(iter(images))]  # that came first: stamps go back where a recording starts over
 
     def hand_over(self, color, depth):
         """Gives a pair of messages to the worker; what can't be a frame is logged and left out."""
@@ -108,16 +108,17 @@ class SlamNode(Node):
 
     def work(self):
         """Tracks the newest frame; optimizes the map while there is none."""
-        while not self.queue.is_over:
+        while not self.queue.is_over and rclpy.ok():
             try:
                 waiting = self.queue.take(0.01 if self.system is not None and self.system.mapping_left else 0.5)
                 if waiting is not None:
                     self.track(waiting)
                 if self.system is not None:
                     self.system.optimize_map(2)
-            except (SpslamError, TypeError, ValueError) as error:
-                self.failure = error
-                self.get_logger().fatal(f"tracking has ended: {error}")
+            except Exception as error:
+                if rclpy.ok():  # else Ctrl-C has ended what publishes
+                    self.failure = error
+                    self.get_logger().fatal(f"tracking has ended: {error}")
                 return
 
     def track(self, waiting):
@@ -142,6 +143,8 @@ class SlamNode(Node):
             position.x, position.y, position.z = pose[:3, 3].tolist()
         moved.child_frame_id = waiting.header.frame_id
         self.path.poses.append(stamped)
+        if len(self.path.poses) > PATH_POSES:
+            self.path.poses = self.path.poses[::2]
         self.path.header.stamp = waiting.header.stamp
         self.pose_publisher.publish(stamped)
         self.transforms.sendTransform(moved)

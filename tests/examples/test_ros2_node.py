@@ -65,3 +65,64 @@ def test_frames_become_poses_path_points_and_transforms(tmp_path, kind):
     assert "the encoding must be one of rgb8, bgr8, rgba8, bgra8, got mono8" in ended.stdout + ended.stderr
     if kind == "fakes":  # ROS may deliver from the second message on
         assert "camera_info can't be used: Camera: fx must be positive, got 0" in ended.stdout + ended.stderr
+
+
+NODE = """
+import sys, rclpy
+from types import SimpleNamespace as Some
+import numpy as np
+from tests.examples.drive_ros2_node import load_example, stamp
+from sensor_msgs.msg import Image
+rclpy.init()
+example = load_example()
+node = example.SlamNode()
+header = stamp(Image(), 0).header
+frame = Some(header=header)
+node.system = Some(mapping_left=0, optimize_map=lambda count: None)
+
+def fail(*_, **__):
+    raise RuntimeError("publisher's context is invalid")
+
+"""
+EDGES = {
+    "a path of any length": """
+for _ in range(9 * example.PATH_POSES):
+    node.publish(frame, np.eye(4))
+assert example.PATH_POSES / 2 <= len(node.path.poses) <= example.PATH_POSES
+""",
+    "stamps that go back while there is no depth": """
+pairs = []
+node.hand_over = lambda color, depth: pairs.append((color, depth))
+for number in range(20, 35):
+    node.on_color(stamp(Image(), number))
+for number in range(3):
+    node.on_color(stamp(Image(), number))
+    node.on_depth(stamp(Image(), number))
+assert len(pairs) == 3, pairs
+assert len(node.colors) <= 10 and not node.depths
+""",
+    "Ctrl-C while a frame is tracked": """
+def process(image, on_pose, defer_mapping):
+    rclpy.ok = lambda: False
+    on_pose(np.eye(4))
+
+node.system.process, node.pose_publisher.publish = process, fail
+node.queue.put(example.StampedFrame(None, 0.0, header))
+node.worker.join(10)
+assert not node.worker.is_alive() and node.failure is None
+""",
+    "tracking that fails": """
+node.system.process = fail
+node.queue.put(example.StampedFrame(None, 0.0, header))
+node.worker.join(10)
+assert str(node.failure) == "publisher's context is invalid"
+""",
+}
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_what_happens_in_long_runs_and_at_their_end(edge):
+    command = [sys.executable, "-c", NODE + EDGES[edge], "no mesh"]
+    ended = subprocess.run(command, env=environment("fakes"), capture_output=True, text=True, timeout=100)
+    assert ended.returncode == 0, ended.stderr
+    assert "Traceback" not in ended.stderr
