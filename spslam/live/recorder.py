@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import queue
 import threading
@@ -24,6 +25,8 @@ WAITING_FRAMES = 32  # one second at 30 Hz; 68 MB of 640x480
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 _PNG_LEVEL = 1  # four times as fast as the default, for a tenth more bytes
 _MOST_UNITS = 65535
+_PERIOD_S = 1 / 30  # of a camera, until its stamps tell
+_LONGEST_PERIOD_S = 1.0
 
 
 class FolderRecorder(contextlib.AbstractContextManager):
@@ -32,8 +35,9 @@ class FolderRecorder(contextlib.AbstractContextManager):
     If any frame has a pose, `poses.txt` has a row for each, of NaN where it is unknown.
 
     `spslam run folder --data DIR` reads the result, also after a kill: each image appears whole, and a frame's time is
-    the last that is written of it. Color is JPEG of quality 95. A frame that comes while `WAITING_FRAMES` others wait
-    for the disk is left out and counted.
+    the last that is written of it. Times ascend, as they must to be run: where a camera's stamps go back, those after
+    go on from there, and a stamp that comes again is half a frame's period later. Color is JPEG of quality 95. A frame
+    that comes while `WAITING_FRAMES` others wait for the disk is left out and counted.
 
     Args:
         folder: made where it is missing; it must be empty.
@@ -62,6 +66,7 @@ class FolderRecorder(contextlib.AbstractContextManager):
         self.frames = self.left_out = 0
         self.failure: OutputError | None = None
         self._waiting: queue.Queue[RgbdFrame | None] = queue.Queue()
+        self._clock = _AscendingTimes()
         self._times: TextIO | None = None
         self._poses: TextIO | None = None
         self._thread = threading.Thread(target=self._run, name="spslam-recorder", daemon=True)
@@ -129,7 +134,7 @@ class FolderRecorder(contextlib.AbstractContextManager):
             self._poses = self._open("poses.txt", files)
         if self._poses is not None:
             self._append(self._poses, _pose_row(frame.pose))
-        self._append(self._times, f"{frame.timestamp:.9f}")
+        self._append(self._times, f"{self._clock.next(frame.timestamp):.9f}")
 
     def _write_image(self, kind: str, name: str, image: np.ndarray, options: list[int]) -> None:
         """Writes an image under a hidden name and renames it, so that it is there whole or not at all."""
@@ -155,6 +160,25 @@ class FolderRecorder(contextlib.AbstractContextManager):
     def _append(self, file: TextIO, row: str) -> None:
         with writing(file.name):
             file.write(row + "\n")
+
+
+class _AscendingTimes:
+    """The times of a recording by a camera's stamps, whose clock may be set back, or stand still."""
+
+    def __init__(self) -> None:
+        self._stamp: float | None = None
+        self._time, self._shift_s, self._period_s = -math.inf, 0.0, _PERIOD_S
+
+    def next(self, stamp: float) -> float:
+        """The time of the next frame, s."""
+        step_s = 0.0 if self._stamp is None else stamp - self._stamp
+        if step_s < 0:
+            self._shift_s += self._period_s - step_s
+        elif 0 < step_s <= _LONGEST_PERIOD_S:
+            self._period_s = step_s
+        self._stamp = stamp
+        self._time = max(stamp + self._shift_s, self._time + self._period_s / 2)
+        return self._time
 
 
 def _pose_row(pose: np.ndarray | None) -> str:

@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,6 +77,23 @@ def test_a_kill_where_the_first_pose_comes_late_leaves_a_recording(tmp_path, mon
             recorder.offer(frame)
     assert (folder / "color" / "000002.jpg").exists()
     assert len(opened(folder)) == 2 and opened(folder).poses() is None
+
+
+@pytest.mark.parametrize(
+    ("stamps", "times"),
+    [
+        ([0, 0.1, 0.2, 3.2, 3.3], [0, 0.1, 0.2, 3.2, 3.3]),
+        ([9, 9.1, 9.2, 5.2, 5.3, 5.4, 0.1], [9, 9.1, 9.2, 9.3, 9.4, 9.5, 9.6]),
+        ([0, 0.1, 0.1, 0.2, 0.2, 0.3], [0, 0.1, 0.15, 0.2, 0.25, 0.3]),
+        ([7, 7, 7], [7, 7 + 1 / 60, 7 + 2 / 60]),
+        ([1.7e9, 1.7e9 + 0.1, 0, 0.1], [1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2, 1.7e9 + 0.3]),
+    ],
+)
+def test_times_ascend_whatever_the_clock_of_the_camera_does(tmp_path, stamps, times):
+    with FolderRecorder(tmp_path / "rec", Recorded(1).camera) as recorder:
+        for stamp in stamps:
+            recorder.offer(replace(plain_frame(), timestamp=stamp))
+    np.testing.assert_allclose(opened(tmp_path / "rec").timestamps(), times, rtol=0, atol=1e-6)
 
 
 def test_frames_that_come_too_fast_are_left_out_and_counted(tmp_path, monkeypatch):
