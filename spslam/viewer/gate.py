@@ -13,7 +13,7 @@ import hmac
 import http
 import io
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -27,6 +27,8 @@ _MAX_MESSAGE_BYTES = 32 << 20
 _REFUSED = "This viewer needs the address with the token that the command printed.\n"
 _FULL = "The viewer has as many clients as it takes; close one.\n"
 _FOREIGN = "The viewer answers to its own address only.\n"
+# Of viser's messages: a control has another value, and parts of a file, for which the page has no control.
+_CONTROL, _UPLOADS = "GuiUpdateMessage", ("FileTransferStartUpload", "FileTransferPart")
 # The page is one file. What it may load is itself, and what it has made of itself.
 _POLICY = (
     "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
@@ -126,7 +128,7 @@ def open_server(listener: Listener, label: str) -> tuple[Any, Gate]:
     def serve(handler: Any, host: Any = None, port: Any = None, *, process_request: Any = None, **options: Any) -> Any:
         opened.append(True)
         options |= {"max_size": _MAX_MESSAGE_BYTES, "open_timeout": _OPEN_TIMEOUT_S, "server_header": None}
-        return original(handler, sock=listener.socket, process_request=gate.wrap(process_request), **options)
+        return original(sifted(handler), sock=listener.socket, process_request=gate.wrap(process_request), **options)
 
     server_module.serve = serve  # type: ignore
     try:
@@ -142,6 +144,43 @@ def open_server(listener: Listener, label: str) -> tuple[Any, Gate]:
     # Any client may ask viser to publish the server through one on the internet.
     server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
     return server, gate
+
+
+def sifted(handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
+    """A web socket's handler that is given what the page sends; other messages that viser knows are left out.
+
+    viser sets whatever attribute of a control a message names, such as that it is removed, after which every update of
+    the page fails; and it keeps files that nothing asks for in memory.
+    """
+
+    async def handle(connection: Any) -> None:
+        receive = connection.recv
+
+        async def recv(*arguments: Any, **options: Any) -> Any:
+            while not _is_of_the_page(content := await receive(*arguments, **options)):
+                pass
+            return content
+
+        connection.recv = recv
+        await handler(connection)
+
+    return handle
+
+
+def _is_of_the_page(content: bytes | str) -> bool:
+    """Whether the page may have sent a message, or viser closes the connection for it."""
+    import msgspec  # viser's own
+
+    try:
+        message = msgspec.msgpack.decode(content) if isinstance(content, bytes) else None
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return True
+    if not isinstance(message, dict) or message.get("type") != _CONTROL:
+        return not (isinstance(message, dict) and message.get("type") in _UPLOADS)
+    updates = message.get("updates")
+    return isinstance(updates, dict) and all(
+        name == "value" and isinstance(value, (bool, int, float)) for name, value in updates.items()
+    )
 
 
 def silence() -> contextlib.AbstractContextManager:

@@ -63,6 +63,44 @@ def test_garbage_harms_no_other_client():
         assert fetch(opened.url)[0] == 200
 
 
+def move(client, slider):
+    """Has a client move the slider to frame 2; returns once that was taken, and so was what the client sent before."""
+    message = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid, "updates": {"value": 2}}
+    client.send(msgspec.msgpack.encode(message))
+    until = time.monotonic() + 10
+    while slider.value != 2:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    "updates", [{"removed": True}, {"props": None}, {"update_cb": None}, {"gui_api": None}, {"value": 1, "removed": 1}]
+)
+@pytest.mark.parametrize("control", ["_slider", "_play"])
+def test_a_client_can_set_the_value_of_a_control_alone(control, updates):
+    with replay() as opened, connected(opened.url) as witness, connected(opened.url) as client:
+        panel = opened._sink._panel
+        message = {"type": "GuiUpdateMessage", "uuid": getattr(panel, control)._impl.uuid, "updates": updates}
+        client.send(msgspec.msgpack.encode(message))
+        move(client, panel._slider)
+        for frame in (3, 1):
+            opened.show(frame)
+            assert opened._frames.wait_until_idle(20)
+        assert not opened._ended.is_set(), opened._failure
+        assert panel._slider.value == 1
+        assert len(witness.recv(timeout=30)) > 0
+
+
+def test_files_that_nothing_asks_for_are_not_kept():
+    with replay() as opened, connected(opened.url) as client:
+        slider, gui = opened._sink._panel._slider, opened._sink.server.gui
+        start = {"type": "FileTransferStartUpload", "source_component_uuid": slider._impl.uuid, "transfer_uuid": "t"}
+        start |= {"filename": "f", "mime_type": "", "part_count": 9, "size_bytes": 9}
+        client.send(msgspec.msgpack.encode(start))
+        move(client, slider)
+        assert not gui._current_file_upload_states
+
+
 def test_values_that_no_slider_has_are_ignored():
     with replay() as opened:
         slider = opened._sink._panel._slider
