@@ -118,8 +118,12 @@ def _run(
     from spslam.live.request import LiveRequest
     from spslam.live.session import run_live
 
-    if args.record is not None and args.record.resolve() == output.resolve():
-        raise UsageError(f"--record and --output must be two folders, got {output} for both")
+    if args.record is not None:
+        recorded, results = args.record.resolve(), output.resolve()
+        if recorded == results:
+            raise UsageError(f"--record and --output must be two folders, got {output} for both")
+        if recorded in results.parents:
+            raise UsageError(f"--output must not be inside the folder of --record, {args.record}, got {output}")
     progress = make_live_progress(args.quiet)
     request = LiveRequest(
         config,
