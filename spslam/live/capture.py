@@ -92,6 +92,9 @@ class Capture(contextlib.AbstractContextManager):
             return
         arrived = item if isinstance(item, LiveFrame) else LiveFrame(item, now)
         frame = arrived.frame
+        if not isinstance(frame, RgbdFrame):
+            kinds = "RgbdFrame (RgbdFrame.from_arrays makes one), LiveFrame, DatasetError or None"
+            raise TypeError(f"{self.source.name}: frames() must yield {kinds}, got {type(frame).__name__}")
         check_frame(self.source.name, frame.color, frame.depth, self.source.camera)
         check_time(self.source.name, frame.timestamp)
         # The source may write into its arrays again, while queue, recorder and previews keep the frame.

@@ -158,6 +158,7 @@ def test_when_the_camera_fails_the_results_are_written_and_then_it_is_said(tmp_p
         (RoomCamera(0, fault=SourceError("test camera: absent")), SourceError, "^test camera: absent$"),
         (RoomCamera(2, change=lambda f: DatasetError("bad")), SourceError, "2 could not be used"),
         (RoomCamera(1, change=lambda f: f.__class__(0, 0.0, f.color, f.depth[::2])), SourceError, "camera's shape"),
+        (RoomCamera(1, change=lambda f: (f.color, f.depth)), SourceError, "must yield RgbdFrame .*, got tuple"),
     ],
 )
 def test_without_a_frame_nothing_is_left_behind(tmp_path, camera, kind, message):
