@@ -98,7 +98,7 @@ def _execute_run(
     dataset = _open_again(run, config, args.texture) if options.source == "tsdf" or args.texture else None
     earlier = _earlier(folder) if "map" in run.metrics else []
     scene, noise = Scene.load(folder.map, device), measured_noise(run.metrics)
-    job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args))
+    job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args), needs_frames=True)
     path = folder.mesh_as(file_format)
     mesh, figures = _replace_mesh(path, lambda place: write_mesh(place, job, dataset))
     _print_mesh(path, mesh, figures)
