@@ -218,3 +218,30 @@ def test_a_merged_map_is_called_one(folder, command):
     (folder / "out" / "trajectory.txt").rename(folder / "out" / "trajectory-1.txt")
     refused = spslam(command, "out", cwd=folder)
     assert_refused(refused, "out: is a merged map, which has no trajectory of its own; give one of the merged runs")
+
+
+def test_figures_of_a_merged_map_are_of_its_new_mesh(folder, monkeypatch):
+    from spslam.run import recordings
+
+    (folder / "out" / "trajectory.txt").rename(folder / "out" / "trajectory-1.txt")
+    before = metrics_of(folder)
+    with monkeypatch.context() as patches:
+        patches.setattr(recordings, "_open_again", lambda _: "it is gone")
+        said = "the mesh is of the map alone where folder/data was: it is gone"
+        assert f"! {said}\n" in remesh(folder)
+    metrics = metrics_of(folder)
+    assert metrics["mesh_source"] == "neural" and metrics["warnings"] == [said]
+    assert not {"mesh_frames", "mesh_mb"} & metrics.keys()
+    remesh(folder, "--format", "glb")
+    assert metrics_of(folder) == metrics
+    remesh(folder)
+    assert {**metrics_of(folder), "mesh_s": before["mesh_s"]} == before
+
+
+def test_earlier_frames_are_missed_only_where_frames_are_fused(folder, monkeypatch):
+    from spslam.run import recordings
+
+    (folder / "out" / "metrics.json").write_text(json.dumps({**metrics_of(folder), "map": "earlier"}))
+    monkeypatch.setattr(recordings, "read_again", lambda *_: ([], ["the mesh is of the map alone where it was"]))
+    assert "! the mesh is of the map alone" not in remesh(folder, "--source", "neural")
+    assert "! the mesh is of the map alone where it was\n" in remesh(folder, "--source", "tsdf")
