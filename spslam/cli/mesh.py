@@ -244,7 +244,7 @@ def _print_mesh(path: Path, mesh: TriangleMesh, figures: dict[str, Any]) -> None
         pages, width, height = figures["texture_size"]
         textured = f"; texels of {1e3 * figures['texel_m']:.1f} mm, {pages} x {width}x{height} px"
         if figures["texel_m"] > figures["wanted_texel_m"]:
-            wanted = f"{1e3 * figures['wanted_texel_m']:.1f} mm"
+            wanted = f"{1e3 * figures['wanted_texel_m']:.2g} mm"
             print(f"! texels of {wanted} would need more than {figures['most_pages']} pages; larger ones are taken")
     print(f"{path}: {size}; {made_at}{made_of}{textured}, {figures['mesh_s']:.1f} s")
 
