@@ -96,9 +96,9 @@ def _execute_run(
     run = RunOutput.read(args.output)
     options = _mesh_options(args, config.mesh, "neural" if _is_live(run) else config.mesh.source)
     dataset = _open_again(run, config, args.texture) if options.source == "tsdf" or args.texture else None
-    earlier = _earlier(folder) if "map" in run.metrics else []
+    earlier = _earlier(folder, dataset is not None) if "map" in run.metrics else []
     scene, noise = Scene.load(folder.map, device), measured_noise(run.metrics)
-    job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args))
+    job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args), needs_frames=True)
     path = folder.mesh_as(file_format)
     mesh, figures = _replace_mesh(path, lambda place: write_mesh(place, job, dataset))
     _print_mesh(path, mesh, figures)
@@ -221,6 +221,18 @@ def _execute_merged(
     for line in missing:
         print(f"! {line}")
     _print_mesh(path, mesh, figures)
+    if path == folder.mesh and folder.metrics.is_file():
+        _replace_merged_figures(folder, figures, missing)
+
+
+def _replace_merged_figures(folder: RunFolder, figures: dict[str, Any], missing: list[str]) -> None:
+    """Writes metrics of a merged map with the figures of its new mesh; its warnings are of the mesh alone."""
+    from spslam.evaluation.finished_run import MESH_KEYS, write_metrics
+    from spslam.reading import MAX_JSON_BYTES, parse_json, read_text
+
+    known = parse_json(read_text(folder.metrics, MAX_JSON_BYTES, OutputError), str(folder.metrics), OutputError)
+    warnings = {"warnings": missing} if missing else {}
+    write_metrics(folder, known, {**figures, **warnings}, MESH_KEYS | {"warnings"})
 
 
 def _print_mesh(path: Path, mesh: TriangleMesh, figures: dict[str, Any]) -> None:
@@ -232,7 +244,7 @@ def _print_mesh(path: Path, mesh: TriangleMesh, figures: dict[str, Any]) -> None
         pages, width, height = figures["texture_size"]
         textured = f"; texels of {1e3 * figures['texel_m']:.1f} mm, {pages} x {width}x{height} px"
         if figures["texel_m"] > figures["wanted_texel_m"]:
-            wanted = f"{1e3 * figures['wanted_texel_m']:.1f} mm"
+            wanted = f"{1e3 * figures['wanted_texel_m']:.2g} mm"
             print(f"! texels of {wanted} would need more than {figures['most_pages']} pages; larger ones are taken")
     print(f"{path}: {size}; {made_at}{made_of}{textured}, {figures['mesh_s']:.1f} s")
 
@@ -242,12 +254,20 @@ def _is_live(run: RunOutput) -> bool:
     return "received_frames" in run.metrics
 
 
-def _earlier(folder: RunFolder) -> list[EarlierFrames]:
-    """The recordings that the map of a run with `--map` is of beside the run's; says which can't be read again."""
+def _earlier(folder: RunFolder, are_read: bool) -> list[EarlierFrames]:
+    """The recordings that the map of a run with `--map` is of beside the run's; says which can't be read again.
+
+    Args:
+        folder: of the run.
+        are_read: whether their frames are wanted, not their trajectories alone.
+    """
+    from spslam.run.mesh import EarlierFrames
     from spslam.run.recordings import read_again
     from spslam.slam.graph.archive import KeyframeArchive
 
     archive = KeyframeArchive.load(require_run_file(folder.keyframes))
+    if not are_read:
+        return [EarlierFrames(each.trajectory, None) for each in archive.recordings[:-1]]
     earlier, missing = read_again(archive, archive.recordings[:-1])
     for line in missing:
         print(f"! {line}")

@@ -20,6 +20,7 @@ from spslam.evaluation.trajectory_metrics import Alignment, ate, rpe
 from spslam.geometry import umeyama
 from spslam.io import atomic_write
 from spslam.meshing.render import render_colors
+from spslam.run_folder import RunFolder
 from spslam.scene import Scene
 
 # Frames used to determine which surface was observed; more of them add time, but hardly any surface.
@@ -167,9 +168,16 @@ def add_metrics(run: RunOutput, figures: dict[str, Any], replaced: Iterable[str]
     Raises:
         OutputError: metrics.json can't be written.
     """
+    return write_metrics(run.folder, run.metrics, figures, replaced)
+
+
+def write_metrics(
+    folder: RunFolder, known: dict[str, Any], figures: dict[str, Any], replaced: Iterable[str] = ()
+) -> dict[str, Any]:
+    """As `add_metrics`, of a folder that may be a merged map's, with the metrics `known` of it."""
     gone = set(replaced) - figures.keys()
-    metrics = {key: value for key, value in {**run.metrics, **figures}.items() if key not in gone}
-    atomic_write(run.folder.metrics, json.dumps(metrics, indent=1) + "\n")
+    metrics = {key: value for key, value in {**known, **figures}.items() if key not in gone}
+    atomic_write(folder.metrics, json.dumps(metrics, indent=1) + "\n")
     return metrics
 
 

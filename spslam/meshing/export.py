@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from spslam.errors import OutputError
 from spslam.io import atomic_write
+from spslam.meshing.glb import encode_glb
 from spslam.meshing.mesh import TriangleMesh
 from spslam.meshing.ply import encode_ply
 
@@ -22,8 +23,8 @@ def save_mesh(mesh: TriangleMesh, path: str | os.PathLike) -> None:
 
     Args:
         mesh: the mesh. A mesh without faces can be written as PLY only.
-        path: `.ply` (binary), `.glb` (glTF; axes are not changed) or `.obj` (vertex colors after the coordinates, as
-            most programs read them). The folder must exist.
+        path: `.ply` (binary), `.glb` (glTF; axes are not changed, colors are linear there) or `.obj` (vertex colors
+            after the coordinates, as most programs read them). The folder must exist.
 
     Raises:
         OutputError: another suffix, a mesh without faces as GLB or OBJ, or the operating system refuses.
@@ -39,8 +40,10 @@ def save_mesh(mesh: TriangleMesh, path: str | os.PathLike) -> None:
         return
     if len(mesh.faces) == 0:
         raise OutputError(f"{path}: a mesh without faces can be written as .ply only")
-    exported = _as_trimesh(mesh).export(file_type=suffix[1:], include_normals=True)
-    atomic_write(path, exported if isinstance(exported, bytes) else str(exported))
+    if suffix == ".glb":
+        atomic_write(path, encode_glb(mesh))
+        return
+    atomic_write(path, str(_as_trimesh(mesh).export(file_type="obj", include_normals=True)))
 
 
 def _as_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spslam.errors import DatasetError, brief
+from spslam.meshing.glb import decode_own_glb
 from spslam.meshing.ply import decode_own_ply
 from spslam.notebook import mesh_html
 from spslam.reading import read_bytes
@@ -17,6 +18,7 @@ from spslam.reading import read_bytes
 if TYPE_CHECKING:
     import trimesh
 
+_OWN = {".ply": decode_own_ply, ".glb": decode_own_glb}
 READ_FORMATS = (".ply", ".obj", ".glb", ".stl", ".off")
 MAX_MESH_BYTES = 2 << 30
 _HEADER_BYTES = 1 << 16
@@ -69,7 +71,8 @@ def load_mesh(path: Path) -> Mesh:
         raise DatasetError(f"{path}: a mesh must be one of {', '.join(READ_FORMATS)}, got {suffix or 'no suffix'}")
     content = read_bytes(path, MAX_MESH_BYTES, DatasetError)
     try:
-        vertices, faces, colors = (decode_own_ply(content) if suffix == ".ply" else None) or _decode(content, suffix)
+        own = _OWN[suffix](content) if suffix in _OWN else None
+        vertices, faces, colors = own or _decode(content, suffix)
         if not len(faces):
             return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.uint8))
         _check(vertices, faces)

@@ -19,6 +19,7 @@ from spslam.evaluation.run_output import match_times
 from spslam.meshing import TriangleMesh, extract_mesh, save_mesh
 from spslam.meshing.color_detail import ColorOptions, color_mesh, colored_every, keep_colored
 from spslam.meshing.depth_views import DepthViews
+from spslam.meshing.extract import cubes_per_cell
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
 from spslam.meshing.texture.export import check_textured_format
@@ -70,6 +71,7 @@ class MeshJob:
         noise: of depth, see `ops.measure_planes`; where it was not measured, None.
         earlier: recordings that the map is of beside the run's.
         texture: whether the frames' colors are baked into a texture; None for colors of vertices.
+        needs_frames: a mesh is fused only where a frame can be read; else the map fills in for all of them.
     """
 
     scene: Scene
@@ -79,6 +81,7 @@ class MeshJob:
     noise: tuple[float, float] | None = None
     earlier: Sequence[EarlierFrames] = ()
     texture: TextureWish | None = None
+    needs_frames: bool = False
 
 
 def measured_noise(metrics: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -106,8 +109,9 @@ def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[T
         The mesh, and what metrics.json says of it.
 
     Raises:
-        OutputError: a mesh is to be fused or textured and no frame of the run is in the dataset, there is no surface
-            and the file is to be another than a PLY, or the file can't be written.
+        OutputError: a mesh is to be fused or textured and no frame of the run is in the dataset, or none can be read
+            and the job needs frames, there is no surface and the file is to be another than a PLY, or the file can't be
+            written.
         SpslamError: the surface does not fit into `mesh.max_memory_mb` at any voxel size.
     """
     started = time.perf_counter()
@@ -143,9 +147,10 @@ def no_surface(path: Path, resolution_m: float) -> str:
 
 def _extracted(job: MeshJob) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh of the map alone, and figures."""
-    resolution_m = job.options.resolution_m
-    mesh = extract_mesh(job.scene, resolution_m, job.camera, None if job.camera is None else _tracked_poses(job))
-    return mesh, {"mesh_source": "neural", "mesh_resolution_m": resolution_m}
+    wanted_m, voxel_m = job.options.resolution_m, job.scene.volume.voxel_size_m
+    mesh = extract_mesh(job.scene, wanted_m, job.camera, None if job.camera is None else _tracked_poses(job))
+    blocks, per_block = cubes_per_cell(voxel_m, wanted_m)
+    return mesh, {"mesh_source": "neural", "mesh_resolution_m": voxel_m / (blocks * per_block)}
 
 
 def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, Any]]:
@@ -160,6 +165,11 @@ def _fused(job: MeshJob, dataset: RgbdDataset) -> tuple[TriangleMesh, dict[str, 
     keep_freed_memory()
     with library_threads_limited(), interpreter_shared():
         volume = fuse_frames(frames, fusion, job.scene, job.scene.device, views)
+    if job.needs_frames and not volume.integrated:
+        raise OutputError(
+            f"{dataset.name}: none of the {sum(map(len, frames))} frames to fuse can be read: restore the data, or use "
+            "--source neural, which needs no frames"
+        )
     mesh = extract_fused_mesh(volume, job.scene, dataset.camera, _tracked_poses(job), views=views)
     figures = {
         "mesh_source": "tsdf",

@@ -65,7 +65,8 @@ def test_figures_of_the_mesh_before_go_with_it(folder):
     assert "! the figures of the mesh before were removed; `spslam eval out --gt-mesh PLY --views` measures" in said
     metrics = metrics_of(folder)
     assert not STALE.keys() & metrics.keys() and "mesh_mb" not in metrics
-    assert metrics["mesh_resolution_m"] == 0.08 and metrics["mesh_source"] == "neural" and "ate_rmse_cm" in metrics
+    # The map has nothing coarser than its own voxels.
+    assert metrics["mesh_resolution_m"] == 0.04 and metrics["mesh_source"] == "neural" and "ate_rmse_cm" in metrics
     report = (folder / "out" / "report.html").read_text()
     assert "accuracy_cm" not in report and "psnr_db" not in report and "neural" in report
     assert "figures of the mesh before" not in remesh(folder, "--resolution", "0.08")
@@ -139,6 +140,21 @@ def test_missing_and_unreadable_frames_are_said(folder):
     assert metrics_of(folder)["mesh_frames"] == metrics_of(folder)["mesh_color_frames"] == 4
 
 
+def test_the_resolution_said_of_the_map_is_that_of_its_cells(folder):
+    assert "; neural at 0.00571429 m, " in remesh(folder, "--resolution", "0.006", "--source", "neural")
+    assert metrics_of(folder)["mesh_resolution_m"] == pytest.approx(0.04 / 7)  # a whole number in a voxel
+
+
+@pytest.mark.parametrize("wish", [[], ["--format=glb"], ["--format=obj", "--texture"]])
+def test_a_mesh_of_no_frame_replaces_none_of_frames(folder, wish):
+    for image in (folder / "data" / "depth").iterdir():
+        image.write_bytes(image.read_bytes()[:100])
+    before = contents(folder / "out")
+    refused = spslam("mesh", "out", *wish, cwd=folder)
+    assert_refused(refused, "folder/data: none of the 6 frames to fuse can be read: restore the data, or use --source")
+    assert contents(folder / "out") == before
+
+
 @pytest.mark.parametrize("source", ["tsdf", "neural"])
 @pytest.mark.parametrize("resolution", ["1e-5", "1e-300", "5e-324"])
 def test_a_resolution_beyond_memory_is_refused_with_one_that_fits(folder, source, resolution):
@@ -165,7 +181,7 @@ def test_a_mesh_without_surface_replaces_none(folder, monkeypatch, wish):
     monkeypatch.setattr(mesh, "extract_mesh", lambda *_: empty)
     before = contents(folder / "out")
     refused = spslam("mesh", "out", "--source", "neural", "--resolution", "1", *wish, cwd=folder)
-    assert_refused(refused, f"out/mesh.{wish[0][-3:]}: no surface at a resolution of 1 m, so no mesh was written")
+    assert_refused(refused, f"out/mesh.{wish[0][-3:]}: no surface at a resolution of 0.04 m, so no mesh was written")
     assert contents(folder / "out") == before
 
 
@@ -202,3 +218,30 @@ def test_a_merged_map_is_called_one(folder, command):
     (folder / "out" / "trajectory.txt").rename(folder / "out" / "trajectory-1.txt")
     refused = spslam(command, "out", cwd=folder)
     assert_refused(refused, "out: is a merged map, which has no trajectory of its own; give one of the merged runs")
+
+
+def test_figures_of_a_merged_map_are_of_its_new_mesh(folder, monkeypatch):
+    from spslam.run import recordings
+
+    (folder / "out" / "trajectory.txt").rename(folder / "out" / "trajectory-1.txt")
+    before = metrics_of(folder)
+    with monkeypatch.context() as patches:
+        patches.setattr(recordings, "_open_again", lambda _: "it is gone")
+        said = "the mesh is of the map alone where folder/data was: it is gone"
+        assert f"! {said}\n" in remesh(folder)
+    metrics = metrics_of(folder)
+    assert metrics["mesh_source"] == "neural" and metrics["warnings"] == [said]
+    assert not {"mesh_frames", "mesh_mb"} & metrics.keys()
+    remesh(folder, "--format", "glb")
+    assert metrics_of(folder) == metrics
+    remesh(folder)
+    assert {**metrics_of(folder), "mesh_s": before["mesh_s"]} == before
+
+
+def test_earlier_frames_are_missed_only_where_frames_are_fused(folder, monkeypatch):
+    from spslam.run import recordings
+
+    (folder / "out" / "metrics.json").write_text(json.dumps({**metrics_of(folder), "map": "earlier"}))
+    monkeypatch.setattr(recordings, "read_again", lambda *_: ([], ["the mesh is of the map alone where it was"]))
+    assert "! the mesh is of the map alone" not in remesh(folder, "--source", "neural")
+    assert "! the mesh is of the map alone where it was\n" in remesh(folder, "--source", "tsdf")

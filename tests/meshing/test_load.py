@@ -46,6 +46,21 @@ def test_a_written_mesh_comes_back(tmp_path):
         np.testing.assert_array_equal(loaded.colors, colors)
 
 
+def test_a_glb_that_is_nearly_one_written_here_is_read_as_any_other(tmp_path):
+    vertices = CUBE.vertices.astype(np.float32)
+    faces, colors = CUBE.faces.astype(np.int32), np.full((len(vertices), 3), 128, np.uint8)
+    path = tmp_path / "mesh.glb"
+    save_mesh(TriangleMesh(vertices, faces, colors, np.zeros_like(vertices)), path)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b'"generator":"spslam"', b'"generator":"others"'))
+    loaded = load_mesh(path)
+    np.testing.assert_array_equal(loaded.faces, CUBE.faces)
+    assert (loaded.colors == 55).all()  # linear, as trimesh reads them
+    for damaged in (content[:100], content[:-4], content[:20] + b"[" * 400 + content[420:]):
+        path.write_bytes(damaged)
+        refused(path, "can't be read as a mesh: ")
+
+
 def refused(path, message):
     for load in (load_mesh, TriangleSurface.load):
         with pytest.raises(DatasetError, match=f"{path.name}: .*{message}") as error:

@@ -1,13 +1,16 @@
 """Triangle meshes, and their files."""
 
+import json
 import os
+import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
 from spslam.errors import OutputError
-from spslam.meshing import TriangleMesh, save_mesh
+from spslam.meshing import TriangleMesh, load_mesh, save_mesh
 from spslam.meshing.cleaning import in_large_component
 from spslam.meshing.mesh import compact, face_normals, vertex_normals
 
@@ -22,6 +25,12 @@ def _sphere(subdivisions=3, offset=0.0):
 
 def _empty():
     return TriangleMesh(*(np.zeros((0, 3), dtype) for dtype in (np.float32, np.int32, np.uint8, np.float32)))
+
+
+def linear(levels):
+    """The light, 0 to 1, that levels of sRGB, 0 to 255, stand for (IEC 61966-2-1)."""
+    share = np.asarray(levels) / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def test_vertex_normals_of_a_sphere_are_radial():
@@ -99,7 +108,9 @@ def test_files_contain_the_mesh(suffix, tmp_path):
     loaded = trimesh.load(path, process=False, force="mesh")
     np.testing.assert_allclose(loaded.vertices, mesh.vertices, atol=1e-7)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
-    np.testing.assert_array_equal(loaded.visual.vertex_colors[:, :3], mesh.colors)
+    shown = loaded.visual.vertex_colors[:, :3]
+    # trimesh takes the linear colors of a GLB as they are.
+    np.testing.assert_array_equal(shown, np.rint(255 * linear(mesh.colors)) if suffix == "glb" else mesh.colors)
     assert os.listdir(tmp_path) == [path.name]
 
 
@@ -116,6 +127,21 @@ def test_glb_contains_the_normals(tmp_path):
     mesh = _sphere()
     save_mesh(mesh, tmp_path / "mesh.glb")
     assert b'"NORMAL":' in (tmp_path / "mesh.glb").read_bytes()
+
+
+def test_colors_in_a_glb_are_linear_as_its_format_has_them(tmp_path):
+    mesh = _sphere()
+    colors = np.resize(np.arange(256, dtype=np.uint8), mesh.colors.shape)
+    save_mesh(replace(mesh, colors=colors), tmp_path / "mesh.glb")
+    content = (tmp_path / "mesh.glb").read_bytes()
+    length = struct.unpack_from("<I", content, 12)[0]
+    document = json.loads(content[20 : 20 + length])
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"]) == (5126, "VEC3")
+    start = 28 + length + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    stored = np.frombuffer(content, "<f4", colors.size, start).reshape(-1, 3)
+    np.testing.assert_allclose(stored, linear(colors), rtol=1e-6)
+    np.testing.assert_array_equal(load_mesh(tmp_path / "mesh.glb").colors, colors)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])

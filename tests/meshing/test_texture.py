@@ -136,6 +136,16 @@ def test_larger_texels_where_pages_are_full(monkeypatch):
     assert rms(colors, points) < 6
 
 
+def test_finer_texels_wanted_are_no_coarser_ones(monkeypatch):
+    """Of a rough surface, which squares of few texels cut into single faces, each with a border of its own."""
+    monkeypatch.setattr(atlas, "MOST_PAGE_PX", 1024)
+    even = mesh_of(*CORNER)
+    rough = even.vertices + np.random.default_rng(0).normal(scale=0.02, size=even.vertices.shape).astype(np.float32)
+    mesh = replace(even, vertices=rough)
+    made = [atlas.make_atlas(mesh, texel_m, 1).texel_m for texel_m in (2e-3, 1e-4, 1e-6)]
+    assert made[0] > 2e-3 and max(made) < 1.1 * made[0]
+
+
 def test_a_face_is_on_one_page_however_fine_the_texels_wanted():
     vertices = np.array([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]], np.float32)
     blank = np.zeros((3, 3))

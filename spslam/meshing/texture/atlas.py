@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from spslam.errors import SpslamError
-from spslam.meshing.mesh import TriangleMesh
+from spslam.meshing.mesh import TriangleMesh, face_normals
 from spslam.meshing.texture.charts import Charts, make_charts
 
 # Edge of a page at most, px: what graphics cards of any kind take.
@@ -22,6 +22,9 @@ _LEAST_WEIGHT, _MOST_WEIGHT = -1.0, 2.0
 # Texels that faces are looked for in at once; some 100 bytes each.
 _FRAGMENTS = 2_000_000
 _SPARE, _STEP_PX, _ATTEMPTS = 1.05, 64, 8
+# Texels of this share of those by which a mesh fills all pages are too many. From smaller ones, whose tiles cut it into
+# single faces, larger ones than needed would come out.
+_FINEST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ def make_atlas(mesh: TriangleMesh, texel_m: float, most_pages: int) -> Atlas:
     Raises:
         SpslamError: even large texels need more pages, as of a mesh in very many pieces.
     """
+    area_m2 = float(np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1).sum(dtype=np.float64)) / 2
+    texel_m = max(texel_m, _FINEST_SHARE * float(np.sqrt(area_m2 / most_pages)) / MOST_PAGE_PX)
     for _ in range(_ATTEMPTS):
         charts = make_charts(mesh, texel_m * TILE_PX)
         sizes = np.ceil(charts.sizes_m / texel_m).astype(np.int64) + 1 + 2 * GUTTER_PX

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ import numpy as np
 
 from spslam.errors import OutputError
 from spslam.io import atomic_write, atomic_write_all
+from spslam.meshing.glb import FLOAT, INDICES, UINT, VERTEX_DATA, GlbBinary, encode_document
 from spslam.meshing.texture.textured_mesh import TexturedMesh
 from spslam.run_folder import TEXTURED_FORMATS
 
@@ -20,9 +19,7 @@ _SUFFIXES = tuple(f".{name}" for name in TEXTURED_FORMATS)
 # Of PNG, 0 to 9: the first gives nearly the size of the last at a third of the time.
 _COMPRESSION = 3
 # Numbers of the glTF 2.0 specification.
-_FLOAT, _UINT, _VERTEX_DATA, _INDICES = 5126, 5125, 34962, 34963
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
-_GLB_MAGIC, _GLB_VERSION, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
 
 
 def check_textured_format(path: Path) -> None:
@@ -91,64 +88,28 @@ def _obj(mesh: TexturedMesh, materials: str) -> str:
 
 def _glb(mesh: TexturedMesh, images: list[bytes]) -> bytes:
     """A binary glTF 2.0: all pages share the vertices, each has its material and its faces."""
-    binary = _Binary()
+    binary = GlbBinary()
     attributes = {
-        "POSITION": binary.accessor(mesh.vertices.astype("<f4"), _FLOAT, "VEC3", _VERTEX_DATA),
-        "NORMAL": binary.accessor(mesh.normals.astype("<f4"), _FLOAT, "VEC3", _VERTEX_DATA),
-        "TEXCOORD_0": binary.accessor(mesh.places.astype("<f4"), _FLOAT, "VEC2", _VERTEX_DATA),
+        "POSITION": binary.positions(mesh.vertices),
+        "NORMAL": binary.accessor(mesh.normals.astype("<f4"), FLOAT, "VEC3", VERTEX_DATA),
+        "TEXCOORD_0": binary.accessor(mesh.places.astype("<f4"), FLOAT, "VEC2", VERTEX_DATA),
     }
-    binary.accessors[0] |= {"min": mesh.vertices.min(0).tolist(), "max": mesh.vertices.max(0).tolist()}
     primitives = []
     for page in range(len(images)):
         faces = mesh.faces[mesh.page_of == page].astype("<u4").reshape(-1, 1)
         if len(faces):
-            indices = binary.accessor(faces, _UINT, "SCALAR", _INDICES)
+            indices = binary.accessor(faces, UINT, "SCALAR", INDICES)
             primitives.append({"attributes": attributes, "indices": indices, "material": page})
-    document = {
-        "asset": {"version": "2.0", "generator": "spslam"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": primitives}],
+    more = {
         "materials": [_material(page) for page in range(len(images))],
         "textures": [{"sampler": 0, "source": page} for page in range(len(images))],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
         "images": [{"mimeType": "image/png", "bufferView": binary.view(image)} for image in images],
-        "accessors": binary.accessors,
-        "bufferViews": binary.views,
-        "buffers": [{"byteLength": binary.size}],
         "extensionsUsed": ["KHR_materials_unlit"],
     }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    chunks = [(_JSON_CHUNK, text + b" " * (-len(text) % 4)), (_BINARY_CHUNK, b"".join(binary.parts))]
-    body = b"".join(struct.pack("<I", len(content)) + kind + content for kind, content in chunks)
-    return _GLB_MAGIC + struct.pack("<II", _GLB_VERSION, 12 + len(body)) + body
+    return encode_document(primitives, binary, more)
 
 
 def _material(page: int) -> dict[str, Any]:
     surface = {"baseColorTexture": {"index": page}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {"name": f"page{page}", "pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}}
-
-
-class _Binary:
-    """The binary part of a GLB as it grows, and what says where its arrays are."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.size = 0
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def view(self, content: bytes, target: int | None = None) -> int:
-        """The number of the view of new content."""
-        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
-        self.views.append(view if target is None else view | {"target": target})
-        self.parts.append(content + b"\0" * (-len(content) % 4))
-        self.size += len(self.parts[-1])
-        return len(self.views) - 1
-
-    def accessor(self, array: np.ndarray, component: int, kind: str, target: int) -> int:
-        """The number of the accessor of a new array."""
-        view = self.view(np.ascontiguousarray(array).tobytes(), target)
-        self.accessors.append({"bufferView": view, "componentType": component, "count": len(array), "type": kind})
-        return len(self.accessors) - 1
