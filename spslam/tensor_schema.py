@@ -88,6 +88,17 @@ def _check_depth_keyframes(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
         raise SpslamError(f"tensor depth_keyframes.frames must be below {sizes['frames']}, got {int(frames.max())}")
 
 
+def _check_depth_history(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
+    frames = tensors.get("depth_history.frames")
+    if frames is None:
+        if sizes["depth_histories"]:
+            raise SpslamError("tensor depth_history.cells is missing")
+        return
+    numbers = [frames.flatten(), *(tensors[f"depth_history.{name}"].flatten() for name in ("moving", "looked"))]
+    if int(torch.cat(numbers).max()) >= sizes["frames"]:
+        raise SpslamError(f"tensors depth_history.frames, .moving and .looked must be below {sizes['frames']}")
+
+
 def _check_features(tensors: Mapping[str, Tensor], sizes: Sizes) -> None:
     """Counts cover the features; frames ascend and exist."""
     frames, counts = tensors["features.frames"], tensors["features.counts"]
@@ -267,7 +278,8 @@ _MOMENTS = (
 )
 
 # And: width and height of the images (px), thumbnail_rows and thumbnail_columns, depth_images (0 without depth
-# keyframes), depth_image_rows and depth_image_columns.
+# keyframes), depth_image_rows and depth_image_columns; depth_histories (0 where nothing that moves is looked for),
+# depth_cell_rows and depth_cell_columns.
 CHECKPOINT = TensorSchema(
     {
         **_map_rules("scene."),
@@ -301,6 +313,14 @@ CHECKPOINT = TensorSchema(
             torch.uint8, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
         ),
         "depth_keyframes.frames": TensorRule(torch.int64, ("depth_images",), low=-1, optional=True),
+        "depth_history.cells": TensorRule(
+            torch.uint16, ("depth_histories", "depth_cell_rows", "depth_cell_columns"), optional=True
+        ),
+        "depth_history.frames": TensorRule(torch.int64, ("depth_histories",), low=-1, optional=True),
+        "depth_history.moving": TensorRule(torch.int64, (), low=-1, optional=True),
+        "depth_history.looked": TensorRule(torch.int64, (), low=-1, optional=True),
+        "depth_history.off": TensorRule(torch.float64, (2,), low=0, high=1e9, optional=True),
+        "depth_history.found": TensorRule(torch.int32, (2,), low=0, optional=True),
         **_graph_rules("graph."),
         **_moment_rules(_MOMENTS),
     },
@@ -309,6 +329,7 @@ CHECKPOINT = TensorSchema(
         _check_unit_quaternions,
         _check_pixels,
         _check_depth_keyframes,
+        _check_depth_history,
         _check_features,
         _check_graph,
         _check_moments,
@@ -316,6 +337,7 @@ CHECKPOINT = TensorSchema(
     (
         ("depth_keyframes.images", "depth_keyframes.intensities"),
         ("depth_keyframes.images", "depth_keyframes.frames"),
+        *(("depth_history.cells", f"depth_history.{name}") for name in ("frames", "moving", "looked", "off", "found")),
         *(("newest.frame", name) for name in _newest_rules()),
         *(("graph.frames", name) for name in _graph_rules("graph.")),
         *((f"moments.{name}.first", f"moments.{name}.second") for name, _ in _MOMENTS),

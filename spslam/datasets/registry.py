@@ -132,7 +132,7 @@ def _open_generated(config: Any) -> RgbdDataset:
 def _open_places(config: Any) -> RgbdDataset:
     capture = _load("places", "Capture")
     captured = capture(**_given(config, [field.name for field in fields(capture)]))
-    names = ("place", "motion", "sensor", "frames", "seed", "texture")
+    names = ("place", "motion", "sensor", "frames", "seed", "texture", "people")
     return _load("places", "PlacesDataset")(**_given(config, names), capture=captured)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -64,6 +65,99 @@ def count_known_surface(
     )  # fmt: skip
 
 
+class DepthCells(NamedTuple):
+    """How depth images are looked at in cells, and when depths differ.
+
+    Attributes:
+        intrinsics: of the depth images, px.
+        unit: of their depth, m.
+        step: every how many pixels there is a cell.
+        margin: m.
+        turn: radians.
+        deviations: of depth; depths z differ if they do by more than margin + turn z and so many.
+    """
+
+    intrinsics: Intrinsics
+    unit: float
+    step: int
+    margin: float
+    turn: float
+    deviations: float
+
+
+def find_moving_cells(
+    depth: torch.Tensor,
+    pose: torch.Tensor,
+    earlier: tuple[torch.Tensor, torch.Tensor, Sequence[tuple[int, int]]],
+    noise: torch.Tensor,
+    cells: DepthCells,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where a frame shows what moves, by what earlier frames saw there.
+
+    A cell moves if an earlier frame saw something clearly behind its surface, there and around. It does, too, if an
+    earlier one saw surface that the frame sees through, there and around, and no earlier one saw the cell's own. And
+    more than half of it and the cells around it must. Computed in float64: the same on every device.
+
+    Args:
+        depth: uint16 [H, W] of the frame, 0 where unknown.
+        pose: float32 [7] of the frame.
+        earlier: cells uint16 [S, h, w] of earlier frames, poses float32 [F, 7], and rows of both for each, at most 16.
+        noise: float32 [2 or more] a^2 (m^2) and c^2 (1/m^2) of the variance of a depth z, a^2 + c^2 z^4.
+        cells: how images are looked at.
+
+    Returns:
+        uint8 [h, w], 1 in cells that move and those around; int32 [2], how many move, those around not counted, and how
+        many have depth.
+    """
+    grids, poses, rows = earlier
+    # The enums in csrc/bindings/moving_objects.cpp.
+    return torch.ops.spslam.find_moving_cells(
+        depth, pose, grids, poses, noise, [*cells.intrinsics, cells.unit, cells.margin, cells.turn, cells.deviations],
+        cells.step, [number for row in rows for number in row],
+    )  # fmt: skip
+
+
+class SampleSteps(NamedTuple):
+    """Of which pixels of a frame its images are.
+
+    Attributes:
+        image: every how many pixels of the frame the depth image has one.
+        thumbnail: the depth thumbnail, the middle of so many.
+        cells: every how many pixels of the depth image there is a cell.
+    """
+
+    image: int
+    thumbnail: int
+    cells: int
+
+
+def leave_out_moving(
+    samples: tuple[torch.Tensor, ...],
+    cells: torch.Tensor,
+    counts: torch.Tensor,
+    steps: SampleSteps,
+    shares: tuple[float, float],
+    fewest: int,
+) -> tuple[torch.Tensor, ...]:
+    """A frame's pixels without those in cells that move: there is no depth there, and their records are other pixels'.
+
+    The k-th record there becomes the k-th outside, counted round. All is as it was where the share of cells that move
+    does not lie between two limits, or too few records are left; the device decides.
+
+    Args:
+        samples: records int32 [P, 3], normals float32 [P, 3], depth image uint16 [H, W], and depth thumbnail float16.
+        cells, counts: of `find_moving_cells`.
+        steps: of which pixels these are.
+        shares: of the cells with depth, the limits.
+        fewest: records that must be left.
+
+    Returns:
+        The same four, as tensors of their own.
+    """
+    # The enums in csrc/bindings/moving_objects.cpp.
+    return torch.ops.spslam.leave_out_moving(*samples, cells, counts, list(shares), [*steps, fewest])
+
+
 class ShownImages(NamedTuple):
     """A frame's small images.
 
@@ -115,6 +209,16 @@ def brightness_sums(
         records, poses, rows, pose, shown.depth, shown.intensity,
         [*intrinsics, *shown.intrinsics, shown.unit, tolerance], [size[1], size[0], cells, points],
     )  # fmt: skip
+
+
+@torch.library.register_fake("spslam::find_moving_cells")
+def _(depth, pose, earlier, *_):
+    return depth.new_empty(earlier.shape[1:], dtype=torch.uint8), depth.new_empty(2, dtype=torch.int32)
+
+
+@torch.library.register_fake("spslam::leave_out_moving")
+def _(records, normals, depth, thumbnail, *_):
+    return tuple(torch.empty_like(each) for each in (records, normals, depth, thumbnail))
 
 
 @torch.library.register_fake("spslam::brightness_sums")

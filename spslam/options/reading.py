@@ -132,6 +132,12 @@ class DatasetOptions(Section):
     texture: float = option(
         "contrast of all patterns and pictures; at 0 every surface has one plain color", needs=(_PLACES,), ge=0, le=1
     )
+    people: int = option(
+        "people who walk on the camera's way, in its images alone",
+        needs=(_PLACES, need(is_not("dataset.place", "desk"))),
+        ge=0,
+        le=8,
+    )
     rate_hz: float | None = option("frame rate; null is the sensor's", "Hz", needs=(_PLACES,), ge=1, le=120)
     sensor_noise: float = option(
         "scale of the sensor's errors: 0 is exact, 1 the sensor",

@@ -84,6 +84,10 @@ class TrackingOptions(Section):
         "they give",
         needs=(need(is_("tracking.recovery", True)),),
     )
+    moving_objects: bool = option(
+        "leave out what moves before the camera, such as people, by the depth of the last two seconds",
+        needs=(need(is_("tracking.depth_keyframes", True)),),
+    )
     recovery_min_robust_weight: float = option(
         "recover and verify when the mean robust weight of the pixels is below this", ge=0, le=1
     )

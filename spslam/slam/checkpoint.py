@@ -16,6 +16,7 @@ import torch
 from spslam.config import Config
 from spslam.errors import OutputError, SpslamError, brief
 from spslam.scene.scene import TENSOR_SIZES
+from spslam.slam.depth_history import cell_shape
 from spslam.slam.depth_keyframes import depth_image_shape
 from spslam.slam.device_events import host_copy
 from spslam.slam.recovery.pose_confidence import shipped_constants
@@ -84,6 +85,8 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
         tensors.update(_prefixed("newest.", state.newest.tensors()))
     if state.depth_keyframes is not None:
         tensors.update(_prefixed("depth_keyframes.", state.depth_keyframes.tensors()))
+    if state.depth_history is not None:
+        tensors.update(_prefixed("depth_history.", state.depth_history.tensors()))
     if state.graph is not None:
         tensors.update(_prefixed("graph.", state.graph.tensors()))
     # Moments that the next mapping call resets anyway need no place.
@@ -167,6 +170,8 @@ def _restore(state: SlamState, tensors: dict[str, torch.Tensor], header: dict[st
         state.newest.load_state_dict(_section(tensors, "newest."))
     if state.depth_keyframes is not None:
         state.depth_keyframes.load_state_dict(_section(tensors, "depth_keyframes."))
+    if state.depth_history is not None:
+        state.depth_history.load_state_dict(_section(tensors, "depth_history."))
     if state.graph is not None:
         state.graph.load_state_dict(_section(tensors, "graph."))
     device = state.scene.device
@@ -217,6 +222,8 @@ def _unjoined(tensors: dict[str, torch.Tensor], frames: int) -> list[UnjoinedFra
 def _sizes(state: SlamState) -> dict[str, int]:
     """The sizes that `CHECKPOINT` leaves open."""
     _, rows, columns = state.frames.depth_thumbnails.shape
+    cells = 0 if state.depth_history is None else len(state.depth_history.cells)
+    cell_rows, cell_columns = cell_shape(state.frames.camera)
     images = 0 if state.depth_keyframes is None else len(state.depth_keyframes.images)
     image_rows, image_columns = depth_image_shape(state.frames.camera)
     return {
@@ -225,6 +232,9 @@ def _sizes(state: SlamState) -> dict[str, int]:
         "height": state.frames.camera.height,
         "thumbnail_rows": rows,
         "thumbnail_columns": columns,
+        "depth_histories": cells,
+        "depth_cell_rows": cell_rows,
+        "depth_cell_columns": cell_columns,
         "depth_images": images,
         "depth_image_rows": image_rows,
         "depth_image_columns": image_columns,

@@ -7,6 +7,7 @@ from spslam.camera import Camera
 from spslam.config import Config
 from spslam.slam.feature_store import keeps_features
 from spslam.slam.image_features import FrameFeatures, ImageFeatures
+from spslam.slam.moving_objects import StaticFrame
 from spslam.slam.pixels import FramePixels
 from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.recovery.sliding import UNSURE_EIGENVALUE
@@ -37,7 +38,7 @@ class FeatureKeeper:
         self,
         state: SlamState,
         frame: PreparedFrame,
-        read: FrameFeatures,
+        static: StaticFrame,
         tracked: TrackedFrame,
         shutter: ops.ShutterMotion | None,
     ) -> None:
@@ -46,7 +47,7 @@ class FeatureKeeper:
         Args:
             state: after the frame; changed.
             frame: as it came.
-            read: of its pixels, as they were read.
+            static: the frame without what moves.
             tracked: what tracking made of it.
             shutter: how the camera moved while it was read; None where that does not matter.
         """
@@ -54,11 +55,14 @@ class FeatureKeeper:
         self._since_asked = 0 if is_asked else self._since_asked + 1
         if tracked.occluded or state.frames.is_lost(-1):
             return
+        read, number, history = static.features, len(state.frames) - 1, state.depth_history
         features = self._wanted(state, frame, read) if tracked.features is None else tracked.features
+        if static.is_watched and history is not None and number in history.frames:
+            features = read.extracted  # poses of the next frames are predicted by them
         if features is not None and shutter is not None:
             features = self._rectifier.features(features, shutter)
         if features is not None:
-            state.features.add(len(state.frames) - 1, features)
+            state.features.add(number, features)
 
     def of(self, read: FramePixels) -> FrameFeatures:
         """Those of a frame as it was read, extracted where they are asked for."""

@@ -24,6 +24,7 @@ from spslam.slam.image_features import FrameFeatures
 from spslam.slam.interpreter import interpreter_shared
 from spslam.slam.localizer import LocalizedFrame, Localizer
 from spslam.slam.mapper import Mapper, MappingTask
+from spslam.slam.moving_objects import MovingObjects, StaticFrame
 from spslam.slam.multi_map import MultiMap
 from spslam.slam.pixels import FramePixels
 from spslam.slam.poses import check_first_pose, pose_tensor
@@ -92,6 +93,7 @@ class FramePipeline:
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
         self.recovery = Recovery(config, camera, self.tracker, confidence)
         self._localizer = Localizer(self.tracker, self.recovery, self._rectifier)
+        self._moving = MovingObjects(config, camera, self.tracker)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
         self.first_pose = np.eye(4)
         self._prior = prior
@@ -118,6 +120,7 @@ class FramePipeline:
         self.state = state
         self.history = FrameHistory(self.state)
         self.constraints = ConstraintSource(self.config, self.camera)
+        self._moving.forget()
         self.close()
         self.global_mapping = None
         if self.state.graph is not None:
@@ -151,20 +154,22 @@ class FramePipeline:
         number, begins_map = len(self.state.frames), not self._has_map
         loops = () if defer_mapping else self._update_globally(number)
         read, self.history.coming_s = self._receive(frame, events), frame.depth_time
-        features = self.features.of(read)
+        static = StaticFrame(self.features.of(read))
+        if not begins_map:
+            static = self._moving.without(self.state, self.history, static.features)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
         constraints = Constraints()
         if not begins_map:
             constraints = self.constraints.gather(self.history, read, frame.depth_time, frame.offsets.color)
-        tracked, shutter, pixels = self._track(frame, features, constraints, number, events)
+        tracked, shutter, pixels = self._track(frame, static, constraints, number, events)
         if not begins_map:
             self._tell(on_pose, tracked, tracked.lost)
-        self._store(frame, pixels, constraints, tracked, features, shutter)
+        self._store(frame, pixels, constraints, tracked, static, shutter, read)
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
             self._tell(on_pose, tracked, self.state.frames.is_lost(-1))
-        self.features.keep(self.state, frame, features, tracked, shutter)
+        self.features.keep(self.state, frame, static, tracked, shutter)
         self._follow_other_maps(frame, read)
         is_keyframe = not tracked.occluded and not self.state.frames.is_lost(-1) and self.state.segment is None
         if self.global_mapping is not None and is_keyframe:
@@ -278,10 +283,10 @@ class FramePipeline:
         return frame.pixels.received()
 
     def _track(
-        self, frame: PreparedFrame, features: FrameFeatures, constraints: Constraints, number: int, events: FrameEvents
+        self, frame: PreparedFrame, static: StaticFrame, constraints: Constraints, number: int, events: FrameEvents
     ) -> LocalizedFrame:
         """Finds the pose, and rectifies the frame by the motion to it where that matters."""
-        state, read = self.state, features.pixels
+        state, features, read = self.state, static.features, static.features.pixels
         if not self._has_map:
             first = pose_tensor(self.first_pose, self.device)
             return LocalizedFrame(TrackedFrame.untracked(first, lost=self._has_too_little_depth(read)), None, read)
@@ -300,7 +305,7 @@ class FramePipeline:
                 seconds = self._rectifier.seconds(state, self.history, frame.depth_time)
             to_be_mapped = self._is_mapping_turn(number)
             found = self._localizer.next_frame(
-                state, features, self.history, constraints, seconds, to_be_mapped, self.while_tracking
+                state, features, self.history, constraints, seconds, to_be_mapped, self.while_tracking, static.start
             )
         events.tracking = (begin, self._record())
         return found
@@ -311,8 +316,9 @@ class FramePipeline:
         pixels: FramePixels,
         constraints: Constraints,
         tracked: TrackedFrame,
-        features: FrameFeatures,
+        static: StaticFrame,
         shutter: ops.ShutterMotion | None,
+        read: FramePixels,
     ) -> None:
         """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
         state, number, copies = self.state, len(self.state.frames), RowCopies()
@@ -331,7 +337,8 @@ class FramePipeline:
         state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records, copies)
         is_known = not tracked.occluded and not tracked.lost
         if state.newest is not None and is_known:
-            state.newest.replace(number, features, shutter, copies)
+            state.newest.replace(number, static.features, shutter, copies)
+        self._moving.keep(state, read, static, tracked, copies)
         if state.depth_keyframes is not None and is_known:
             if constraints.depth_keyframes is not None:
                 state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes, tracked.gain)

@@ -4,12 +4,14 @@ ORB: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011, 
 (`csrc/cpu/orb_features.cpp`): a third of the time.
 """
 
+from collections.abc import Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
+import torch
 
 from spslam.camera import Camera
 from spslam.image_library import check_memory, image_library
@@ -48,6 +50,14 @@ class ImageFeatures:
     def __len__(self) -> int:
         return len(self.descriptors)
 
+    def where_known(self, depth: np.ndarray) -> "ImageFeatures":
+        """Without those with a depth that an image [h, w] of the same size does not have."""
+        columns, rows = np.rint(self.positions).astype(np.int64).T
+        rows, columns = np.clip(rows, 0, len(depth) - 1), np.clip(columns, 0, depth.shape[1] - 1)
+        kept = (self.points[:, 2] == 0) | (depth[rows, columns] > 0)
+        beyond_m = None if self.beyond_m is None else self.beyond_m[kept]
+        return ImageFeatures(self.descriptors[kept], self.positions[kept], self.points[kept], beyond_m)
+
     def with_depth(self) -> "ImageFeatures":
         """Those of which the depth is known."""
         known = self.points[:, 2] > 0
@@ -68,11 +78,20 @@ class FrameFeatures:
 
     def __init__(self, pixels: FramePixels, camera: Camera, max_depth_m: float):
         self.pixels, self._camera, self._max_depth_m = pixels, camera, max_depth_m
+        self._whole: FrameFeatures | None = None  # with what was left out of the pixels
+
+    def having(self, views: Mapping[str, torch.Tensor]) -> "FrameFeatures":
+        """The same of pixels whose views of some names are others, with less depth: without the features there."""
+        less = FrameFeatures(self.pixels.having(**views), self._camera, self._max_depth_m)
+        less._whole = self
+        return less
 
     @cached_property
     def extracted(self) -> ImageFeatures:
         """The features; waits for the device."""
-        return extract_features(self.pixels, self._camera, self._max_depth_m)
+        if self._whole is None:
+            return extract_features(self.pixels, self._camera, self._max_depth_m)
+        return self._whole.extracted.where_known(self.pixels.depth_image.cpu().numpy())
 
 
 def extract_features(pixels: FramePixels, camera: Camera, max_depth_m: float) -> ImageFeatures:

@@ -81,6 +81,7 @@ class Localizer:
         seconds: float | None,
         to_be_mapped: bool,
         meanwhile: Callable[[], None] | None = None,
+        start: torch.Tensor | None = None,
     ) -> LocalizedFrame:
         """The next frame of a camera, predicted, tracked and rectified; changes nothing.
 
@@ -91,13 +92,14 @@ class Localizer:
             constraints: of the frame, without its motion.
             seconds: from the last frame to this one; None where the motion in between does not matter.
             to_be_mapped, meanwhile: as of `localize`.
+            start: float32 [7], where the camera is taken to be; None predicts it by its motion.
         """
         read, number, pixels = features.pixels, len(state.frames), None
         if seconds is None:
-            predicted = self._tracker.predict(state.frames, history.steps)
+            predicted = self._tracker.predict(state.frames, history.steps) if start is None else start
             problem = TrackingProblem(state.scene, read.records, predicted, number, constraints)
             return LocalizedFrame(self.localize(problem, read, features, history, to_be_mapped, meanwhile), None, read)
-        if self._tracker.can_follow(state.frames):
+        if start is None and self._tracker.can_follow(state.frames):
             moving, bent_turn = self._rectifier.moving(read, state, seconds, history.steps), self._rectifier.bent_turn
             found = self._tracker.follow(state.scene, moving, bent_turn, number, constraints, meanwhile)
             tracked, motion = self._recovery.settled(found.estimate, history, to_be_mapped), found.motion
@@ -108,6 +110,9 @@ class Localizer:
                 pixels = read.having(records=records, depth_image=depth, intensity_image=intensity)
         else:
             motion, predicted_pixels = self._rectifier.predict(read, state, seconds, history.steps)
+            if start is not None:
+                motion = motion._replace(pose=start)
+                predicted_pixels = self._rectifier.frame(read, motion)
             constraints = replace(constraints, shutter=motion)
             problem = TrackingProblem(state.scene, predicted_pixels.records, motion.pose, number, constraints)
             tracked = self.localize(problem, predicted_pixels, features, history, to_be_mapped, meanwhile)

@@ -13,6 +13,7 @@ from spslam.config import Config
 from spslam.geometry import pose7_to_matrix
 from spslam.scene import Scene, SceneSettings
 from spslam.scene.sparse_volume import SparseVolume, resize_rows
+from spslam.slam.depth_history import DepthHistory
 from spslam.slam.depth_keyframes import DepthKeyframeStore
 from spslam.slam.feature_store import FeatureStore, uses_features
 from spslam.slam.frame_table import FrameTable
@@ -118,6 +119,7 @@ class SlamState:
         pixels: pixel records of every frame.
         noise: of the sensor.
         depth_keyframes: images of some earlier frames; None where tracking does not use them.
+        depth_history: coarse depth of some of the last frames; None where nothing that moves is looked for.
         features: image features of some earlier frames; none where tracking does not use them.
         newest: the last frame with a trusted pose, for its image features; None where tracking does not use them.
         graph: keyframes and what was measured between them; None where there is no keyframe graph.
@@ -134,6 +136,7 @@ class SlamState:
     pixels: PixelDatabase
     noise: SensorNoiseEstimate
     depth_keyframes: DepthKeyframeStore | None = None
+    depth_history: DepthHistory | None = None
     features: FeatureStore = field(default_factory=FeatureStore)
     newest: NewestFrame | None = None
     graph: KeyframeStore | None = None
@@ -175,13 +178,14 @@ class SlamState:
         depth_keyframes = None
         if tracking.depth_keyframes:
             depth_keyframes = DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
+        depth_history = DepthHistory(camera, device) if tracking.moving_objects else None
         noise = SensorNoiseEstimate(camera, tracking.depth_noise_m, device)
         graph = None
         if config.graph.enabled and config.prior.enabled:
             prior = config.prior
             graph = KeyframeStore(KeyframeCamera.of(camera, depth_m, prior.normal_step_px, prior.max_jump))
         newest = NewestFrame(camera, depth_m, device) if uses_features(config) else None
-        return cls(scene, frames, pixels, noise, depth_keyframes, newest=newest, graph=graph)
+        return cls(scene, frames, pixels, noise, depth_keyframes, depth_history, newest=newest, graph=graph)
 
     def has_enough_features(self, number: int) -> bool:
         """Whether features of enough frames are kept that stand close to where frame `number` stands."""

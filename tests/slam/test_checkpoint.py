@@ -95,6 +95,8 @@ def test_an_unchanged_checkpoint_is_read(load, checkpoint):
         ("depth_keyframes.intensities", (6, 48, 63), r"must be uint8 \[6, 48, 64\], got uint8 \[6, 48, 63\]"),
         ("noise.counts", (2, 32, 127), r"must be int32 \[2, 32, 128\], got int32 \[2, 32, 127\]"),
         ("depth_keyframes.frames", (7,), r"must be int64 \[6\], got int64 \[7\]"),
+        ("depth_history.cells", (10, 48, 63), r"must be uint16 \[10, 48, 64\], got uint16 \[10, 48, 63\]"),
+        ("depth_history.frames", (9,), r"must be int64 \[10\], got int64 \[9\]"),
         ("moments.geometry_decoder.first", (7,), r"must be float32 \[1473\], got float32 \[7\]"),
         ("moments.embeddings.second", (9, 8), r"must be float32 \[\d+, 8\], got float32 \[9, 8\]"),
     ],
@@ -115,6 +117,9 @@ def test_a_tensor_of_another_shape_is_refused(load, name, shape, message):
         ("pixels.records", -1, "tensor pixels.records must lie in the image, got a pixel beyond its width"),
         ("pixels.records", 48 << 16, "tensor pixels.records must lie in the image, got a pixel beyond its height"),
         ("depth_keyframes.frames", 2, "tensor depth_keyframes.frames must be below 2, got 2"),
+        ("depth_history.frames", 2, "tensors depth_history.frames, .moving and .looked must be below 2"),
+        ("depth_history.looked", 2, "tensors depth_history.frames, .moving and .looked must be below 2"),
+        ("depth_history.found", -1, "tensor depth_history.found must be at least 0, got -1"),
         ("scene.planes.layout", 2**62, "layout of plane 0 must "),
         ("moments.poses.second", -1.0, "tensor moments.poses.second must be at least 0, got -1"),
     ],
@@ -130,7 +135,9 @@ def test_truth_values_other_than_0_and_1_are_refused(load):
     refused(load, change, "tensor frames.lost must be 0 or 1, got 2")
 
 
-@pytest.mark.parametrize("name", ["frames.poses", "scene.origin", "pixels.records", "depth_keyframes.images"])
+@pytest.mark.parametrize(
+    "name", ["frames.poses", "scene.origin", "pixels.records", "depth_keyframes.images", "depth_history.cells"]
+)
 def test_a_missing_tensor_is_named(load, name):
     refused(load, lambda tensors, _: tensors.pop(name), f"tensors? {name} ")
 

@@ -86,6 +86,21 @@ class Caster:
                     self._add(number, visible, (rays, inverses), (depth, owner))
         return depth, owner
 
+    def window(self, camera: Camera, poses: np.ndarray) -> tuple[slice, slice]:
+        """Rows and columns of the image in which all solids that are in view lie; empty ones where none is.
+
+        Args:
+            camera: of the image.
+            poses: [1, 4, 4], or one for each row [H, 4, 4].
+        """
+        with np.errstate(invalid="ignore"):  # boxes behind the camera are infinite
+            windows = [window for _, _, window in self._in_view(camera, poses)]
+        if not windows:
+            return slice(0, 0), slice(0, 0)
+        rows, columns = zip(*windows, strict=True)
+        first, last = ([pick(each) for each in (rows, columns)] for pick in (_first, _last))
+        return slice(first[0], last[0]), slice(first[1], last[1])
+
     def _shell_depth(self, rays: Rays, inverses: np.ndarray) -> np.ndarray:
         low, high = _bounds(self._shell)
         exits = [
@@ -133,6 +148,14 @@ class Caster:
             (int(i), float(nearest[i]), (slice(first[i, 1], last[i, 1]), slice(first[i, 0], last[i, 0])))
             for i in seen[np.argsort(nearest[seen], kind="stable")]
         ]
+
+
+def _first(slices: Sequence[slice]) -> int:
+    return min(each.start for each in slices)
+
+
+def _last(slices: Sequence[slice]) -> int:
+    return max(each.stop for each in slices)
 
 
 def _image_box(camera: Camera, corners: np.ndarray, pose: np.ndarray) -> np.ndarray:

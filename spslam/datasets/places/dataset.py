@@ -11,6 +11,7 @@ from spslam.datasets.clock import AT_ONCE, CaptureOffsets, capture_offsets, capt
 from spslam.datasets.images import check_image_size
 from spslam.datasets.places.color_image import ColorImage, ExposureMeter
 from spslam.datasets.places.motion import MOTIONS, Motion
+from spslam.datasets.places.people import MOST_PEOPLE, People
 from spslam.datasets.places.registry import PLACES, make_place
 from spslam.datasets.places.sensors import SENSORS
 from spslam.datasets.solids import SolidScene
@@ -74,6 +75,7 @@ class PlacesDataset(RgbdDataset):
         seed: of place, motion and noise.
         texture: contrast of all patterns and pictures, 0 to 1.
         capture: image size, rate, and effects.
+        people: who walk on the camera's way, 0 to `MOST_PEOPLE`; not at a desk.
 
     Attributes:
         place: the `Place`, for evaluation: `signed_distance`, `sample_surface`, `mesh`.
@@ -92,15 +94,21 @@ class PlacesDataset(RgbdDataset):
         seed: int = 0,
         texture: float = 1.0,
         capture: Capture | None = None,
+        people: int = 0,
     ) -> None:
         for option, name, known in (("place", place, PLACES), ("motion", motion, MOTIONS), ("sensor", sensor, SENSORS)):
             if name not in known:
                 raise DatasetError(f"dataset.{option} must be one of {', '.join(known)}, got {name}")
-        numbers = (("frames", frames, 1, MAX_FRAMES), ("seed", seed, 0, 2**63 - 1), ("texture", texture, 0, 1))
+        numbers = [("frames", frames, 1, MAX_FRAMES), ("seed", seed, 0, 2**63 - 1), ("texture", texture, 0, 1)]
+        numbers.append(("people", people, 0, MOST_PEOPLE))
         for option, value, low, high in numbers:
             if not low <= value <= high:
                 raise DatasetError(f"dataset.{option} must be from {low} to {high}, got {value}")
-        self._arguments = (place, motion, sensor, frames, seed, texture, capture)
+        if people and place == "desk":
+            raise DatasetError(
+                "dataset.people must be 0 at a desk, where nobody walks by; choose another dataset.place"
+            )
+        self._arguments = (place, motion, sensor, frames, seed, texture, capture, people)
         self._capture = Capture() if capture is None else capture
         self._capture.check()
         self._sensor = SENSORS[sensor]
@@ -109,6 +117,7 @@ class PlacesDataset(RgbdDataset):
         self.name = f"{place}-{motion}-{sensor}-{seed}"
         self.place = make_place(place, seed, texture)
         self.motion = Motion(self.place.route, motion, seed, self.place.pace)
+        self._people = People(people, self.motion, seed, texture)
         self._rate_hz = self._sensor.rate_hz if self._capture.rate_hz is None else self._capture.rate_hz
         self._frames, self._seed = int(frames), int(seed)
         self._times = np.arange(self._frames) / self._rate_hz
@@ -142,11 +151,11 @@ class PlacesDataset(RgbdDataset):
         time = float(self._times[index])
         color_time = float(self._color_times[self._colors[index]]) + self._capture.color_delay_ms / 1000
         generator = np.random.default_rng([self._seed, 41, index])
-        color, exact = self.place.render(self.camera, self._row_poses(color_time))
+        color, exact = self._render(color_time)
         seen = color
         color = self._color.take(color, exact, (self.motion, color_time), generator)
         if color_time != time:
-            seen, exact = self.place.render(self.camera, self._row_poses(time))
+            seen, exact = self._render(time)
         depth = self._sensor.read(exact, seen, self.camera, self._capture.sensor_noise, generator)
         return RgbdFrame(index, float(self._stamps[index]), color, depth, self.motion.pose(time), self._offsets[index])
 
@@ -161,10 +170,11 @@ class PlacesDataset(RgbdDataset):
         stamps = np.maximum.accumulate(self._times + generator.uniform(0, most_s, self._frames))
         return stamps, capture_offsets(stamps, capture_times(color)[self._colors], capture_times(stamps))
 
-    def _row_poses(self, time: float) -> np.ndarray:
-        """The pose at a time, or of each row [H, 4, 4] around it."""
-        readout = self._capture.rolling_shutter_ms / 1000
-        if readout == 0:
-            return self.motion.pose(time)
-        height = self.camera.height
-        return self.motion.poses(time + readout * ((np.arange(height) + 0.5) / height - 0.5))
+    def _render(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Sharp color uint8 [H, W, 3] and exact depth float32 [H, W], m, of an image whose middle row is of a time."""
+        readout, height = self._capture.rolling_shutter_ms / 1000, self.camera.height
+        rows = (np.arange(height) + 0.5) / height - 0.5 if readout else np.zeros(1)
+        times = time + readout * rows
+        image = self.place.render(self.camera, self.motion.poses(times))
+        self._people.add(image, self.camera, times)
+        return image

@@ -78,7 +78,7 @@ class Motion:
     def poses(self, times: np.ndarray) -> np.ndarray:
         """Poses T_world_camera, float64 [N, 4, 4], at times [N] in seconds."""
         times = np.asarray(times, dtype=np.float64)
-        position, yaw, pitch = self._route.at(self._effort(times))
+        position, yaw, pitch = self._route.at(self.effort(times))
         moved = self._shake(times) + self._steps(times)
         moved[:, 3] += self._turns(times)
         forward, left = np.stack((np.cos(yaw), np.sin(yaw)), 1), np.stack((-np.sin(yaw), np.cos(yaw)), 1)
@@ -90,7 +90,12 @@ class Motion:
         """The pose [4, 4] at one time in seconds."""
         return self.poses(np.array([time]))[0]
 
-    def _effort(self, times: np.ndarray) -> np.ndarray:
+    def way(self, effort: np.ndarray) -> np.ndarray:
+        """Positions [N, 3] of the route without shake and steps, m, at efforts [N]."""
+        return self._route.at(effort)[0]
+
+    def effort(self, times: np.ndarray) -> np.ndarray:
+        """How far along the route the camera is at times [N] in seconds, in the route's parameter."""
         if self._style.stops:
             cycle = np.floor(times / _CYCLE_S)
             share = np.clip((times - cycle * _CYCLE_S) / (_CYCLE_S - _STANDING_S), 0, 1)

@@ -1,0 +1,188 @@
+"""What moves before the camera, such as people, is left out of a frame, and does not lead the camera along.
+
+A pixel moves if frames of the last two seconds saw free space where its surface is, or if it lies behind surface that
+they saw and that is gone (`ops.comparison.find_moving_cells`). Something large may lead tracking along; then poses are
+wrong by which that is judged. So while anything moves, the camera is predicted by what most image features agree on.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from spslam import ops
+from spslam.camera import Camera
+from spslam.config import Config
+from spslam.slam.depth_history import DepthHistory
+from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
+from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
+from spslam.slam.feature_store import uses_features
+from spslam.slam.frame_history import FrameHistory
+from spslam.slam.image_features import FrameFeatures
+from spslam.slam.pixels import THUMBNAIL_STEP_PX, FramePixels
+from spslam.slam.recovery.feature_alignment import FeatureAlignment, joined_too
+from spslam.slam.recovery.tracked_frame import TrackedFrame
+from spslam.slam.row_copies import RowCopies
+from spslam.slam.state import SlamState
+from spslam.slam.tracker import Tracker
+
+# Depths differ if they do by more than this, so many deviations of depth, and so many times what the prediction of the
+# camera was off of late; features are off by less.
+MARGIN_M, DEVIATIONS, TIMES_OFF = 0.02, 4.0, 2.0
+NOTICED = 0.01  # share of the cells with depth; fewer are noise at edges
+# Where the share is between these, the pixels are left out. Most of the image moves only where the camera is not where
+# it was predicted.
+LEAST, MOST = 0.02, 0.5
+FEWEST_PIXELS = 100  # that must remain
+WATCHED_S = 2.0  # after something has moved, frames are watched closely
+WATCHED_EVERY = 3  # frames; of those in which nothing has moved
+# The camera is predicted by features of frames of about these ages, s, with at most `WATCHED_S`, if so many agree with
+# one pose, and that share of all that match.
+AGES_S = (0.33, 0.83, 1.67)
+MIN_AGREEING, MIN_AGREEING_SHARE = 40, 0.4
+
+
+class StaticFrame(NamedTuple):
+    """A frame without what moves.
+
+    Attributes:
+        features: of the frame as it was read; their pixels are those that do not move.
+        start: float32 [7], where most of the image says that the camera is; None where nobody asked, or none does.
+        is_watched: whether something has moved of late.
+    """
+
+    features: FrameFeatures
+    start: torch.Tensor | None = None
+    is_watched: bool = False
+
+
+class MovingObjects:
+    """Finds what moves in one frame after the other.
+
+    What was found in a frame is read when the next one comes, so that the host does not wait for the device. Till then
+    the state has it, as a checkpoint may come between.
+
+    Args:
+        config: options of the run.
+        camera: of all frames.
+        tracker: predicts poses.
+    """
+
+    def __init__(self, config: Config, camera: Camera, tracker: Tracker):
+        self._camera, self._tracker = camera, tracker
+        self._unit = depth_unit(config.dataset.max_depth_m)
+        self._intrinsics = depth_image_intrinsics(camera)
+        self._image_step = depth_image_step(camera)
+        self._uses_features = uses_features(config)
+        self._coming: tuple[DeviceEvent, torch.Tensor] | None = None  # what was found, on its way from the device
+
+    def forget(self) -> None:
+        """Another state follows."""
+        self._coming = None
+
+    def without(self, state: SlamState, history: FrameHistory, features: FrameFeatures) -> StaticFrame:
+        """The next frame without what moves in it.
+
+        Args:
+            state: before the frame; when something moved last is noted in it.
+            history: the frames before.
+            features: of the frame as it was read.
+        """
+        known = state.depth_history
+        if known is None or history.is_lost or not features.pixels.count:
+            return StaticFrame(features)
+        self._note(known)
+        number = len(state.frames)
+        is_watched = known.moving >= 0 and 0 <= history.seconds_since(known.moving) <= WATCHED_S
+        earlier = known.known(state.frames.is_lost)
+        if not earlier or not (is_watched or number % WATCHED_EVERY == 0):
+            return StaticFrame(features)
+        start = self._by_features(history, features) if is_watched and self._uses_features else None
+        predicted = self._tracker.predict(state.frames, history.steps) if start is None else start
+        off_m, off_rad = known.off if start is None else (0.0, 0.0)
+        margin_m = MARGIN_M + TIMES_OFF * off_m
+        cells, counts = ops.comparison.find_moving_cells(
+            features.pixels.depth_image,
+            predicted,
+            (known.cells, state.frames.pose_rows, earlier),
+            history.noise,
+            ops.comparison.DepthCells(
+                self._intrinsics, self._unit, known.step, margin_m, TIMES_OFF * off_rad, DEVIATIONS
+            ),
+        )
+        known.looked, known.found = number, counts
+        coming = fetch(counts)
+        self._coming = event_recorder(counts.device)(), coming
+        if not is_watched:
+            return StaticFrame(features)
+        return StaticFrame(features.having(self._left_out(features, known.step, cells, counts)), start, True)
+
+    def keep(
+        self, state: SlamState, read: FramePixels, static: StaticFrame, tracked: TrackedFrame, copies: RowCopies
+    ) -> None:
+        """Keeps what later frames need of the newest one of a state, at a trusted pose.
+
+        Args:
+            state: after the frame; changed.
+            read: its pixels as they were read.
+            static: those that do not move.
+            tracked: what tracking made of it.
+            copies: what is stored is written when these are made.
+        """
+        number = len(state.frames) - 1
+        if state.depth_history is not None and not tracked.lost:
+            off = tracked.fit.prediction_error_cm / 100, math.radians(tracked.fit.prediction_error_deg)
+            if static.start is None and not math.isnan(sum(off)):
+                state.depth_history.predicted(*off)
+            last = max(state.depth_history.frames)
+            seconds = state.frames.depth_time(number) - state.frames.depth_time(last) if last >= 0 else 0.0
+            state.depth_history.keep(number, seconds, read.depth_image, copies)
+
+    def _note(self, known: DepthHistory) -> None:
+        """Reads what was found in an earlier frame; the device has long been done with it."""
+        if known.looked < 0:
+            return
+        found = known.found
+        if self._coming is not None:
+            self._coming[0].wait()
+            found = self._coming[1]
+        moving, all_cells = found.tolist()
+        if moving > NOTICED * all_cells:
+            known.moving = known.looked
+        known.looked, self._coming = -1, None
+
+    def _left_out(
+        self, features: FrameFeatures, step: int, cells: torch.Tensor, counts: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        pixels = features.pixels
+        names = ("records", "normals", "depth_image", "depth_thumbnail")
+        steps = ops.comparison.SampleSteps(self._image_step, THUMBNAIL_STEP_PX, step)
+        tensors = ops.comparison.leave_out_moving(
+            tuple(getattr(pixels, name) for name in names), cells, counts, steps, (LEAST, MOST), FEWEST_PIXELS
+        )
+        return dict(zip(names, tensors, strict=True))
+
+    def _by_features(self, history: FrameHistory, features: FrameFeatures) -> torch.Tensor | None:
+        """Pose float32 [7] that most features agree on with frames of the last two seconds; None where too few do."""
+        rows = self._anchors(history)
+        known = {row: kept for row in rows if (kept := history.features(row)) is not None and len(kept)}
+        if not known:
+            return None
+        image = FeatureAlignment(features.extracted, self._camera, device=history.poses.device)
+        poses = history.color_poses(list(known), is_timed=False)
+        matches = joined_too(image.matches_with(list(zip(known.values(), poses, strict=True))))[-1]
+        pose = image.pose(matches, history.poses.device) if len(matches) >= MIN_AGREEING else None
+        if pose is None:
+            return None
+        agreeing, matched = image.inliers(matches, image.color_pose(pose)), len(np.unique(matches.rows))
+        return pose if agreeing >= max(MIN_AGREEING, MIN_AGREEING_SHARE * matched) else None
+
+    @staticmethod
+    def _anchors(history: FrameHistory) -> list[int]:
+        """Rows of the frames with image features whose ages are nearest to `AGES_S`."""
+        ages = {row: history.seconds_since(row) for row in history.feature_rows()[-60:]}
+        ages = {row: age for row, age in ages.items() if 0.5 * AGES_S[0] <= age <= WATCHED_S}
+        return sorted({min(ages, key=lambda row: abs(ages[row] - wanted)) for wanted in AGES_S}) if ages else []
