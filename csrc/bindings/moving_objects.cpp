@@ -35,8 +35,8 @@ std::tuple<Tensor, Tensor> find_moving_cells(Tensor depth, Tensor pose, Tensor e
   grids.rows = earlier.size(1), grids.columns = earlier.size(2);
   SPS_CHECK((grids.rows - 1) * step < grids.height && (grids.columns - 1) * step < grids.width, kFind,
             ": the depth image must hold the cells");
-  grids.intrinsics = load_intrinsics(kFind, {scalars[GridScalar::kFx], scalars[GridScalar::kFy],
-                                             scalars[GridScalar::kCx], scalars[GridScalar::kCy]});
+  grids.intrinsics = load_intrinsics(
+      kFind, {scalars[GridScalar::kFx], scalars[GridScalar::kFy], scalars[GridScalar::kCx], scalars[GridScalar::kCy]});
   grids.unit = scalars[GridScalar::kUnit];
   grids.margin = scalars[GridScalar::kMargin], grids.turn = scalars[GridScalar::kTurn];
   grids.deviations = scalars[GridScalar::kDeviations];

@@ -65,9 +65,8 @@ void find_moving_cells<Cuda>(Cuda device, const DepthGrids& grids, void* workspa
     if (moving[cell]) atomicAdd(counts, 1);
     if (cell_depth(grids, cell / grids.columns, cell % grids.columns) > 0.0) atomicAdd(counts + 1, 1);
   });
-  for_each(device, num_cells, [=] __device__(std::int64_t cell) {
-    cells[cell] = is_marked_around(grids, moving, cell);
-  });
+  for_each(device, num_cells,
+           [=] __device__(std::int64_t cell) { cells[cell] = is_marked_around(grids, moving, cell); });
 }
 
 template <>

@@ -78,8 +78,8 @@ SPS_INLINE std::uint32_t earlier_evidence(const DepthGrids& grids, std::int64_t 
   const double margin = depth_margin(grids, seen.depth);
   const double measured = cell_depth(grids, slot, seen.row, seen.column);
   std::uint32_t evidence = measured > 0.0 && std::fabs(seen.depth - measured) < margin ? kSame : 0u;
-  const double nearest = nearest_around(
-      grids, seen.row, seen.column, [&](std::int64_t r, std::int64_t c) { return cell_depth(grids, slot, r, c); });
+  const double nearest = nearest_around(grids, seen.row, seen.column,
+                                        [&](std::int64_t r, std::int64_t c) { return cell_depth(grids, slot, r, c); });
   if (nearest > 0.0 && seen.depth < nearest - margin) evidence |= kFree;
   return evidence;
 }
@@ -99,7 +99,9 @@ SPS_INLINE std::int64_t gone_before(const DepthGrids& grids, std::int64_t i, con
 }
 
 // Whether the evidence says that a cell moves.
-SPS_INLINE bool seems_moving(std::uint32_t evidence) { return (evidence & kFree) || (evidence & (kGone | kSame)) == kGone; }
+SPS_INLINE bool seems_moving(std::uint32_t evidence) {
+  return (evidence & kFree) || (evidence & (kGone | kSame)) == kGone;
+}
 
 // Whether a cell seems to move, as do more than half of it and those around it.
 SPS_INLINE bool is_moving(const DepthGrids& grids, const std::uint32_t* evidence, std::int64_t cell) {

@@ -55,8 +55,8 @@ struct FrameSamples {
 // it is where the share of cells that move is not between least and most, or fewer than `fewest` records are left.
 // `places` [2 num_records + 1] is scratch.
 template <class Device>
-void leave_out_moving(Device device, const FrameSamples& samples, const std::uint8_t* cells,
-                      const std::int32_t* counts, std::int32_t* places, std::int32_t* records, float* normals,
-                      std::uint16_t* depth, std::uint16_t* thumbnail);
+void leave_out_moving(Device device, const FrameSamples& samples, const std::uint8_t* cells, const std::int32_t* counts,
+                      std::int32_t* places, std::int32_t* records, float* normals, std::uint16_t* depth,
+                      std::uint16_t* thumbnail);
 
 }  // namespace spslam
