@@ -180,7 +180,7 @@ class FramePipeline:
             loops = self._take_up_ready(number)
         events.finished = self._record()
         report = frame_report(self.state, frame, pixels, tracked, iterations, loops)
-        return PendingReport(report, events, frame.wait_ms, loss, pose)
+        return PendingReport(report, events, frame.wait_ms, loss, pose, static.found)
 
     @property
     def mapping_left(self) -> int:

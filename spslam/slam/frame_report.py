@@ -40,6 +40,7 @@ class FrameReport:
         voxels: allocated vertices.
         decode_ms: reading, decoding and sampling the frame, on a thread and ahead of need.
         loss: total loss of the last mapping iteration; None where there was none.
+        moving_share: share of the surface in view that moves; None where the frame was not looked at for that.
         upload_ms: copying it to the device, beside other work; 0 on the CPU.
         wait_ms: time in which the device was idle because the frame had not been read yet.
         tracking_ms: finding its pose.
@@ -65,6 +66,7 @@ class FrameReport:
     voxels: int
     decode_ms: float
     loss: float | None = None
+    moving_share: float | None = None
     upload_ms: float = 0.0
     wait_ms: float = 0.0
     tracking_ms: float = 0.0
@@ -140,6 +142,7 @@ class PendingReport:
         host_wait_ms: how long the host waited for the frame to be read.
         loss: float32 [] in page-locked memory, on its way there; None where there is none.
         pose: seven numbers of T_world_camera, or float32 [7] on its way as the loss; None where the frame is lost.
+        moving: int32 [2] on its way as the loss, cells that move and all with depth; None where nobody looked.
     """
 
     report: FrameReport
@@ -147,6 +150,7 @@ class PendingReport:
     host_wait_ms: float
     loss: torch.Tensor | None
     pose: Sequence[float] | torch.Tensor | None = None
+    moving: torch.Tensor | None = None
 
     def is_done(self) -> bool:
         """Whether `result()` would return at once."""
@@ -158,7 +162,9 @@ class PendingReport:
         loss = None if self.loss is None else float(self.loss)
         numbers = self.pose.tolist() if isinstance(self.pose, torch.Tensor) else self.pose
         pose = None if numbers is None else pose7_to_matrix(np.array(numbers))
-        times: dict[str, Any] = {**self.events.times_ms(self.host_wait_ms)}
+        moving = None if self.moving is None else self.moving.tolist()
+        share = None if moving is None else moving[0] / max(moving[1], 1)
+        times: dict[str, Any] = {**self.events.times_ms(self.host_wait_ms), "moving_share": share}
         return FrameReport(**{**vars(self.report), "loss": loss, "pose": pose, **times})
 
 

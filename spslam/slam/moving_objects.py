@@ -52,11 +52,13 @@ class StaticFrame(NamedTuple):
         features: of the frame as it was read; their pixels are those that do not move.
         start: float32 [7], where most of the image says that the camera is; None where nobody asked, or none does.
         is_watched: whether something has moved of late.
+        found: int32 [2] how many cells move, and how many have depth, on its way to the CPU; None where nobody looked.
     """
 
     features: FrameFeatures
     start: torch.Tensor | None = None
     is_watched: bool = False
+    found: torch.Tensor | None = None
 
 
 class MovingObjects:
@@ -117,8 +119,9 @@ class MovingObjects:
         coming = fetch(counts)
         self._coming = event_recorder(counts.device)(), coming
         if not is_watched:
-            return StaticFrame(features)
-        return StaticFrame(features.having(self._left_out(features, known.step, cells, counts)), start, True)
+            return StaticFrame(features, found=coming)
+        left = features.having(self._left_out(features, known.step, cells, counts))
+        return StaticFrame(left, start, is_watched=True, found=coming)
 
     def keep(
         self, state: SlamState, read: FramePixels, static: StaticFrame, tracked: TrackedFrame, copies: RowCopies

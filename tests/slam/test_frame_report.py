@@ -76,11 +76,11 @@ REPORT = FrameReport(
 
 def test_a_report_is_done_with_the_last_event_of_the_frame():
     events = mapped_frame(finished=At(22, passed=False))
-    pending = PendingReport(REPORT, events, 0.0, torch.tensor(0.25))
+    pending = PendingReport(REPORT, events, 0.0, torch.tensor(0.25), moving=torch.tensor([3, 60]))
     assert not pending.is_done()
     report = pending.result()
     assert events.finished.waited
-    assert (report.frame, report.loss, report.mapping_ms) == (3, 0.25, 4)
+    assert (report.frame, report.loss, report.moving_share, report.mapping_ms) == (3, 0.25, 0.05, 4)
 
 
 def test_a_log_row_is_flat_and_without_nan():
