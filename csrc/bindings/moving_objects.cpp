@@ -23,6 +23,8 @@ std::tuple<Tensor, Tensor> find_moving_cells(Tensor depth, Tensor pose, Tensor e
   check_count(kFind, "step", step, 1);
   SPS_CHECK(depth.dim() == 2 && earlier.dim() == 3, kFind, ": depth must have shape [H, W] and earlier [S, h, w]");
   SPS_CHECK(pose.numel() == kPoseSize && noise.numel() >= 2, kFind, ": pose must have shape [7] and noise [2]");
+  SPS_CHECK(poses.dim() == 2 && poses.size(1) == kPoseSize, kFind, ": poses must have shape [F, 7]");
+  SPS_CHECK(earlier.size(1) >= 1 && earlier.size(2) >= 1, kFind, ": earlier must have cells");
   const std::int64_t num_earlier = static_cast<std::int64_t>(rows.size()) / 2;
   SPS_CHECK(num_earlier <= kMaxEarlierGrids, kFind, ": too many earlier frames");
   DeviceScope scope(depth);
@@ -66,7 +68,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> leave_out_moving(Tensor records, Tens
             kLeaveOut, ": records and normals must have shape [P, 3]");
   SPS_CHECK(depth.dim() == 2 && thumbnail.dim() == 2 && cells.dim() == 2 && counts.numel() == 2, kLeaveOut,
             ": depth, thumbnail and cells must have two dimensions, and counts [2]");
+  SPS_CHECK(records.size(0) >= 1 && cells.size(0) >= 1 && cells.size(1) >= 1, kLeaveOut,
+            ": there must be records and cells");
+  SPS_CHECK(thumbnail.scalar_type() == ScalarType::Half, kLeaveOut, ": thumbnail must be float16");
   DeviceScope scope(records);
+  counts = as_contiguous(counts);
   records = as_contiguous(records), normals = as_contiguous(normals), depth = as_contiguous(depth);
   thumbnail = as_contiguous(thumbnail), cells = as_contiguous(cells);
   FrameSamples samples{};

@@ -11,6 +11,8 @@ from spslam.slam.depth_keyframes import depth_image_shape
 from spslam.slam.row_copies import RowCopies, write_rows
 
 UNPREDICTED = (0.02, 0.02)  # m and radians, by which a camera of which nothing is known may be off its prediction
+MOST_OFF = (0.1, 0.1)
+WATCHED_S = 2.0  # what was seen longer ago says nothing
 FADES = 0.7  # of that, from frame to frame
 COLUMNS = 80  # of cells, at most
 SLOTS = 10  # frames
@@ -68,13 +70,15 @@ class DepthHistory:
         return True
 
     def predicted(self, off_m: float, off_rad: float) -> None:
-        """Takes account of by how much a frame's predicted pose was off."""
+        """Takes account of by how much a frame's predicted pose was off; a jump says no more than `MOST_OFF`."""
         before = (FADES * each for each in self.off)
-        self.off = tuple(max(pair) for pair in zip((off_m, off_rad), before, strict=True))
+        off = (min(pair) for pair in zip((off_m, off_rad), MOST_OFF, strict=True))
+        self.off = tuple(max(pair) for pair in zip(off, before, strict=True))
 
-    def known(self, is_lost: Callable[[int], bool]) -> list[tuple[int, int]]:
-        """Slot and number of each frame with a trusted pose."""
-        return [(slot, frame) for slot, frame in enumerate(self.frames) if frame >= 0 and not is_lost(frame)]
+    def known(self, is_lost: Callable[[int], bool], seconds_since: Callable[[int], float]) -> list[tuple[int, int]]:
+        """Slot and number of each frame with a trusted pose that is at most `WATCHED_S` old."""
+        kept = [(slot, frame) for slot, frame in enumerate(self.frames) if frame >= 0 and not is_lost(frame)]
+        return [(slot, frame) for slot, frame in kept if seconds_since(frame) <= WATCHED_S]
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All that a checkpoint needs."""

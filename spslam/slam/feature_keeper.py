@@ -5,7 +5,7 @@ from __future__ import annotations
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.slam.feature_store import keeps_features
+from spslam.slam.feature_store import keeps_features, uses_features
 from spslam.slam.image_features import FrameFeatures, ImageFeatures
 from spslam.slam.moving_objects import StaticFrame
 from spslam.slam.pixels import FramePixels
@@ -56,8 +56,8 @@ class FeatureKeeper:
         if tracked.occluded or state.frames.is_lost(-1):
             return
         read, number, history = static.features, len(state.frames) - 1, state.depth_history
-        features = self._wanted(state, frame, read) if tracked.features is None else tracked.features
-        if static.is_watched and history is not None and number in history.frames:
+        features = self._wanted(state, frame, static) if tracked.features is None else tracked.features
+        if static.is_watched and history is not None and number in history.frames and uses_features(self._config):
             features = read.extracted  # poses of the next frames are predicted by them
         if features is not None and shutter is not None:
             features = self._rectifier.features(features, shutter)
@@ -73,10 +73,11 @@ class FeatureKeeper:
         """Whether those of the next frames will probably be asked for: those of a recent one were, or nearly."""
         return self._since_asked < EXPECTED_FRAMES
 
-    def _wanted(self, state: SlamState, frame: PreparedFrame, read: FrameFeatures) -> ImageFeatures | None:
+    def _wanted(self, state: SlamState, frame: PreparedFrame, static: StaticFrame) -> ImageFeatures | None:
         """Of a frame that nobody doubted; those that are due and were not extracted ahead are extracted now."""
         if frame.features is None and not keeps_features(self._config, state.frames.processed - 1):
             return None
         if state.has_enough_features(len(state.frames) - 1):
             return None
-        return read.extracted if frame.features is None else frame.features
+        # Those that were extracted ahead are of what moves, too.
+        return static.features.extracted if frame.features is None or static.is_watched else frame.features

@@ -337,7 +337,7 @@ class FramePipeline:
         state.pixels.add(pixels.records[:0] if tracked.occluded else pixels.records, copies)
         is_known = not tracked.occluded and not tracked.lost
         if state.newest is not None and is_known:
-            state.newest.replace(number, static.features, shutter, copies)
+            state.newest.replace(number, static.features.whole, shutter, copies)
         self._moving.keep(state, read, static, tracked, copies)
         if state.depth_keyframes is not None and is_known:
             if constraints.depth_keyframes is not None:

@@ -52,7 +52,7 @@ class ImageFeatures:
 
     def where_known(self, depth: np.ndarray) -> "ImageFeatures":
         """Without those with a depth that an image [h, w] of the same size does not have."""
-        columns, rows = np.rint(self.positions).astype(np.int64).T
+        columns, rows = np.floor(self.positions + 0.5).astype(np.int64).T
         rows, columns = np.clip(rows, 0, len(depth) - 1), np.clip(columns, 0, depth.shape[1] - 1)
         kept = (self.points[:, 2] == 0) | (depth[rows, columns] > 0)
         beyond_m = None if self.beyond_m is None else self.beyond_m[kept]
@@ -85,6 +85,11 @@ class FrameFeatures:
         less = FrameFeatures(self.pixels.having(**views), self._camera, self._max_depth_m)
         less._whole = self
         return less
+
+    @property
+    def whole(self) -> "FrameFeatures":
+        """The same of the pixels as they were read, with nothing left out."""
+        return self if self._whole is None else self._whole
 
     @cached_property
     def extracted(self) -> ImageFeatures:

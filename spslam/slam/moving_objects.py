@@ -16,7 +16,7 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.config import Config
-from spslam.slam.depth_history import DepthHistory
+from spslam.slam.depth_history import WATCHED_S, DepthHistory
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.feature_store import uses_features
@@ -37,9 +37,8 @@ NOTICED = 0.01  # share of the cells with depth; fewer are noise at edges
 # it was predicted.
 LEAST, MOST = 0.02, 0.5
 FEWEST_PIXELS = 100  # that must remain
-WATCHED_S = 2.0  # after something has moved, frames are watched closely
 WATCHED_EVERY = 3  # frames; of those in which nothing has moved
-# The camera is predicted by features of frames of about these ages, s, with at most `WATCHED_S`, if so many agree with
+# The camera is predicted by features of frames of about these ages, s, at most `WATCHED_S`, if so many agree with
 # one pose, and that share of all that match.
 AGES_S = (0.33, 0.83, 1.67)
 MIN_AGREEING, MIN_AGREEING_SHARE = 40, 0.4
@@ -99,10 +98,12 @@ class MovingObjects:
         self._note(known)
         number = len(state.frames)
         is_watched = known.moving >= 0 and 0 <= history.seconds_since(known.moving) <= WATCHED_S
-        earlier = known.known(state.frames.is_lost)
+        earlier = known.known(state.frames.is_lost, history.seconds_since)
         if not earlier or not (is_watched or number % WATCHED_EVERY == 0):
             return StaticFrame(features)
-        start = self._by_features(history, features) if is_watched and self._uses_features else None
+        start = (
+            self._by_features(state.frames.opened, history, features) if is_watched and self._uses_features else None
+        )
         predicted = self._tracker.predict(state.frames, history.steps) if start is None else start
         off_m, off_rad = known.off if start is None else (0.0, 0.0)
         margin_m = MARGIN_M + TIMES_OFF * off_m
@@ -168,15 +169,16 @@ class MovingObjects:
         )
         return dict(zip(names, tensors, strict=True))
 
-    def _by_features(self, history: FrameHistory, features: FrameFeatures) -> torch.Tensor | None:
-        """Pose float32 [7] that most features agree on with frames of the last two seconds; None where too few do."""
-        rows = self._anchors(history)
+    def _by_features(self, first: int, history: FrameHistory, features: FrameFeatures) -> torch.Tensor | None:
+        """Pose float32 [7] that most features agree on with frames of the last two seconds, from number `first` on;
+        None where too few do."""
+        rows = self._anchors(first, history)
         known = {row: kept for row in rows if (kept := history.features(row)) is not None and len(kept)}
         if not known:
             return None
         image = FeatureAlignment(features.extracted, self._camera, device=history.poses.device)
         poses = history.color_poses(list(known), is_timed=False)
-        matches = joined_too(image.matches_with(list(zip(known.values(), poses, strict=True))))[-1]
+        matches = max(joined_too(image.matches_with(list(zip(known.values(), poses, strict=True)))), key=len)
         pose = image.pose(matches, history.poses.device) if len(matches) >= MIN_AGREEING else None
         if pose is None:
             return None
@@ -184,8 +186,8 @@ class MovingObjects:
         return pose if agreeing >= max(MIN_AGREEING, MIN_AGREEING_SHARE * matched) else None
 
     @staticmethod
-    def _anchors(history: FrameHistory) -> list[int]:
-        """Rows of the frames with image features whose ages are nearest to `AGES_S`."""
-        ages = {row: history.seconds_since(row) for row in history.feature_rows()[-60:]}
+    def _anchors(first: int, history: FrameHistory) -> list[int]:
+        """Rows, from `first` on, of the frames with image features whose ages are nearest to `AGES_S`."""
+        ages = {row: history.seconds_since(row) for row in history.feature_rows()[-60:] if row >= first}
         ages = {row: age for row, age in ages.items() if 0.5 * AGES_S[0] <= age <= WATCHED_S}
         return sorted({min(ages, key=lambda row: abs(ages[row] - wanted)) for wanted in AGES_S}) if ages else []

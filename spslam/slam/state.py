@@ -178,7 +178,7 @@ class SlamState:
         depth_keyframes = None
         if tracking.depth_keyframes:
             depth_keyframes = DepthKeyframeStore(camera, depth_m, tracking.depth_keyframe_kernel_m, device)
-        depth_history = DepthHistory(camera, device) if tracking.moving_objects else None
+        depth_history = DepthHistory(camera, device) if tracking.moving_objects and tracking.depth_keyframes else None
         noise = SensorNoiseEstimate(camera, tracking.depth_noise_m, device)
         graph = None
         if config.graph.enabled and config.prior.enabled:

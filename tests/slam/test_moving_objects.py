@@ -1,5 +1,7 @@
 """What moves before a camera: cells by the definition and by the op, what is left out of a frame, whole runs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -9,10 +11,10 @@ from spslam.config import load_config
 from spslam.datasets.places import Capture, PlacesDataset
 from spslam.geometry import inverse, pose7_to_matrix
 from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapshot
-from spslam.slam.depth_history import DepthHistory
+from spslam.slam.depth_history import FADES, MOST_OFF, DepthHistory
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.image_features import ImageFeatures
-from spslam.slam.moving_objects import DEVIATIONS, FEWEST_PIXELS, MARGIN_M
+from spslam.slam.moving_objects import DEVIATIONS, FEWEST_PIXELS, MARGIN_M, MovingObjects
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
 from spslam.slam.poses import pose_tensor
 from spslam.slam.system import SlamSystem
@@ -219,6 +221,8 @@ def test_opcheck(walked, frames, device):
         (0, 0, lambda depth: depth[:100]),
         (0, 1, lambda pose: pose[:6]),
         (0, 2, lambda earlier: earlier[0]),
+        (0, 2, lambda earlier: earlier[:, :0]),
+        (0, 3, lambda poses: poses[:, :6].contiguous()),
         (0, 4, lambda noise: noise[:1]),
         (0, 5, lambda scalars: scalars[1:]),
         (0, 6, lambda step: 0),
@@ -228,7 +232,10 @@ def test_opcheck(walked, frames, device):
         (1, 0, lambda records: records[:, :2]),
         (1, 1, lambda normals: normals[1:]),
         (1, 2, lambda depth: depth[0]),
+        (1, 0, lambda records: records[:0]),
+        (1, 3, lambda thumbnail: thumbnail.float()),
         (1, 4, lambda cells: cells[0]),
+        (1, 4, lambda cells: cells[:0]),
         (1, 5, lambda counts: counts[:1]),
         (1, 6, lambda scalars: scalars[1:]),
         (1, 7, lambda integers: [1, 16, 0, 100]),
@@ -250,7 +257,43 @@ def test_history_keeps_a_frame_now_and_then(walked):
     ]
     assert kept == list(range(0, 60, 5))
     assert sorted(history.frames) == kept[-10:]
-    assert history.known(lambda frame: frame == 20) == [(s, f) for s, f in enumerate(history.frames) if f != 20]
+    assert history.known(lambda frame: frame == 20, lambda frame: (60 - frame) / 30) == [
+        (slot, frame) for slot, frame in enumerate(history.frames) if frame not in (20,)
+    ]
+    assert history.known(lambda frame: False, lambda frame: 2.01 if frame < 50 else 1.0) == [
+        (history.frames.index(frame), frame)
+        for frame in sorted(history.frames, key=history.frames.index)
+        if frame >= 50
+    ]
+
+
+def test_a_jump_does_not_hide_what_moves(walked):
+    history = DepthHistory(walked.camera)
+    history.predicted(2.0, 1.5)
+    assert history.off == MOST_OFF
+    history.predicted(0.001, 0.002)
+    np.testing.assert_allclose(history.off, (FADES * 0.1, FADES * 0.1))
+
+
+def test_anchors_are_of_the_recording_alone():
+    times = {0: 1.7, 5: 0.3, 12: 0.9, 20: 1.6, 25: 0.35, 28: 0.1}
+    history = SimpleNamespace(feature_rows=lambda: list(times), seconds_since=times.get)
+    assert MovingObjects._anchors(0, history) == [0, 12, 25]
+    assert MovingObjects._anchors(10, history) == [12, 20, 25]
+    assert MovingObjects._anchors(26, history) == []
+
+
+def test_without_image_features_none_are_kept(walked):
+    config = load_config("places", overrides=["device=cpu", "tracking.features=false", "mapping.first_iterations=20"])
+    system = SlamSystem(config, walked.camera)
+    shares = [system.process(frame).moving_share for frame in walked]
+    assert max(share for share in shares if share is not None) > 0.05
+    assert system.state.features.frames == []
+
+
+def test_without_depth_keyframes_nothing_is_looked_for(walked):
+    config = load_config("places", overrides=["device=cpu", "tracking.depth_keyframes=false"])
+    assert SlamSystem(config, walked.camera).state.depth_history is None
 
 
 def test_features_of_what_is_left_out_go():
@@ -294,3 +337,19 @@ def test_a_checkpoint_keeps_what_was_found(walked, tmp_path):
     for index in range(stop, len(walked)):
         np.testing.assert_array_equal(second.process(walked[index]).pose, poses[index])
     assert second.state.depth_history.moving == whole.state.depth_history.moving > stop
+
+
+def test_a_checkpoint_has_the_features_of_a_frame_that_was_watched(walked, tmp_path):
+    config = load_config("places", overrides=["device=cpu", "mapping.first_iterations=20"])
+    first, second = (SlamSystem(config, walked.camera) for _ in range(2))
+    for frame in walked:
+        first.process(frame)
+    assert first.state.depth_history.moving > len(walked) - 10
+    path = tmp_path / "checkpoint.safetensors"
+    source = {"data": {"frames": 60}, "next": 60, "clock": {"frames": 60, "wall_s": 1.0, "decode_s": 0.1}}
+    write_snapshot(path, take_snapshot(first.state, config, source, copy=False))
+    load_checkpoint(path, second.state, config)
+    here, there = (system.state.newest.features() for system in (first, second))
+    np.testing.assert_array_equal(here.descriptors, there.descriptors)
+    np.testing.assert_array_equal(here.points, there.points)
+    np.testing.assert_array_equal(here.beyond_m, there.beyond_m)
