@@ -163,6 +163,7 @@ class FramePipeline:
         if not begins_map:
             constraints = self.constraints.gather(self.history, read, frame.depth_time, frame.offsets.color)
         tracked, shutter, pixels = self._track(frame, static, constraints, number, events)
+        tracked = self._moving.judged(static, tracked)
         if not begins_map:
             self._tell(on_pose, tracked, tracked.lost)
         self._store(frame, pixels, constraints, tracked, static, shutter, read)

@@ -8,6 +8,7 @@ wrong by which that is judged. So while anything moves, the camera is predicted 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,11 +38,13 @@ NOTICED = 0.01  # share of the cells with depth; fewer are noise at edges
 # it was predicted.
 LEAST, MOST = 0.02, 0.5
 FEWEST_PIXELS = 100  # that must remain
+MOST_MAPPED = 0.3  # where more moves, some of it may not be known to, and the frame is not mapped
 WATCHED_EVERY = 3  # frames; of those in which nothing has moved
 # The camera is predicted by features of frames of about these ages, s, at most `WATCHED_S`, if so many agree with
 # one pose, and that share of all that match.
 AGES_S = (0.33, 0.83, 1.67)
 MIN_AGREEING, MIN_AGREEING_SHARE = 40, 0.4
+MORE_AGREEING = 1.25  # times as many as with the pose that motion predicts
 
 
 class StaticFrame(NamedTuple):
@@ -101,15 +104,14 @@ class MovingObjects:
         earlier = known.known(state.frames.is_lost, history.seconds_since)
         if not earlier or not (is_watched or number % WATCHED_EVERY == 0):
             return StaticFrame(features)
-        start = (
-            self._by_features(state.frames.opened, history, features) if is_watched and self._uses_features else None
-        )
-        predicted = self._tracker.predict(state.frames, history.steps) if start is None else start
+        predicted, start = self._tracker.predict(state.frames, history.steps), None
+        if is_watched and self._uses_features:
+            start = self._by_features(state.frames.opened, history, features, predicted)
         off_m, off_rad = known.off if start is None else (0.0, 0.0)
         margin_m = MARGIN_M + TIMES_OFF * off_m
         cells, counts = ops.comparison.find_moving_cells(
             features.pixels.depth_image,
-            predicted,
+            predicted if start is None else start,
             (known.cells, state.frames.pose_rows, earlier),
             history.noise,
             ops.comparison.DepthCells(
@@ -123,6 +125,14 @@ class MovingObjects:
             return StaticFrame(features, found=coming)
         left = features.having(self._left_out(features, known.step, cells, counts))
         return StaticFrame(left, start, is_watched=True, found=coming)
+
+    def judged(self, static: StaticFrame, tracked: TrackedFrame) -> TrackedFrame:
+        """What tracking made of a frame, occluded where too much of it moves; the device looked before it tracked."""
+        if static.found is None or self._coming is None or tracked.occluded:
+            return tracked
+        self._coming[0].wait()
+        moving, known = static.found.tolist()
+        return replace(tracked, occluded=True) if moving > MOST_MAPPED * known else tracked
 
     def keep(
         self, state: SlamState, read: FramePixels, static: StaticFrame, tracked: TrackedFrame, copies: RowCopies
@@ -169,9 +179,11 @@ class MovingObjects:
         )
         return dict(zip(names, tensors, strict=True))
 
-    def _by_features(self, first: int, history: FrameHistory, features: FrameFeatures) -> torch.Tensor | None:
+    def _by_features(
+        self, first: int, history: FrameHistory, features: FrameFeatures, predicted: torch.Tensor
+    ) -> torch.Tensor | None:
         """Pose float32 [7] that most features agree on with frames of the last two seconds, from number `first` on;
-        None where too few do."""
+        None where too few do, or nearly as many with the one that motion predicts."""
         rows = self._anchors(first, history)
         known = {row: kept for row in rows if (kept := history.features(row)) is not None and len(kept)}
         if not known:
@@ -182,8 +194,9 @@ class MovingObjects:
         pose = image.pose(matches, history.poses.device) if len(matches) >= MIN_AGREEING else None
         if pose is None:
             return None
-        agreeing, matched = image.inliers(matches, image.color_pose(pose)), len(np.unique(matches.rows))
-        return pose if agreeing >= max(MIN_AGREEING, MIN_AGREEING_SHARE * matched) else None
+        agreeing, of_motion = (image.inliers(matches, image.color_pose(each)) for each in (pose, predicted))
+        least = max(MIN_AGREEING, MIN_AGREEING_SHARE * len(np.unique(matches.rows)), MORE_AGREEING * of_motion)
+        return pose if agreeing >= least else None
 
     @staticmethod
     def _anchors(first: int, history: FrameHistory) -> list[int]:
