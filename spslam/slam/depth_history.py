@@ -10,10 +10,10 @@ from spslam.camera import Camera
 from spslam.slam.depth_keyframes import depth_image_shape
 from spslam.slam.row_copies import RowCopies, write_rows
 
-UNPREDICTED = (0.02, 0.02)  # m and radians, by which a camera of which nothing is known may be off its prediction
-MOST_OFF = (0.1, 0.1)
 WATCHED_S = 2.0  # what was seen longer ago says nothing
-FADES = 0.7  # of that, from frame to frame
+# By how much a camera may be off its prediction, m and radians: where nothing is known, and at most; and the share of
+# it that is left a frame later.
+UNPREDICTED, MOST_OFF, FADES = (0.02, 0.02), (0.1, 0.1), 0.7
 COLUMNS = 80  # of cells, at most
 SLOTS = 10  # frames
 INTERVAL_S = 1 / 6  # between two of them

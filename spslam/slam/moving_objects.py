@@ -30,8 +30,8 @@ from spslam.slam.row_copies import RowCopies
 from spslam.slam.state import SlamState
 from spslam.slam.tracker import Tracker
 
-# Depths differ if they do by more than this, so many deviations of depth, and so many times what the prediction of the
-# camera was off of late; features are off by less.
+# Depths differ if they do by more than this, so many deviations of depth, and so many times what the motion model's
+# prediction was off of late, where the camera is predicted by that.
 MARGIN_M, DEVIATIONS, TIMES_OFF = 0.02, 4.0, 2.0
 NOTICED = 0.01  # share of the cells with depth; fewer are noise at edges
 # Where the share is between these, the pixels are left out. Most of the image moves only where the camera is not where
@@ -127,8 +127,11 @@ class MovingObjects:
         return StaticFrame(left, start, is_watched=True, found=coming)
 
     def judged(self, static: StaticFrame, tracked: TrackedFrame) -> TrackedFrame:
-        """What tracking made of a frame, occluded where too much of it moves; the device looked before it tracked."""
-        if static.found is None or self._coming is None or tracked.occluded:
+        """What tracking made of a frame, occluded where too much of it moves; the device looked before it tracked.
+
+        A frame that was recovered is elsewhere than it was looked at from.
+        """
+        if static.found is None or self._coming is None or tracked.occluded or tracked.recovered:
             return tracked
         self._coming[0].wait()
         moving, known = static.found.tolist()

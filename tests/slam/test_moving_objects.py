@@ -1,5 +1,6 @@
 """What moves before a camera: cells by the definition and by the op, what is left out of a frame, whole runs."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,10 +14,12 @@ from spslam.geometry import inverse, pose7_to_matrix
 from spslam.slam.checkpoint import load_checkpoint, take_snapshot, write_snapshot
 from spslam.slam.depth_history import FADES, MOST_OFF, DepthHistory
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
+from spslam.slam.device_events import HostEvent
 from spslam.slam.image_features import ImageFeatures
-from spslam.slam.moving_objects import DEVIATIONS, FEWEST_PIXELS, MARGIN_M, MovingObjects
+from spslam.slam.moving_objects import DEVIATIONS, FEWEST_PIXELS, MARGIN_M, MovingObjects, StaticFrame
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
 from spslam.slam.poses import pose_tensor
+from spslam.slam.recovery.tracked_frame import TrackedFrame
 from spslam.slam.system import SlamSystem
 from tests.ops.arguments import opcheck
 from tests.system.sequences import settings
@@ -273,6 +276,18 @@ def test_a_jump_does_not_hide_what_moves(walked):
     assert history.off == MOST_OFF
     history.predicted(0.001, 0.002)
     np.testing.assert_allclose(history.off, (FADES * 0.1, FADES * 0.1))
+
+
+@pytest.mark.parametrize(
+    ("counts", "is_recovered", "is_occluded"),
+    [([31, 100], False, True), ([30, 100], False, False), ([31, 100], True, False), ([0, 0], False, False)],
+)
+def test_a_frame_of_which_much_moves_is_not_mapped(walked, counts, is_recovered, is_occluded):
+    moving = SlamSystem(load_config("places", overrides=["device=cpu"]), walked.camera)._moving
+    found = torch.tensor(counts, dtype=torch.int32)
+    moving._coming = HostEvent(), found
+    tracked = replace(TrackedFrame.untracked(torch.zeros(7), lost=False), recovered=is_recovered)
+    assert moving.judged(StaticFrame(None, found=found), tracked).occluded == is_occluded
 
 
 def test_anchors_are_of_the_recording_alone():
