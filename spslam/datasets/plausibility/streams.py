@@ -40,6 +40,8 @@ _BLANK_LEVELS = 3.0
 _STEPS_S = (0.001, 5.0)
 _USUAL_STEP_S = 1 / 30
 _UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9), ("minutes", 60.0), ("hours", 3600.0))
+# A row of a thumbnail is as dark at least for the contrast in it.
+_DARK_LEVELS = 8.0
 # A view fits better after an earlier one: correlation distances of thumbnails.
 _MUCH_NEARER, _FAR_STEPS = 0.5, 1.5
 _THUMBNAIL = (32, 24)
@@ -241,11 +243,15 @@ def _share_apart(distances: np.ndarray) -> float:
 
 
 def _distances(views: Sequence[View]) -> np.ndarray:
-    """1 - correlation of thumbnails, [F, F]."""
+    """1 - correlation of thumbnails, [F, F].
+
+    Their rows are of the same brightness: light that flickers with the mains leaves bands, elsewhere in each image.
+    """
     rows = []
     for view in views:
         small = cv2.resize(cv2.GaussianBlur(view.gray, (0, 0), 3), _THUMBNAIL, interpolation=cv2.INTER_AREA)
-        row = small.astype(np.float64).ravel() - small.mean()
+        of_rows = small.mean(axis=1, keepdims=True)
+        row = ((small - of_rows) / np.maximum(of_rows, _DARK_LEVELS)).ravel()
         rows.append(row / max(float(np.linalg.norm(row)), 1e-6))
     table = np.stack(rows)
     return 1 - table @ table.T
