@@ -166,7 +166,7 @@ class FramePipeline:
         tracked = self._moving.judged(static, tracked)
         if not begins_map:
             self._tell(on_pose, tracked, tracked.lost)
-        self._store(frame, pixels, constraints, tracked, static, shutter, read)
+        moving = self._store(frame, pixels, constraints, tracked, static, shutter, read)
         is_mapped = self._integrate(pixels, tracked, number, events)
         if begins_map:
             self._tell(on_pose, tracked, self.state.frames.is_lost(-1))
@@ -181,7 +181,7 @@ class FramePipeline:
             loops = self._take_up_ready(number)
         events.finished = self._record()
         report = frame_report(self.state, frame, pixels, tracked, iterations, loops)
-        return PendingReport(report, events, frame.wait_ms, loss, pose, static.found)
+        return PendingReport(report, events, frame.wait_ms, loss, pose, moving)
 
     @property
     def mapping_left(self) -> int:
@@ -320,8 +320,8 @@ class FramePipeline:
         static: StaticFrame,
         shutter: ops.ShutterMotion | None,
         read: FramePixels,
-    ) -> None:
-        """Adds the frame to the state, without the pixels of an occluded frame, so that mapping never uses them."""
+    ) -> torch.Tensor | None:
+        """Adds the frame to the state, without the pixels of an occluded one; returns `PendingReport.moving`."""
         state, number, copies = self.state, len(self.state.frames), RowCopies()
         state.pixels.make_room()  # the one thing here that may fail: then nothing of the frame is stored
         state.frames.append(
@@ -339,12 +339,13 @@ class FramePipeline:
         is_known = not tracked.occluded and not tracked.lost
         if state.newest is not None and is_known:
             state.newest.replace(number, static.features.whole, shutter, copies)
-        self._moving.keep(state, read, static, tracked, copies)
+        moving = self._moving.keep(state, self.history, read, static, tracked, copies)
         if state.depth_keyframes is not None and is_known:
             if constraints.depth_keyframes is not None:
                 state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes, tracked.gain)
             state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image, copies)
         copies.make()
+        return moving
 
     def _integrate(self, pixels: FramePixels, tracked: TrackedFrame, number: int, events: FrameEvents) -> bool:
         """Encodes the newest frame if it is its turn; returns whether the map is to be optimized next."""

@@ -1,8 +1,10 @@
 """What moves before the camera, such as people, is left out of a frame, and does not lead the camera along.
 
 A pixel moves if frames of the last two seconds saw free space where its surface is, or if it lies behind surface that
-they saw and that is gone (`ops.comparison.find_moving_cells`). Something large may lead tracking along; then poses are
-wrong by which that is judged. So while anything moves, the camera is predicted by what most image features agree on.
+they saw and that is gone (`ops.comparison.find_moving_cells`). That is looked for where frames were tracked, as where
+they were predicted surface of a camera that shakes seems to move. Something large may lead tracking along; then poses
+are wrong by which that is judged. So while anything moves, the camera is predicted by what most image features agree
+on, and what moves is found before the frame is tracked.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.feature_store import uses_features
 from spslam.slam.frame_history import FrameHistory
+from spslam.slam.frame_table import FrameTable
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, FramePixels
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, joined_too
@@ -45,6 +48,7 @@ WATCHED_EVERY = 3  # frames; of those in which nothing has moved
 AGES_S = (0.33, 0.83, 1.67)
 MIN_AGREEING, MIN_AGREEING_SHARE = 40, 0.4
 MORE_AGREEING = 1.25  # times as many as with the pose that motion predicts
+NOT_OFF = (0.0, 0.0)
 
 
 class StaticFrame(NamedTuple):
@@ -66,8 +70,8 @@ class StaticFrame(NamedTuple):
 class MovingObjects:
     """Finds what moves in one frame after the other.
 
-    What was found in a frame is read when the next one comes, so that the host does not wait for the device. Till then
-    the state has it, as a checkpoint may come between.
+    What was found in a tracked frame is read when the next one was tracked too, so that the host does not wait for the
+    device. Till then the state has it, as a checkpoint may come between.
 
     Args:
         config: options of the run.
@@ -91,40 +95,24 @@ class MovingObjects:
         """The next frame without what moves in it.
 
         Args:
-            state: before the frame; when something moved last is noted in it.
+            state: before the frame.
             history: the frames before.
             features: of the frame as it was read.
         """
         known = state.depth_history
         if known is None or history.is_lost or not features.pixels.count:
             return StaticFrame(features)
-        self._note(known)
-        number = len(state.frames)
-        is_watched = known.moving >= 0 and 0 <= history.seconds_since(known.moving) <= WATCHED_S
-        earlier = known.known(state.frames.is_lost, history.seconds_since)
-        if not earlier or not (is_watched or number % WATCHED_EVERY == 0):
+        if not self._is_watched(known, history):
             return StaticFrame(features)
         predicted, start = self._tracker.predict(state.frames, history.steps), None
-        if is_watched and self._uses_features:
+        if self._uses_features:
             start = self._by_features(state.frames.opened, history, features, predicted)
-        off_m, off_rad = known.off if start is None else (0.0, 0.0)
-        margin_m = MARGIN_M + TIMES_OFF * off_m
-        cells, counts = ops.comparison.find_moving_cells(
-            features.pixels.depth_image,
-            predicted if start is None else start,
-            (known.cells, state.frames.pose_rows, earlier),
-            history.noise,
-            ops.comparison.DepthCells(
-                self._intrinsics, self._unit, known.step, margin_m, TIMES_OFF * off_rad, DEVIATIONS
-            ),
-        )
-        known.looked, known.found = number, counts
-        coming = fetch(counts)
-        self._coming = event_recorder(counts.device)(), coming
-        if not is_watched:
-            return StaticFrame(features, found=coming)
-        left = features.having(self._left_out(features, known.step, cells, counts))
-        return StaticFrame(left, start, is_watched=True, found=coming)
+        pose, off = (predicted, known.off) if start is None else (start, NOT_OFF)
+        found = self._look(state.frames, known, history, features.pixels, pose, off)
+        if found is None:
+            return StaticFrame(features, is_watched=True)
+        left = features.having(self._left_out(features, known.step, *found))
+        return StaticFrame(left, start, is_watched=True, found=self._fetched(known, len(state.frames), found[1]))
 
     def judged(self, static: StaticFrame, tracked: TrackedFrame) -> TrackedFrame:
         """What tracking made of a frame, occluded where too much of it moves; the device looked before it tracked.
@@ -138,28 +126,80 @@ class MovingObjects:
         return replace(tracked, occluded=True) if moving > MOST_MAPPED * known else tracked
 
     def keep(
-        self, state: SlamState, read: FramePixels, static: StaticFrame, tracked: TrackedFrame, copies: RowCopies
-    ) -> None:
-        """Keeps what later frames need of the newest one of a state, at a trusted pose.
+        self,
+        state: SlamState,
+        history: FrameHistory,
+        read: FramePixels,
+        static: StaticFrame,
+        tracked: TrackedFrame,
+        copies: RowCopies,
+    ) -> torch.Tensor | None:
+        """Keeps what later frames need of the newest one of a state, at a trusted pose, and looks for what moves.
 
         Args:
             state: after the frame; changed.
+            history: the frames before.
             read: its pixels as they were read.
             static: those that do not move.
             tracked: what tracking made of it.
             copies: what is stored is written when these are made.
+
+        Returns:
+            `StaticFrame.found`, of this look or of that before tracking.
         """
-        number = len(state.frames) - 1
-        if state.depth_history is not None and not tracked.lost:
-            off = tracked.fit.prediction_error_cm / 100, math.radians(tracked.fit.prediction_error_deg)
-            if static.start is None and not math.isnan(sum(off)):
-                state.depth_history.predicted(*off)
-            last = max(state.depth_history.frames)
-            seconds = state.frames.depth_time(number) - state.frames.depth_time(last) if last >= 0 else 0.0
-            state.depth_history.keep(number, seconds, read.depth_image, copies)
+        known, number, counts = state.depth_history, len(state.frames) - 1, static.found
+        if known is None:
+            return None
+        self._note(known)
+        if tracked.lost:
+            return counts
+        off = tracked.fit.prediction_error_cm / 100, math.radians(tracked.fit.prediction_error_deg)
+        if static.start is None and not math.isnan(sum(off)):
+            known.predicted(*off)
+        if not static.is_watched and number % WATCHED_EVERY == 0:
+            found = self._look(state.frames, known, history, read, tracked.pose, NOT_OFF)
+            counts = None if found is None else self._fetched(known, number, found[1])
+        last = max(known.frames)
+        seconds = state.frames.depth_time(number) - state.frames.depth_time(last) if last >= 0 else 0.0
+        known.keep(number, seconds, read.depth_image, copies)
+        return counts
+
+    def _is_watched(self, known: DepthHistory, history: FrameHistory) -> bool:
+        return known.moving >= 0 and 0 <= history.seconds_since(known.moving) <= WATCHED_S
+
+    def _look(
+        self,
+        frames: FrameTable,
+        known: DepthHistory,
+        history: FrameHistory,
+        pixels: FramePixels,
+        pose: torch.Tensor,
+        off: tuple[float, ...],
+    ) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Cells and counts of `ops.comparison.find_moving_cells` for a frame at a pose that may be off by so much, m
+        and radians; None where no earlier frame tells."""
+        earlier = known.known(frames.is_lost, history.seconds_since)
+        if not earlier:
+            return None
+        off_m, off_rad = off
+        margins = MARGIN_M + TIMES_OFF * off_m, TIMES_OFF * off_rad, DEVIATIONS
+        return ops.comparison.find_moving_cells(
+            pixels.depth_image,
+            pose,
+            (known.cells, frames.pose_rows, earlier),
+            history.noise,
+            ops.comparison.DepthCells(self._intrinsics, self._unit, known.step, *margins),
+        )
+
+    def _fetched(self, known: DepthHistory, number: int, counts: torch.Tensor) -> torch.Tensor:
+        """Counts of a look at frame `number` on their way to the CPU; they are noted once the next frame is tracked."""
+        known.looked, known.found = number, counts
+        coming = fetch(counts)
+        self._coming = event_recorder(counts.device)(), coming
+        return coming
 
     def _note(self, known: DepthHistory) -> None:
-        """Reads what was found in an earlier frame; the device has long been done with it."""
+        """Reads what was found before this frame was tracked; the device is done with it."""
         if known.looked < 0:
             return
         found = known.found
