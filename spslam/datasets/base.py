@@ -103,10 +103,12 @@ class RgbdDataset(ABC):
         camera: of all frames.
         depth_range: nearest and farthest depth (m); depth outside comes as 0.
         border_px: depth within so many pixels of the image's border comes as 0.
+        left_out: bool [H, W], pixels whose depth comes as 0, such as those of a robot's own arm; None for none.
         is_registered: whether depth is meant to be registered to color; where it is known not to be, checks of the data
             do not expect it.
         is_random_access: whether each frame is read by itself, so that several processes may share the frames; frames
             of a video, or of a bag, are read best in order.
+        is_seekable: whether frames far apart are read about as fast as others.
         is_timed: whether frames are in order by the recording's own time stamps, not by names of files.
         readers: number of processes that read its frames; 0 where the thread does that asks for one.
         doubts: what opening the recording found doubtful, which a run says as well as a check of the data.
@@ -118,8 +120,10 @@ class RgbdDataset(ABC):
     camera: Camera
     depth_range: tuple[float, float] = (0.0, float("inf"))
     border_px: int = 0
+    left_out: np.ndarray | None = None
     is_registered: bool = True
     is_random_access: bool = False
+    is_seekable: bool = False
     is_timed: bool = False
     readers: int = 0
     doubts: Sequence[Finding] = ()
@@ -193,6 +197,7 @@ class RgbdDataset(ABC):
     def _clear(self, depth: np.ndarray) -> None:
         _clear_depth_outside(depth, *self.depth_range)
         clear_border(depth, self.border_px)
+        clear_left_out(depth, self.left_out)
 
     def _check_sizes(self, frame: RgbdFrame) -> None:
         color, depth = frame.color.shape[:2], frame.depth.shape[:2]
@@ -240,9 +245,10 @@ class Subset(RgbdDataset):
         self.name = dataset.name
         self.camera = dataset.camera
         self.depth_range = dataset.depth_range
-        self.border_px = dataset.border_px
+        self.border_px, self.left_out = dataset.border_px, dataset.left_out
         self.is_registered = dataset.is_registered
-        self.is_random_access, self.is_timed = dataset.is_random_access, dataset.is_timed
+        self.is_random_access, self.is_seekable = dataset.is_random_access, dataset.is_seekable
+        self.is_timed = dataset.is_timed
         self.doubts, self.remarks, self.scale_remedy = dataset.doubts, dataset.remarks, dataset.scale_remedy
 
     def __len__(self) -> int:
@@ -285,6 +291,12 @@ def clear_border(depth: np.ndarray, width: int) -> None:
     if width > 0:
         depth[:width] = depth[-width:] = 0
         depth[:, :width] = depth[:, -width:] = 0
+
+
+def clear_left_out(depth: np.ndarray, left_out: np.ndarray | None) -> None:
+    """Sets depth [H, W] of pixels bool [H, W] to 0, unknown, in place; None for none."""
+    if left_out is not None:
+        np.copyto(depth, 0, where=left_out)
 
 
 def _size(shape: tuple[int, ...]) -> str:

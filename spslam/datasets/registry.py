@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from spslam.datasets.base import RgbdDataset, Subset
+from spslam.datasets.mask import apply_mask
 from spslam.errors import DatasetError
 from spslam.options import DatasetOptions
 
@@ -23,10 +24,11 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
     Args:
         config: any object with the attribute `type` (one of `dataset_types()`) and, each optional or None: `path`,
             `stride` (every n-th frame), `min_depth_m`, `max_depth_m` (depth outside comes as 0), `border_px` (so does
-            depth this close to the image's border), and the options of the kind: `sequence` and `registered` (7scenes),
-            `depth_variant` (synthetic_rgbd), `depth_scale`, `min_confidence`, `pair_tolerance_s` and `register_to`
-            (recordings of one's own), the fields of `RosOptions` (rosbag), `frames`, `width`, `height`, `noise`, `seed`
-            (generated), and the arguments of `PlacesDataset` and its `Capture` (places).
+            depth this close to the image's border), `mask` (so does depth where this image is black), and the options
+            of the kind: `sequence` and `registered` (7scenes), `depth_variant` (synthetic_rgbd), `depth_scale`,
+            `min_confidence`, `pair_tolerance_s` and `register_to` (recordings of one's own), the fields of `RosOptions`
+            (rosbag), `frames`, `width`, `height`, `noise`, `seed` (generated), and the arguments of `PlacesDataset` and
+            its `Capture` (places).
         data_dir: the data's folder or file; overrides `config.path`. Not needed by `generated` and `places`.
 
     Raises:
@@ -47,6 +49,7 @@ def open_dataset(config: Any, data_dir: str | os.PathLike | None = None) -> Rgbd
         raise DatasetError(
             f"dataset.border_px must leave some of images of {camera.width}x{camera.height}, got {dataset.border_px}"
         )
+    apply_mask(dataset, _option(config, "mask"))
     dataset.scale_remedy = _SCALE_REMEDIES.get(config.type, _FIXED_SCALE.format(config.type))
     stride = _option(config, "stride", 1)
     return dataset if stride == 1 else Subset(dataset, step=stride)

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from spslam.datasets.base import clear_border
+from spslam.datasets.base import clear_border, clear_left_out
 from spslam.datasets.frozen_depth import FROZEN, ArrivingFrozenDepth
+from spslam.datasets.mask import left_out_by
 from spslam.errors import DatasetError
 from spslam.live.capture import Capture
 from spslam.live.frame_queue import FrameQueue
@@ -120,6 +121,7 @@ class LiveLoop:
         self._queue: FrameQueue = capture.queue
         self._progress = progress
         self._frozen_depth = ArrivingFrozenDepth()
+        self._left_out = left_out_by(system.config.dataset.mask, system.camera)
         self._begins_at_truth = begins_at_truth
         self._record = event_recorder(system.device)
         mapping = system.config.mapping
@@ -201,9 +203,10 @@ class LiveLoop:
     def _prepare(self, item: LiveFrame, requested: Any, wait_ms: float) -> PreparedFrame:
         began, system, frame = time.perf_counter(), self.system, item.frame
         border_px = system.config.dataset.border_px
-        if border_px > 0:  # the recorder may still need the frame as it is
+        if border_px > 0 or self._left_out is not None:  # the recorder may still need the frame as it is
             frame = replace(frame, depth=frame.depth.copy())
             clear_border(frame.depth, border_px)
+            clear_left_out(frame.depth, self._left_out)
         prepared = system.prepare(frame)
         prepared.decode_ms = 1e3 * (time.perf_counter() - began)
         self.clock.decode_s += prepared.decode_ms / 1e3

@@ -15,7 +15,7 @@ class LiveRequest:
     """A live run over one source.
 
     Attributes:
-        config: all options; of `dataset`, the depth range and `border_px` have an effect.
+        config: all options; of `dataset`, the depth range, `border_px` and a `mask` have an effect.
         output_dir: created if needed; it must be empty.
         record_dir: where the input is recorded in the `folder` layout; None records nothing.
         data_dir: folder of the data that is replayed; None for a camera.

@@ -61,6 +61,11 @@ class DatasetOptions(Section):
     min_depth_m: float = option("smaller depth is treated as missing", "m", ge=0)
     max_depth_m: float = option("larger depth is treated as missing", "m", gt=0, le=1000)
     border_px: int = option("depth within this distance of the image border is treated as missing", "px", ge=0, le=1000)
+    mask: str | None = option(
+        "image of the size of the recording's, black where depth is treated as missing, such as at a robot's own arm; "
+        "null finds what moves along with the camera by frames of the whole recording, in files and bags; `none` uses "
+        "all pixels"
+    )
     sequence: str | int | None = option(
         "the sequence, `seq-03` or 3; `train` or `test` is the first of that split, null the first in the folder",
         needs=(need(is_("dataset.type", "7scenes")),),

@@ -10,6 +10,7 @@ from typing import Any
 
 from spslam.config import Config, dump_config, load_config
 from spslam.datasets.base import RgbdDataset
+from spslam.datasets.mask import absolute_mask
 from spslam.errors import ConfigError, DatasetError, OutputError
 from spslam.io import atomic_write
 from spslam.run.clock import RunClock
@@ -108,7 +109,7 @@ def with_absolute_path(config: Config) -> Config:
     """The options as they hold in any working directory."""
     weights = config.prior.weights
     prior = config.prior.model_copy(update={"weights": None if weights is None else os.path.abspath(weights)})
-    dataset = config.dataset.model_copy(update={"path": _path_of(config)})
+    dataset = config.dataset.model_copy(update={"path": _path_of(config), "mask": absolute_mask(config.dataset.mask)})
     return config.model_copy(update={"dataset": dataset, "prior": prior})
 
 

@@ -64,6 +64,10 @@ class Capture:
                 raise DatasetError(f"dataset.{name} must be from {low:g} to {high:g}, got {value}")
 
 
+# What is set when a dataset is opened.
+_SET_LATER = ("depth_range", "border_px", "left_out")
+
+
 class PlacesDataset(RgbdDataset):
     """Frames of a generated place; the same arguments give the same bytes, in any order of reading.
 
@@ -131,7 +135,7 @@ class PlacesDataset(RgbdDataset):
 
     def __reduce__(self) -> tuple:
         """Another process makes the place again: that is less than its textures are."""
-        return type(self), self._arguments, {"depth_range": self.depth_range, "border_px": self.border_px}
+        return type(self), self._arguments, {name: getattr(self, name) for name in _SET_LATER}
 
     def __len__(self) -> int:
         return self._frames

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from spslam.camera import Camera
-from spslam.datasets.base import RgbdDataset, RgbdFrame
+from spslam.datasets.base import RgbdDataset, RgbdFrame, clear_left_out
 from spslam.datasets.frozen_depth import FrameSignature
 from spslam.datasets.prefetch import prefetch
 from spslam.errors import DatasetError
@@ -147,6 +147,7 @@ class _Views:
         shape = (self._dataset.camera.height, self._dataset.camera.width)
         if frame.color.shape[:2] != shape or frame.depth.shape != shape:
             raise DatasetError(f"{self._dataset.describe(index)}: images of another size")
+        clear_left_out(frame.depth, self._dataset.left_out)
         return View.of(frame, self._dataset.depth_range)
 
 

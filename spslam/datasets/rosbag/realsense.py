@@ -66,7 +66,7 @@ def open_realsense(path: Path, options: RosOptions | None = None) -> Recording:
     depth_stream = TopicStream(path, depth.name, depth_index, True, scale)
     pairs = pair_by_time(color_index.seconds, depth_index.seconds, options.pair_tolerance_s, str(path))
     dataset = Recording(f"realsense/{path.stem}", color_stream, depth_stream, pairs, calibration, view=options.view)
-    dataset.is_timed = True
+    dataset.is_timed = dataset.is_seekable = True
     return dataset
 
 

@@ -75,7 +75,7 @@ def open_rosbag(path: Path, options: RosOptions | None = None) -> Recording:
     color_stream = TopicStream(path, color.name, color_index, False)
     depth_stream = TopicStream(path, depth.name, depth_index, True, options.depth_scale)
     dataset = Recording(name, color_stream, depth_stream, pairs, calibration, reference.poses, view=options.view)
-    dataset.doubts, dataset.is_timed = reference.doubts, True
+    dataset.doubts, dataset.is_timed, dataset.is_seekable = reference.doubts, True, True
     return dataset
 
 
