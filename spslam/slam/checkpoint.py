@@ -108,7 +108,7 @@ def take_snapshot(state: SlamState, config: Config, source: dict[str, Any], copy
     if state.segment is not None:
         inner = take_snapshot(state.segment.state, config, {}, copy)
         tensors.update(_prefixed(_SEGMENT, inner.tensors))
-        header["segment"] = {"first": state.segment.first, **inner.header}
+        header["segment"] = {"first": state.segment.first, "before": state.segment.before, **inner.header}
     return Snapshot(tensors, header)
 
 
@@ -195,10 +195,11 @@ def _restore_segment(path: Path, state: SlamState, config: Config, header: Any) 
     inner = SlamState.start(config, state.frames.camera, np.eye(4), None, state.scene.device)
     tensors = load_tensors(path, _FILE, _sizes(inner), _SEGMENT)
     first = whole_number(header, "first", high=len(state.frames))
-    if first + len(tensors["frames.poses"]) != len(state.frames):
+    before = whole_number(header, "before", high=first)
+    if first - before + len(tensors["frames.poses"]) != len(state.frames):
         raise ValueError("a segment must end with the newest frame")
     _restore(inner, tensors, header)
-    state.segment = Segment(first, inner)
+    state.segment = Segment(first, inner, before)
 
 
 def _unjoined_tensors(unjoined: list[UnjoinedFrames]) -> dict[str, torch.Tensor]:

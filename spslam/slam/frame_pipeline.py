@@ -83,7 +83,7 @@ class FramePipeline:
         self.config = config
         self.camera = camera
         self.device = torch.device(device)
-        prior = load_prior(config.prior.weights, config.prior.neighborhood)
+        prior = self._prior = load_prior(config.prior.weights, config.prior.neighborhood)
         self._decoder = prior.decoder_params if config.prior.decoder == "pretrained" else None
         self._rectifier = ShutterRectifier(camera, config.dataset.max_depth_m)
         self.features = FeatureKeeper(config, camera, self._rectifier)
@@ -96,7 +96,6 @@ class FramePipeline:
         self._moving = MovingObjects(config, camera, self.tracker)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
         self.first_pose = np.eye(4)
-        self._prior = prior
         self.global_mapping: GlobalMapping | None = None
         self.while_tracking: Callable[[], None] | None = None
         self.reset(first_pose)
@@ -148,6 +147,7 @@ class FramePipeline:
             defer_mapping: leave the optimization to `optimize_map`; what is left of one before is added to it, up to
                 as many iterations as the first frame has.
         """
+        self._other_maps.take_over(self.adopt)
         self._record = event_recorder(self.device)
         started = frame.requested if frame.requested is not None and frame.wait_ms == 0 else self._record()
         events = FrameEvents(requested=frame.requested or started, started=started, finished=started)
@@ -209,6 +209,7 @@ class FramePipeline:
 
     def finish(self) -> None:
         """Optimizes once more if frames came after the last mapping call. Call it after the last frame."""
+        self._other_maps.take_over(self.adopt)
         self.optimize_map()
         self._other_maps.end()
         if self.state.frames.is_anywhere:

@@ -35,7 +35,7 @@ class MultiMap:
         global_mapping: of the system; None without a keyframe graph, and then there is no other map.
         tracker: of the system.
         recovery: of the system.
-        make: a system of the same camera without frames, by its options.
+        make: a system of the same camera without frames, by its options and the pose of its first frame.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class MultiMap:
         global_mapping: GlobalMapping | None,
         tracker: Tracker,
         recovery: Recovery,
-        make: Callable[[Config], SegmentSystem],
+        make: Callable[..., SegmentSystem],
     ):
         self._config, self._state, self._global_mapping = config, state, global_mapping
         self._tracker, self._recovery = tracker, recovery
@@ -99,6 +99,17 @@ class MultiMap:
         """
         return None if self._segments is None else self._segments.after_frame(frame, pixels, has_depth)
 
+    def take_over(self, adopt: Callable[[SlamState], None]) -> None:
+        """Between two frames: puts a segment in the place of the system's map, if that had hardly begun.
+
+        Args:
+            adopt: called with the system's state, the same object, which has the segment's content then.
+        """
+        successor = None if self._segments is None else self._segments.successor()
+        if successor is not None:
+            vars(self._state).update(vars(successor))
+            adopt(self._state)
+
     def join(self, place: np.ndarray) -> None:
         """Joins the segment with the map; no optimization of the map may be left to make.
 
@@ -115,9 +126,11 @@ class MultiMap:
             self._segments.end()
 
 
-def _segment_system(make: Callable[[Config], SegmentSystem], config: Config, state: SlamState | None) -> SegmentSystem:
+def _segment_system(
+    make: Callable[..., SegmentSystem], config: Config, state: SlamState | None, first_pose: np.ndarray | None
+) -> SegmentSystem:
     """A system for what a lost camera sees, that of a state if one is given."""
-    system = make(config)
+    system = make(config, first_pose=first_pose)
     if state is not None:
         system.adopt(state)
     return system

@@ -90,10 +90,17 @@ class Segment:
     Attributes:
         first: number of the frame that is its first one.
         state: of its system. Every frame from `first` on is one of its frames too.
+        before: how many lost frames its system has before that one: all `first` of them where it may take the place of
+            the other map, so that frames have the same numbers in both; none elsewhere.
     """
 
     first: int
     state: SlamState
+    before: int = 0
+
+    def number(self, row: int) -> int:
+        """Number of the frame that is in a row of its own."""
+        return self.first - self.before + row
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ class UnjoinedFrames:
 
     Attributes:
         rows: int64 [F] numbers of the frames.
-        poses: float32 [F, 7] in the axes of the segment's first frame, on the CPU.
+        poses: float32 [F, 7] in the axes of the first of them, on the CPU.
     """
 
     rows: torch.Tensor

@@ -10,26 +10,29 @@ import torch
 
 from spslam.datasets.base import RgbdDataset
 from spslam.datasets.generated import GeneratedDataset
+from spslam.slam import segments
 from spslam.slam.state import UnjoinedFrames
 from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import run_on, settings
 
+YOUNG_S, TIMES_AS_MANY = segments.YOUNG_S, segments.TIMES_AS_MANY
 KNOWN, BLACK, ELSEWHERE = 12, 3, 30  # frames
 CONFIG = ("graph.new_map_after_s=0.05", "mapping.iterations=3", "tracking.first_frames=2")
 BACK = (*range(76, 54, -3),)  # from where nothing known is seen to where the first frames look
 ORDER = (*range(0, 2 * KNOWN, 2), *[-1] * BLACK, *range(106, 76, -3), *BACK)
 COUNT = len(ORDER)
+AWAY = (*ORDER[: KNOWN + BLACK], *range(106, 78, -1))  # from where nothing known is seen
 POSES = GeneratedDataset(300, 160, 120).poses()
 
 
 class Frames(RgbdDataset):
     """The generated room's frames in the order of the test, -1 black, at 30 Hz."""
 
-    name, order = "lost", ORDER
+    name = "lost"
 
-    def __init__(self, count=None):
-        self._room, self._count = GeneratedDataset(300, 160, 120), count or len(self.order)
+    def __init__(self, count=None, order=ORDER):
+        self._room, self.order, self._count = GeneratedDataset(300, 160, 120), order, count or len(order)
         self.camera = self._room.camera
 
     def __len__(self):
@@ -52,10 +55,10 @@ class Frames(RgbdDataset):
         return replace(frame, index=index, timestamp=index / 30)
 
 
-def lost_and_back(frames, stop_at=COUNT, path=None):
+def lost_and_back(frames, stop_at=None, path=None):
     """A system after the frames, which was saved and loaded once before frame `stop_at`."""
     system = SlamSystem(settings(*CONFIG), frames.camera, POSES[0])
-    for i in range(COUNT):
+    for i in range(len(frames)):
         if i == stop_at:
             assert system.state.segment is not None
             system.save(path)
@@ -69,8 +72,16 @@ def frames():
     return Frames()
 
 
+@pytest.fixture(scope="module", params=["old", "young"])
+def map_age(request):
+    """A map of 12 frames has hardly begun; as if it were longer, and as if the segment were too short to replace it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segments, *(("YOUNG_S", 0.0) if request.param == "old" else ("TIMES_AS_MANY", 1000)))
+        yield request.param
+
+
 @pytest.fixture(scope="module")
-def joined(frames):
+def joined(frames, map_age):
     system = lost_and_back(frames)
     assert system.state.segment is None
     system.finish()
@@ -135,6 +146,57 @@ def test_memory_of_a_system_goes_with_it(frames):
         assert state() is None
     finally:
         gc.enable()
+
+
+@pytest.fixture(scope="module")
+def away():
+    return Frames(order=AWAY)
+
+
+def replacing(patch):
+    """Rules as they are, whatever `map_age` is."""
+    patch.setattr(segments, "YOUNG_S", YOUNG_S)
+    patch.setattr(segments, "TIMES_AS_MANY", TIMES_AS_MANY)
+
+
+@pytest.fixture(scope="module")
+def replaced(away):
+    with pytest.MonkeyPatch.context() as patch:
+        replacing(patch)
+        system = lost_and_back(away)
+        system.finish()
+        return system
+
+
+def test_a_map_that_had_hardly_begun_is_replaced(replaced):
+    """As of a recording that begins with a hand before the camera, or before that was taken up."""
+    trajectory, first = replaced.trajectory(), KNOWN + BLACK
+    assert np.flatnonzero(trajectory.lost).tolist() == list(range(first))
+    expected = np.linalg.inv(POSES[AWAY[first]]) @ POSES[np.array(AWAY[first:])]
+    moved = np.linalg.inv(trajectory.poses[first]) @ trajectory.poses[first:]
+    assert np.linalg.norm(moved[:, :3, 3] - expected[:, :3, 3], axis=1).max() < 0.01
+    # It goes on where the camera was seen last, and what was known then is kept apart.
+    np.testing.assert_allclose(trajectory.poses[first, :3, 3], POSES[ORDER[KNOWN - 1], :3, 3], atol=0.3)
+    (before,) = replaced.segments()
+    np.testing.assert_array_equal(before.timestamps, np.arange(KNOWN) / 30)
+    assert replaced.state.graph.rows.min() >= first
+    assert min(replaced.state.features.frames) >= first
+
+
+@pytest.mark.parametrize("known", [5, 2 * KNOWN, 2 * KNOWN + 1])
+def test_resumed_around_the_replacement_it_gives_the_same_bytes(away, replaced, tmp_path, monkeypatch, known):
+    replacing(monkeypatch)
+    first, system = KNOWN + BLACK, SlamSystem(settings(*CONFIG), away.camera, POSES[0])
+    for i in range(len(away)):
+        if i == first + known:
+            assert (system.state.segment is None) == (known > 2 * KNOWN)
+            system.save(tmp_path / "system")
+            system = SlamSystem.load(tmp_path / "system")
+        system.process(away[i])
+    system.finish()
+    np.testing.assert_array_equal(system.trajectory().poses, replaced.trajectory().poses)
+    one, other = (each.state.scene.volume for each in (system, replaced))
+    assert one.embeddings.equal(other.embeddings)
 
 
 def test_without_the_option_none_begins(frames):
