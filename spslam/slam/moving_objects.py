@@ -70,8 +70,8 @@ class StaticFrame(NamedTuple):
 class MovingObjects:
     """Finds what moves in one frame after the other.
 
-    What was found in a tracked frame is read when the next one was tracked too, so that the host does not wait for the
-    device. Till then the state has it, as a checkpoint may come between.
+    What was found in a frame is read when the next one comes, so that the host does not wait for the device. Till then
+    the state has it, as a checkpoint may come between.
 
     Args:
         config: options of the run.
@@ -95,13 +95,14 @@ class MovingObjects:
         """The next frame without what moves in it.
 
         Args:
-            state: before the frame.
+            state: before the frame; when something moved last is noted in it.
             history: the frames before.
             features: of the frame as it was read.
         """
         known = state.depth_history
         if known is None or history.is_lost or not features.pixels.count:
             return StaticFrame(features)
+        self._note(known)
         if not self._is_watched(known, history):
             return StaticFrame(features)
         predicted, start = self._tracker.predict(state.frames, history.steps), None
@@ -148,10 +149,7 @@ class MovingObjects:
             `StaticFrame.found`, of this look or of that before tracking.
         """
         known, number, counts = state.depth_history, len(state.frames) - 1, static.found
-        if known is None:
-            return None
-        self._note(known)
-        if tracked.lost:
+        if known is None or tracked.lost:
             return counts
         off = tracked.fit.prediction_error_cm / 100, math.radians(tracked.fit.prediction_error_deg)
         if static.start is None and not math.isnan(sum(off)):
@@ -192,14 +190,14 @@ class MovingObjects:
         )
 
     def _fetched(self, known: DepthHistory, number: int, counts: torch.Tensor) -> torch.Tensor:
-        """Counts of a look at frame `number` on their way to the CPU; they are noted once the next frame is tracked."""
+        """Counts of a look at frame `number` on their way to the CPU; they are noted when the next frame comes."""
         known.looked, known.found = number, counts
         coming = fetch(counts)
         self._coming = event_recorder(counts.device)(), coming
         return coming
 
     def _note(self, known: DepthHistory) -> None:
-        """Reads what was found before this frame was tracked; the device is done with it."""
+        """Reads what was found in the frame before; the device has been asked for little since."""
         if known.looked < 0:
             return
         found = known.found
