@@ -36,6 +36,8 @@ NOISE_DEVIATIONS, MOST_TRUNCATION_M = 9.0, 0.1
 # for more, and as `extract_fused_mesh` asks for as large a share of the weight nearby, little of a ramp stays beside
 # surface. What lies between may be the floor of a landing, of which a camera sees but its edge.
 RAMP_WEIGHT = 0.01
+# Depth of what covers pixels that are left out, m: a robot's own arm, of which nothing else is known.
+COVERED_M = np.float32(0.01)
 # Of a flying pixel, likewise. It is another point in every frame, so that a tenth is enough; with less, landings go.
 FLYING_WEIGHT = 0.1
 
@@ -99,6 +101,13 @@ class PosedFrames:
     def depth(self, position: int) -> np.ndarray:
         """Float32 [H, W], m: of the frame alone, which takes less time."""
         return self.dataset.depth(int(self.indices[position]))
+
+    def covered(self, frame: RgbdFrame) -> RgbdFrame:
+        """One of the frames for what takes its colors: in pixels that are left out something lies before all else."""
+        left_out = self.dataset.left_out
+        if left_out is None:
+            return frame
+        return replace(frame, depth=np.where(left_out, COVERED_M, frame.depth))
 
     def read(self) -> Iterator[tuple[int, RgbdFrame]]:
         """Positions and frames in order, read ahead by threads; frames that can't be read are left out."""

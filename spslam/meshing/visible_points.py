@@ -82,5 +82,5 @@ class _ToBeUploaded:
         return len(self.part)
 
     def __getitem__(self, position: int) -> tuple[torch.Tensor, torch.Tensor]:
-        frame = self.part[position]
+        frame = self.part.covered(self.part[position])
         return to_be_uploaded(frame.depth, self.device), to_be_uploaded(frame.color, self.device)

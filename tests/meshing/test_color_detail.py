@@ -11,7 +11,7 @@ from spslam.meshing import color_detail
 from spslam.meshing.color_detail import ColorOptions, color_mesh, keep_colored, thinned
 from spslam.meshing.render import render_colors
 from spslam.meshing.subdivision import mesh_edges
-from spslam.meshing.texture.views import read_views
+from spslam.meshing.texture.views import read_views, seen_vertices
 from spslam.meshing.visible_points import read_seen
 from tests.meshing.painted import CAMERA, FLOOR, GRAY, NOISE, RED, SIGN, WALL, frames, mesh_of, pattern
 
@@ -128,6 +128,23 @@ def test_seen_points_are_those_that_no_rectangle_hides():
         wanted[mesh.vertices[:, 1] > 0.79] = -1  # between wall and floor
         assert seen[wanted == 1].mean() > 0.995
         assert not seen[wanted == 0].any()
+
+
+def test_pixels_that_are_left_out_color_nothing():
+    """Something moves along before the camera there: what lies behind is not seen, as it is where depth is unknown."""
+    mesh, views, left_out = mesh_of(WALL, step_m=0.02), frames(WALL), np.zeros((CAMERA.height, CAMERA.width), bool)
+    left_out[:, : CAMERA.width // 2] = True
+    surface = ops.SurfacePoints.of(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.normals))
+    before = [weights.numpy() for _, weights in read_seen(surface, [views], NOISE)]
+    views.dataset.left_out = left_out
+    after = [weights.numpy() for _, weights in read_seen(surface, [views], NOISE)]
+    for view, one, other in zip(read_views([views], NOISE), before, after, strict=True):
+        column = view.project(mesh.vertices)[0]
+        is_out, is_left = column < CAMERA.width // 2 - 0.6, column > CAMERA.width // 2 - 0.4
+        assert (one[is_out] > 0).any()
+        assert not other[is_out].any()
+        np.testing.assert_array_equal(other[is_left], one[is_left])
+        assert not is_out[seen_vertices(mesh, view).ids].any()
 
 
 def plainly_seen(mesh, view, rectangles):

@@ -79,7 +79,7 @@ def read_views(parts: Sequence[PosedFrames], noise: tuple[float, float]) -> Iter
             for position, frame in enumerate(frames):
                 if not isinstance(frame, DatasetError):
                     camera, pose = part.dataset.camera, part.poses[position]
-                    yield ColorView(first + position, frame, camera, pose, part.noise or noise)
+                    yield ColorView(first + position, part.covered(frame), camera, pose, part.noise or noise)
         first += len(part)
 
 
