@@ -151,6 +151,20 @@ def test_what_cameras_do_is_no_wrong_order(apartment, fault):
     assert "order" not in found(WrongRecording(apartment, fault, with_poses=False))
 
 
+def test_text_over_the_image_is_no_wrong_depth():
+    """Its points stand still, which depth contradicts: a depth image upside down seemed to explain them better."""
+
+    def with_text(read, i, count):
+        frame = read(i)
+        color, (height, width) = frame.color.copy(), frame.depth.shape
+        cv2.putText(color, "REC 12:34:56 CAM-01", (8, 22), 0, 0.6, (255, 255, 255), 2)
+        cv2.putText(color, "LOGO", (width - 110, height - 20), 0, 1.2, (255, 40, 40), 4)
+        return replace(frame, color=color)
+
+    stairs = PlacesDataset("stairwell", "walking", "structured_light", 160, 405)
+    assert check_first_frames(WrongRecording(stairs, Fault(frame=with_text), with_poses=False)) == []
+
+
 def test_a_jump_after_a_black_out_does_not_stop_a_short_run(apartment):
     """With few views one jump is a large share of the steps."""
     order = np.array([*range(12), *range(12, 18), *range(4, 12)])

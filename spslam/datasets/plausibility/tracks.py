@@ -10,7 +10,7 @@ Estimation*, CVIU 1996).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ _MOST_LOCATED = 0.8  # robust fits bear the others, and see more of the image wi
 _LEAST_POINTS, _KEPT_SHARE = 50, 0.35
 _MOST_STEPS = 8
 _RETURN_PX = 0.5
+_STANDING_PX, _MOVING_PX = 0.5, 3.0
 _WINDOW_PX, _LEVELS = 15, 3
 # By noise, a point is followed with a deviation of at most this in every direction; and edges, whose stairs of pixels
 # stay where they are, are told from corners as by D. Lowe, *Distinctive Image Features*, IJCV 2004, section 4.1.
@@ -99,7 +100,7 @@ def follow(views: Sequence[View], followed: Followed | None = None) -> Tracks:
             is_broken = np.mean(followed.steps[first, first + 1][1]) < _KEPT_SHARE
             steps, broken, first = steps + is_broken, broken + is_broken, first + 1
         else:
-            segments.append(segment)
+            segments.append(_without_standing(segment))
             steps, first = steps + segment.last - segment.first, segment.last
     return Tracks(segments, steps, broken)
 
@@ -157,6 +158,14 @@ def _longest(views: Sequence[View], first: int, points: np.ndarray, followed: Fo
         begin, here = begin[kept], there[kept]
         segment = Segment(first, view + 1, begin[:, 0].astype(np.float64), here[:, 0].astype(np.float64))
     return segment
+
+
+def _without_standing(segment: Segment) -> Segment:
+    """A segment without the points that stand still in the image while most of it moves: text was drawn over it, or
+    something moves along with the camera. What depth says of them is not what they show."""
+    moved_px = np.linalg.norm(segment.pixels_last - segment.pixels_first, axis=1)
+    stays = (moved_px > _STANDING_PX) | (np.median(moved_px) < _MOVING_PX)
+    return replace(segment, pixels_first=segment.pixels_first[stays], pixels_last=segment.pixels_last[stays])
 
 
 def _step(
