@@ -31,7 +31,7 @@ from spslam.run.output_folder import OutputFolder
 from spslam.run.provenance import provenance
 from spslam.run.request import RunRequest
 from spslam.run.results import RunInput, write_results
-from spslam.run.session import RunSession
+from spslam.run.session import RunSession, with_absolute_path
 from spslam.run.threads import kernel_threads_limited, library_threads_limited
 from spslam.run.warm_up import warm_up
 from spslam.slam.interpreter import interpreter_shared
@@ -99,7 +99,8 @@ def _run_on_device(
             with folder.locked(), _removed_if_empty(folder):
                 _refuse_interrupted(folder)
                 folder.create(resume=False)
-                atomic_write(folder.config, dump_config(system.config, provenance(system.config, device)))
+                config = dump_config(with_absolute_path(system.config), provenance(system.config, device))
+                atomic_write(folder.config, config)
                 clock = RunClock(start_s=time.perf_counter() - started)
                 at_truth = first_pose is None and request.config.scene.first_pose == "dataset"
                 return _run(request, source, system, folder, progress, observer, clock, unused, at_truth)

@@ -1,5 +1,6 @@
 """Live runs from start to end: results, latency, dropped frames, cameras that fail, Ctrl-C."""
 
+import contextlib
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import threading
 import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -348,6 +350,22 @@ def test_ctrl_c_twice_before_a_frame_leaves_nothing_behind(tmp_path):
     assert time.monotonic() - began < 8  # a camera that does not answer is not waited for
     assert not list(tmp_path.iterdir())
     forever.set()
+
+
+def test_a_mask_leaves_pixels_out(tmp_path, monkeypatch):
+    """Black in a half; black in all but a corner, so that no frame has enough depth."""
+    monkeypatch.chdir(tmp_path)
+    image = np.zeros((RoomCamera(3).camera.height, RoomCamera(3).camera.width), np.uint8)
+    for rows, columns in ((None, image.shape[1] // 2), (4, 4)):
+        image[:] = 0
+        image[:rows, :columns] = 255
+        assert cv2.imwrite("mask.png", image)
+        with pytest.raises(DatasetError) if rows else contextlib.nullcontext():
+            run_live(
+                replace(request(tmp_path, "dataset.mask=mask.png"), output_dir=tmp_path / str(rows)), RoomCamera(3)
+            )
+    # It holds in any working directory.
+    assert load_config(tmp_path / "None" / "config.yaml").dataset.mask == str(tmp_path / "mask.png")
 
 
 def test_the_command_replays_and_records(tmp_path):
