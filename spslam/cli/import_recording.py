@@ -33,6 +33,8 @@ def execute(args: argparse.Namespace) -> None:
     from spslam.datasets import import_folder, open_sequence
 
     dataset = open_sequence(config.dataset, None, args.frames)
+    if config.dataset.mask is None:
+        dataset.left_out = None  # what moves along with the camera is found in the copy again
     hidden = args.quiet or not sys.stderr.isatty()
     with tqdm(total=len(dataset), unit=" frames", disable=hidden) as bar:
         faults = import_folder(dataset, args.output, lambda done: bar.update(done - bar.n))

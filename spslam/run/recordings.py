@@ -18,13 +18,14 @@ from spslam.meshing import TriangleMesh
 from spslam.options import DatasetOptions, MeshOptions
 from spslam.run.mesh import EarlierFrames, MeshJob, TextureWish, noise_of_model, write_mesh
 from spslam.run.request import RunRequest
+from spslam.run.session import with_absolute_path
 from spslam.scene import Scene
 from spslam.slam.graph.archive import KeyframeArchive, Recording
 
 
 def source_of(request: RunRequest) -> dict[str, Any]:
     """JSON object by which the frames of a request are read again."""
-    dataset = request.config.dataset.model_dump(mode="json")
+    dataset = with_absolute_path(request.config).dataset.model_dump(mode="json")
     if request.data_dir is not None:
         dataset["path"] = os.path.abspath(request.data_dir)
     return {"dataset": dataset}

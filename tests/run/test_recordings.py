@@ -8,7 +8,8 @@ import pytest
 
 from spslam.config import load_config
 from spslam.datasets import open_dataset
-from spslam.run.recordings import read_again
+from spslam.run.recordings import read_again, source_of
+from spslam.run.request import RunRequest
 from spslam.slam.graph.archive import KeyframeArchive, Recording
 from spslam.trajectory import Trajectory
 from tests.datasets.layouts import write_folder
@@ -21,6 +22,15 @@ def test_a_first_frame_that_can_not_be_read_is_no_reason(tmp_path):
         color.write_bytes(b"")
     frames, missing = read_again(KeyframeArchive([recording], [], [], None, [], set(), {}), [recording])
     assert missing == [] and len(frames[0].dataset) == len(recording.trajectory)
+
+
+def test_paths_hold_in_any_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = load_config("folder", overrides=["dataset.path=frames", "dataset.mask=mask.png"])
+    source = source_of(RunRequest(config, None, tmp_path / "out"))["dataset"]
+    assert (source["path"], source["mask"]) == (str(tmp_path / "frames"), str(tmp_path / "mask.png"))
+    free = config.model_copy(update={"dataset": config.dataset.model_copy(update={"mask": "none"})})
+    assert source_of(RunRequest(free, None, tmp_path / "out"))["dataset"]["mask"] == "none"
 
 
 def test_without_any_the_first_fault_is_named(tmp_path):
