@@ -108,7 +108,7 @@ class RgbdDataset(ABC):
             do not expect it.
         is_random_access: whether each frame is read by itself, so that several processes may share the frames; frames
             of a video, or of a bag, are read best in order.
-        is_seekable: whether frames far apart are read about as fast as others.
+        is_seekable: whether frames far apart are read about as fast as others, though by one process.
         is_timed: whether frames are in order by the recording's own time stamps, not by names of files.
         readers: number of processes that read its frames; 0 where the thread does that asks for one.
         doubts: what opening the recording found doubtful, which a run says as well as a check of the data.

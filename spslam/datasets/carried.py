@@ -73,11 +73,9 @@ def carried_in(depths: Sequence[np.ndarray]) -> np.ndarray | None:
             carried |= surface
     if not carried.any():
         return None
-    wide = _grown(carried, _MARGIN)
-    rows, columns = (
-        np.minimum(np.arange(size) // step, cells - 1) for size, cells in zip(depths[0].shape, wide.shape, strict=True)
-    )
-    return wide[np.ix_(rows, columns)]
+    height, width = depths[0].shape
+    wide = _grown(carried, _MARGIN).repeat(step, axis=0).repeat(step, axis=1)
+    return np.pad(wide, [(0, max(height - len(wide), 0)), (0, max(width - wide.shape[1], 0))], "edge")[:height, :width]
 
 
 class _Depths:

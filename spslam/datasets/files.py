@@ -54,7 +54,6 @@ class FileDataset(RgbdDataset):
         registration: brings the color image, which another camera took, to the depth camera's view.
         is_registered: see `RgbdDataset`.
         is_random_access: see `RgbdDataset`.
-        is_seekable: see `RgbdDataset`.
         doubts: see `RgbdDataset`.
     """
 
@@ -71,7 +70,6 @@ class FileDataset(RgbdDataset):
     border_px: int = 0
     is_registered: bool = True
     is_random_access: bool = True
-    is_seekable: bool = True
     doubts: Sequence[Finding] = ()
 
     def __post_init__(self) -> None:

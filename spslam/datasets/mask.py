@@ -62,7 +62,7 @@ def apply_mask(dataset: RgbdDataset, mask: str | None) -> None:
     """
     if mask is not None:
         dataset.left_out = left_out_by(mask, dataset.camera)
-    elif dataset.is_seekable:
+    elif dataset.is_random_access or dataset.is_seekable:
         dataset.left_out = find_carried(dataset)
         if dataset.left_out is not None:
             dataset.remarks = (*dataset.remarks, carried_remark(dataset.left_out))

@@ -197,7 +197,7 @@ class MovingObjects:
         return coming
 
     def _note(self, known: DepthHistory) -> None:
-        """Reads what was found in the frame before; the device has been asked for little since."""
+        """Reads what was found in the frame before; it was copied before that frame was mapped, and is there by now."""
         if known.looked < 0:
             return
         found = known.found

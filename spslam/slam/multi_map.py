@@ -103,11 +103,9 @@ class MultiMap:
         """Between two frames: puts a segment in the place of the system's map, if that had hardly begun.
 
         Args:
-            adopt: called with the system's state, the same object, which has the segment's content then.
+            adopt: called with the system's state if it did; it is the same object, with other content.
         """
-        successor = None if self._segments is None else self._segments.successor()
-        if successor is not None:
-            vars(self._state).update(vars(successor))
+        if self._segments is not None and self._segments.replace_young_map():
             adopt(self._state)
 
     def join(self, place: np.ndarray) -> None:

@@ -165,16 +165,22 @@ class Segments:
             before = pose
         self._global_mapping.take_in(keyframes, links, taken)
 
-    def successor(self) -> SlamState | None:
-        """The segment's state, where it is to take the place of the map's; the poses of that are kept in it, apart."""
+    def replace_young_map(self) -> bool:
+        """Puts the segment in the place of a map that had hardly begun; the poses of that are kept apart.
+
+        Returns:
+            Whether it did: then the state, still the same object, has the segment's content.
+        """
         state, segment = self._state, self._state.segment
-        if segment is None or not segment.before:
-            return None
+        if segment is None or not segment.before or not state.frames.is_lost(-1):
+            return False
         known, ones = (int((~each.frames.lost).sum()) for each in (state, segment.state))
-        if ones < TIMES_AS_MANY * known or not state.frames.is_lost(-1):
-            return None
-        segment.state.unjoined = [*state.unjoined, *_kept_apart(state.frames)]
-        return segment.state
+        if ones < TIMES_AS_MANY * known:
+            return False
+        unjoined = [*state.unjoined, *_kept_apart(state.frames)]
+        vars(state).update(vars(segment.state))
+        state.unjoined = unjoined
+        return True
 
     def _begun(self, number: int, may_succeed: bool) -> Segment:
         """A segment that begins with the newest frame, `number`; one that may take the place of the map has the frames
