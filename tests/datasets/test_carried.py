@@ -6,64 +6,48 @@ import cv2
 import numpy as np
 import pytest
 
+from experiments.capture_faults import FAULTS, carried_pixels
+from experiments.wrong_recordings import WrongRecording
 from spslam.config import load_config
 from spslam.datasets import open_dataset
-from spslam.datasets.base import RgbdDataset, Subset
+from spslam.datasets.base import Subset
 from spslam.datasets.carried import FRAMES, carried_in, find_carried
 from spslam.datasets.places import PlacesDataset
 from spslam.errors import DatasetError
 from spslam.geometry import pose_from
+from tests.cli.command import spslam
 from tests.datasets.layouts import depth_meters, write_folder
 
 COUNT = 120
 
 
-class Robot(RgbdDataset):
+class Robot(WrongRecording):
     """A generated place with something before the camera that moves along with it.
 
     Args:
         arm: whether there is something.
+        place: see `PlacesDataset`.
         motion: of the camera; None for one that stands.
+        sensor: see `PlacesDataset`.
         steady: whether the camera is carried at one height and pitch, low above the floor, as on a robot.
         unreadable: numbers of frames that can't be read.
     """
 
-    name = "robot"
-
     def __init__(self, arm=True, place="apartment", motion="walking", sensor="stereo", steady=False, unreadable=()):
-        self._data = PlacesDataset(place, motion or "walking", sensor, COUNT, 7)
-        self.camera, self._arm, self._stands, self._unreadable = self._data.camera, arm, motion is None, unreadable
+        data = PlacesDataset(place, motion or "walking", sensor, COUNT, 7)
         if steady:
-            way = self._data.motion.poses
-            self._data.motion.poses = lambda times: low_and_level(way(times))
-
-    def __len__(self):
-        return COUNT
-
-    def timestamps(self):
-        return np.arange(COUNT) / 30
-
-    def poses(self):
-        return None
+            way = data.motion.poses
+            data.motion.poses = lambda times: low_and_level(way(times))
+        fault = FAULTS["robot's arm" if arm else "none"]
+        super().__init__(
+            data, replace(fault, order=None if motion else lambda count: np.zeros(count, int)), with_poses=False
+        )
+        self.shown, self._unreadable = carried_pixels((self.camera.height, self.camera.width)), unreadable
 
     def read(self, index):
         if index in self._unreadable:
             raise DatasetError(f"frame {index}")
-        frame = self._data.read(0 if self._stands else index)
-        if self._arm:
-            noise = np.random.default_rng(index).normal(0, 0.002, frame.depth.shape)
-            frame.depth[self.shown] = (self.arm_m + noise)[self.shown]
-        return replace(frame, index=index, timestamp=index / 30)
-
-    @property
-    def shown(self):
-        rows, columns = np.mgrid[0 : self.camera.height, 0 : self.camera.width]
-        return (rows > 0.62 * self.camera.height) & (abs(columns / self.camera.width - 0.5) < 0.2)
-
-    @property
-    def arm_m(self):
-        rows = np.arange(self.camera.height)[:, None] / self.camera.height
-        return np.broadcast_to(0.45 - 0.1 * rows, (self.camera.height, self.camera.width))
+        return super().read(index)
 
 
 def low_and_level(poses):
@@ -167,16 +151,31 @@ def test_a_mask_that_can_not_be_used_is_refused(recording, tmp_path, make, messa
         opened(recording, tmp_path / "mask.png")
 
 
-def test_opening_a_recording_finds_an_arm_and_says_so(tmp_path):
-    robot = Robot()
-    for number in range(COUNT):
+@pytest.fixture(scope="module")
+def robot_folder(tmp_path_factory):
+    robot, folder = Robot(), tmp_path_factory.mktemp("robot")
+    for number in range(0, COUNT, 3):
         frame = robot.read(number)
         for kind, image in (("color", frame.color[..., ::-1]), ("depth", (1000 * frame.depth).astype(np.uint16))):
-            (tmp_path / kind).mkdir(exist_ok=True)
-            assert cv2.imwrite(str(tmp_path / kind / f"{number:03}.png"), image)
+            (folder / kind).mkdir(exist_ok=True)
+            assert cv2.imwrite(str(folder / kind / f"{number:03}.png"), image)
     k = robot.camera
-    np.savetxt(tmp_path / "intrinsics.txt", [[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
-    data = opened(tmp_path)
-    assert not data[5].depth[robot.shown].any()
+    np.savetxt(folder / "intrinsics.txt", [[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    return robot.shown, folder
+
+
+def test_opening_a_recording_finds_an_arm_and_says_so(robot_folder):
+    shown, folder = robot_folder
+    data = opened(folder)
+    assert not data[5].depth[shown].any()
     assert any("moves along with the camera" in remark for remark in data.remarks)
-    assert opened(tmp_path, "none")[5].depth[robot.shown].all()
+    assert opened(folder, "none")[5].depth[shown].all()
+
+
+def test_a_copy_of_it_has_all_depth(robot_folder, tmp_path):
+    """In the copy it is found again; without depth its colors would be taken for those of what lies behind."""
+    shown, folder = robot_folder
+    result = spslam("import", "folder", "--data", str(folder), "copy", "--quiet", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert opened(tmp_path / "copy", "none")[5].depth[shown].all()
+    assert not opened(tmp_path / "copy")[5].depth[shown].any()

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from experiments.capture_faults import FAULTS as FAULTS_OF_CAPTURE
 from experiments.fault_injection import black_out, cover_garbage, cover_near, cover_wall
 from experiments.wrong_inputs import LATE
 from experiments.wrong_recordings import FAULTS, Fault, WrongRecording
@@ -128,14 +129,6 @@ def covered(read, i, count):
     return replace(frame, color=np.zeros_like(frame.color), depth=np.zeros_like(frame.depth))
 
 
-def flickering(read, i, count):
-    """Light that goes with the mains, twice while an image's rows are read, and elsewhere in each image."""
-    frame = read(i)
-    rows = np.linspace(0, 1, frame.color.shape[0])[:, None, None]
-    gain = 1 + 0.2 * np.sin(2 * np.pi * (99.3 * frame.timestamp + 2 * rows))
-    return replace(frame, color=np.clip(frame.color * gain, 0, 255).astype(np.uint8))
-
-
 def away_and_back(count):
     """As of a camera that turns back, and whose frames in between are missing."""
     return np.array([*range(24), *range(23, 3, -1), *range(40, 50), *range(4, 24)])
@@ -143,7 +136,7 @@ def away_and_back(count):
 
 @pytest.mark.parametrize(
     "fault",
-    [Fault(frame=stood_still), Fault(frame=covered), Fault(frame=flickering), Fault(order=away_and_back)],
+    [Fault(frame=stood_still), Fault(frame=covered), FAULTS_OF_CAPTURE["flicker"], Fault(order=away_and_back)],
     ids=["still", "covered", "flickering", "back"],
 )
 def test_what_cameras_do_is_no_wrong_order(apartment, fault):
@@ -153,16 +146,8 @@ def test_what_cameras_do_is_no_wrong_order(apartment, fault):
 
 def test_text_over_the_image_is_no_wrong_depth():
     """Its points stand still, which depth contradicts: a depth image upside down seemed to explain them better."""
-
-    def with_text(read, i, count):
-        frame = read(i)
-        color, (height, width) = frame.color.copy(), frame.depth.shape
-        cv2.putText(color, "REC 12:34:56 CAM-01", (8, 22), 0, 0.6, (255, 255, 255), 2)
-        cv2.putText(color, "LOGO", (width - 110, height - 20), 0, 1.2, (255, 40, 40), 4)
-        return replace(frame, color=color)
-
     stairs = PlacesDataset("stairwell", "walking", "structured_light", 160, 405)
-    assert check_first_frames(WrongRecording(stairs, Fault(frame=with_text), with_poses=False)) == []
+    assert check_first_frames(WrongRecording(stairs, FAULTS_OF_CAPTURE["text"], with_poses=False)) == []
 
 
 def test_a_jump_after_a_black_out_does_not_stop_a_short_run(apartment):
