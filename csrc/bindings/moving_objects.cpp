@@ -1,5 +1,6 @@
 #include "spslam/moving_objects.h"
 
+#include <limits>
 #include <tuple>
 
 #include "bindings/common.h"
@@ -35,6 +36,7 @@ std::tuple<Tensor, Tensor> find_moving_cells(Tensor depth, Tensor pose, Tensor e
   grids.earlier = data<std::uint16_t>(earlier), grids.poses = data<float>(poses), grids.noise = data<float>(noise);
   grids.height = depth.size(0), grids.width = depth.size(1), grids.step = step;
   grids.rows = earlier.size(1), grids.columns = earlier.size(2);
+  SPS_CHECK(grids.rows * grids.columns <= std::numeric_limits<std::int32_t>::max(), kFind, ": too many cells");
   SPS_CHECK((grids.rows - 1) * step < grids.height && (grids.columns - 1) * step < grids.width, kFind,
             ": the depth image must hold the cells");
   grids.intrinsics = load_intrinsics(
@@ -51,7 +53,7 @@ std::tuple<Tensor, Tensor> find_moving_cells(Tensor depth, Tensor pose, Tensor e
   }
   Tensor cells = empty(depth, {grids.rows, grids.columns}, ScalarType::Byte);
   Tensor counts = empty(depth, {2}, ScalarType::Int);
-  Tensor workspace = empty(depth, {moving_cells_workspace_size(scope.context, grids)}, ScalarType::Byte);
+  Tensor workspace = empty(depth, {moving_cells_workspace_size(grids)}, ScalarType::Byte);
   spslam::find_moving_cells(scope.context, grids, workspace.mutable_data_ptr(), mutable_data<std::uint8_t>(cells),
                             mutable_data<std::int32_t>(counts));
   return {cells, counts};

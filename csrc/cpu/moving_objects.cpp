@@ -9,42 +9,103 @@
 namespace spslam {
 namespace {
 
-constexpr std::int64_t kRowGrain = 4;  // rows of cells, of one earlier frame
+constexpr std::int64_t kRowGrain = 8;  // rows of cells, of one earlier frame
+constexpr std::int64_t kLanes = 64;    // cells of a row that are looked at together
+
+// nearest [columns] of a row of cells: the rows above and below first, then the columns beside.
+void nearest_in_row(const std::uint16_t* above, const std::uint16_t* here, const std::uint16_t* below,
+                    std::int64_t columns, std::uint16_t* nearest) {
+  for (std::int64_t begin = 0; begin < columns; begin += kLanes) {
+    const std::int64_t end = std::min(begin + kLanes, columns);
+    // With one column more on either side, of unknown depth beyond the border.
+    std::uint16_t lines[kLanes + 2];
+    lines[0] = lines[end - begin + 1] = 0;
+    const std::int64_t from = begin > 0 ? begin - 1 : 0, to = end < columns ? end + 1 : columns;
+    SPS_SIMD
+    for (std::int64_t c = from; c < to; ++c) lines[c - begin + 1] = nearest_of(above[c], here[c], below[c]);
+    SPS_SIMD
+    for (std::int64_t c = 0; c < end - begin; ++c) {
+      nearest[begin + c] = nearest_of(lines[c], lines[c + 1], lines[c + 2]);
+    }
+  }
+}
+
+// nearest [rows, columns] of one grid.
+void nearest_in_grid(const DepthGrids& grids, const std::uint16_t* depth, std::uint16_t* nearest) {
+  for (std::int64_t row = 0; row < grids.rows; ++row) {
+    const auto line = [&](std::int64_t r) {
+      return depth + std::clamp<std::int64_t>(r, 0, grids.rows - 1) * grids.columns;
+    };
+    nearest_in_row(line(row - 1), line(row), line(row + 1), grids.columns, nearest + row * grids.columns);
+  }
+}
+
+// Cells of a row, from `first` on, as another frame sees them.
+struct SeenCells {
+  std::int32_t cells[kLanes];
+  double depths[kLanes], margins[kLanes];
+};
+void see_cells(const DepthGrids& grids, const Pose<double>& motion, const std::uint16_t* depth, std::int64_t row,
+               std::int64_t first, std::int64_t count, SeenCells& seen) {
+  const double unit = grids.unit;
+  SPS_SIMD
+  for (std::int64_t c = 0; c < count; ++c) {
+    const SeenCell cell = seen_cell(grids, motion, row, first + c, unit * depth[first + c]);
+    seen.cells[c] = cell.cell;
+    seen.depths[c] = cell.depth;
+    seen.margins[c] = depth_margin(grids, cell.depth);
+  }
+}
 
 }  // namespace
 
 template <>
-std::int64_t moving_cells_workspace_size<Cpu>(Cpu, const DepthGrids& grids) {
-  return grids.rows * grids.columns * static_cast<std::int64_t>(sizeof(std::uint32_t) + 1);
-}
-
-template <>
-void find_moving_cells<Cpu>(Cpu device, const DepthGrids& grids, void* workspace, std::uint8_t* cells,
+void find_moving_cells<Cpu>(Cpu device, const DepthGrids& grids, void* memory, std::uint8_t* cells,
                             std::int32_t* counts) {
-  const std::int64_t num_cells = grids.rows * grids.columns;
-  std::uint32_t* evidence = static_cast<std::uint32_t*>(workspace);
-  std::uint8_t* moving = reinterpret_cast<std::uint8_t*>(evidence + num_cells);
-  std::fill_n(evidence, num_cells, 0u);
+  const std::int64_t num_cells = grids.rows * grids.columns, columns = grids.columns;
+  const MovingWorkspace work = moving_workspace(grids, memory);
+  std::fill_n(work.evidence, num_cells, 0u);
+  for (std::int64_t cell = 0; cell < num_cells; ++cell) {
+    work.depth[cell] = frame_cell(grids, cell / columns, cell % columns);
+  }
+  parallel_for(1 + grids.num_earlier, 1, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t grid = begin; grid < end; ++grid) {
+      const std::uint16_t* depth = grid == 0 ? work.depth : earlier_cells(grids, grid - 1);
+      nearest_in_grid(grids, depth, work.nearest + grid * num_cells);
+    }
+  });
   const Pose<double> now = load_frame_pose(grids.pose);
   parallel_for(grids.num_earlier * grids.rows, kRowGrain, [&](std::int64_t begin, std::int64_t end) {
+    SeenCells seen;
     for (std::int64_t line = begin; line < end; ++line) {
       const std::int64_t i = line / grids.rows, row = line % grids.rows;
       const Pose<double> then = load_frame_pose(grids.poses + kPoseSize * grids.frames[i]);
-      for (std::int64_t column = 0; column < grids.columns; ++column) {
-        const std::uint32_t found = earlier_evidence(grids, i, then, now, row, column);
-        if (found) __atomic_fetch_or(evidence + row * grids.columns + column, found, __ATOMIC_RELAXED);
-        const std::int64_t cell = gone_before(grids, i, then, now, row, column);
-        if (cell >= 0) __atomic_fetch_or(evidence + cell, std::uint32_t{kGone}, __ATOMIC_RELAXED);
+      const Pose<double> to_earlier = motion_between(now, then), to_now = motion_between(then, now);
+      const std::uint16_t *earlier = earlier_cells(grids, i), *nearest = work.nearest + (1 + i) * num_cells;
+      for (std::int64_t first = 0; first < columns; first += kLanes) {
+        const std::int64_t count = std::min(kLanes, columns - first), begin_of_row = row * columns;
+        see_cells(grids, to_earlier, work.depth + begin_of_row, row, first, count, seen);
+        for (std::int64_t c = 0; c < count; ++c) {
+          if (seen.cells[c] < 0) continue;
+          const std::uint32_t found =
+              earlier_evidence(grids, seen.depths[c], earlier[seen.cells[c]], nearest[seen.cells[c]], seen.margins[c]);
+          if (found) __atomic_fetch_or(work.evidence + begin_of_row + first + c, found, __ATOMIC_RELAXED);
+        }
+        see_cells(grids, to_now, earlier + begin_of_row, row, first, count, seen);
+        for (std::int64_t c = 0; c < count; ++c) {
+          if (seen.cells[c] < 0 || !is_gone(grids, seen.depths[c], work.nearest[seen.cells[c]])) continue;
+          __atomic_fetch_or(work.evidence + seen.cells[c], std::uint32_t{kGone}, __ATOMIC_RELAXED);
+        }
       }
     }
   });
   counts[0] = counts[1] = 0;
   for (std::int64_t cell = 0; cell < num_cells; ++cell) {
-    moving[cell] = is_moving(grids, evidence, cell);
-    counts[0] += moving[cell];
-    counts[1] += cell_depth(grids, cell / grids.columns, cell % grids.columns) > 0.0;
+    work.moving[cell] = is_moving(grids, work.evidence, work.depth, cell);
+    counts[0] += work.moving[cell];
+    counts[1] += work.depth[cell] != 0;
   }
-  for_each(device, num_cells, [&](std::int64_t cell) { cells[cell] = is_marked_around(grids, moving, cell); });
+  for_each(device, num_cells, [&](std::int64_t cell) { cells[cell] = is_marked_around(grids, work.moving, cell); });
 }
 
 template <>

@@ -9,6 +9,19 @@ namespace {
 constexpr int kScanThreads = 1024;
 constexpr int kWarp = 32;
 
+// Least known depth in a cell and those around it; `depth` returns that of a row and column.
+template <class Depth>
+__device__ std::uint16_t nearest_around(const DepthGrids& grids, std::int64_t row, std::int64_t column,
+                                        const Depth& depth) {
+  std::uint16_t nearest = 0;
+  for (std::int64_t r = row > 0 ? row - 1 : 0; r <= row + 1 && r < grids.rows; ++r) {
+    for (std::int64_t c = column > 0 ? column - 1 : 0; c <= column + 1 && c < grids.columns; ++c) {
+      nearest = nearer(nearest, depth(r, c));
+    }
+  }
+  return nearest;
+}
+
 // places [num_records]: the records that stay, in order; places[num_records] is their number.
 __global__ void __launch_bounds__(kScanThreads)
     place_kernel(FrameSamples samples, const std::uint8_t* cells, std::int32_t* places, std::int32_t* ranks) {
@@ -38,35 +51,48 @@ __global__ void __launch_bounds__(kScanThreads)
 }  // namespace
 
 template <>
-std::int64_t moving_cells_workspace_size<Cuda>(Cuda, const DepthGrids& grids) {
-  return grids.rows * grids.columns * static_cast<std::int64_t>(sizeof(std::uint32_t) + 1);
-}
-
-template <>
-void find_moving_cells<Cuda>(Cuda device, const DepthGrids& grids, void* workspace, std::uint8_t* cells,
+void find_moving_cells<Cuda>(Cuda device, const DepthGrids& grids, void* memory, std::uint8_t* cells,
                              std::int32_t* counts) {
   const std::int64_t num_cells = grids.rows * grids.columns;
-  std::uint32_t* evidence = static_cast<std::uint32_t*>(workspace);
-  std::uint8_t* moving = reinterpret_cast<std::uint8_t*>(evidence + num_cells);
-  const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
-  cudaMemsetAsync(evidence, 0, static_cast<std::size_t>(num_cells) * sizeof(std::uint32_t), stream);
-  cudaMemsetAsync(counts, 0, 2 * sizeof(std::int32_t), stream);
+  const MovingWorkspace work = moving_workspace(grids, memory);
+  for_each(device, (1 + grids.num_earlier) * num_cells, [=] __device__(std::int64_t place) {
+    const std::int64_t grid = place / num_cells, cell = place % num_cells;
+    const std::int64_t row = cell / grids.columns, column = cell % grids.columns;
+    const std::uint16_t* earlier = grid > 0 ? earlier_cells(grids, grid - 1) : nullptr;
+    const auto depth = [&](std::int64_t r, std::int64_t c) {
+      return earlier != nullptr ? earlier[r * grids.columns + c] : frame_cell(grids, r, c);
+    };
+    work.nearest[place] = nearest_around(grids, row, column, depth);
+    if (grid > 0) return;
+    work.depth[cell] = depth(row, column);
+    work.evidence[cell] = 0u;
+    if (cell == 0) counts[0] = counts[1] = 0;
+  });
   for_each(device, grids.num_earlier * num_cells, [=] __device__(std::int64_t place) {
-    const std::int64_t i = place / num_cells, row = place % num_cells / grids.columns, column = place % grids.columns;
+    const std::int64_t i = place / num_cells, cell = place % num_cells;
+    const std::int64_t row = cell / grids.columns, column = cell % grids.columns;
     const Pose<double> now = load_frame_pose(grids.pose);
     const Pose<double> then = load_frame_pose(grids.poses + kPoseSize * grids.frames[i]);
-    const std::uint32_t found = earlier_evidence(grids, i, then, now, row, column);
-    if (found) atomicOr(evidence + row * grids.columns + column, found);
-    const std::int64_t cell = gone_before(grids, i, then, now, row, column);
-    if (cell >= 0) atomicOr(evidence + cell, std::uint32_t{kGone});
+    const std::uint16_t* earlier = earlier_cells(grids, i);
+    const SeenCell seen = seen_cell(grids, motion_between(now, then), row, column, grids.unit * work.depth[cell]);
+    if (seen.cell >= 0) {
+      const std::uint32_t found =
+          earlier_evidence(grids, seen.depth, earlier[seen.cell], work.nearest[(1 + i) * num_cells + seen.cell],
+                           depth_margin(grids, seen.depth));
+      if (found) atomicOr(work.evidence + cell, found);
+    }
+    const SeenCell before = seen_cell(grids, motion_between(then, now), row, column, grids.unit * earlier[cell]);
+    if (before.cell >= 0 && is_gone(grids, before.depth, work.nearest[before.cell])) {
+      atomicOr(work.evidence + before.cell, std::uint32_t{kGone});
+    }
   });
   for_each(device, num_cells, [=] __device__(std::int64_t cell) {
-    moving[cell] = is_moving(grids, evidence, cell);
-    if (moving[cell]) atomicAdd(counts, 1);
-    if (cell_depth(grids, cell / grids.columns, cell % grids.columns) > 0.0) atomicAdd(counts + 1, 1);
+    work.moving[cell] = is_moving(grids, work.evidence, work.depth, cell);
+    if (work.moving[cell]) atomicAdd(counts, 1);
+    if (work.depth[cell] != 0) atomicAdd(counts + 1, 1);
   });
   for_each(device, num_cells,
-           [=] __device__(std::int64_t cell) { cells[cell] = is_marked_around(grids, moving, cell); });
+           [=] __device__(std::int64_t cell) { cells[cell] = is_marked_around(grids, work.moving, cell); });
 }
 
 template <>

@@ -19,83 +19,83 @@ SPS_INLINE double depth_margin(const DepthGrids& grids, double z) {
   return grids.margin + grids.turn * z + grids.deviations * std::sqrt(noise);
 }
 
-// Depth (m) of a cell of the frame, and of an earlier one; 0 where unknown.
-SPS_INLINE double cell_depth(const DepthGrids& grids, std::int64_t row, std::int64_t column) {
-  return grids.unit * grids.depth[row * grids.step * grids.width + column * grids.step];
-}
-SPS_INLINE double cell_depth(const DepthGrids& grids, std::int64_t slot, std::int64_t row, std::int64_t column) {
-  return grids.unit * grids.earlier[(slot * grids.rows + row) * grids.columns + column];
+// Scratch of find_moving_cells. Grid 0 is the frame's, grid 1 + i that of the i-th earlier one.
+struct MovingWorkspace {
+  std::uint32_t* evidence;  // [cells]
+  std::uint16_t* nearest;   // [1 + num_earlier, cells] least known depth in a cell and those around it, 0 where none
+  std::uint16_t* depth;     // [cells] of the frame
+  std::uint8_t* moving;     // [cells]
+};
+SPS_INLINE MovingWorkspace moving_workspace(const DepthGrids& grids, void* memory) {
+  const std::int64_t num_cells = grids.rows * grids.columns;
+  std::uint32_t* evidence = static_cast<std::uint32_t*>(memory);
+  std::uint16_t* nearest = reinterpret_cast<std::uint16_t*>(evidence + num_cells);
+  std::uint16_t* depth = nearest + (1 + grids.num_earlier) * num_cells;
+  return {evidence, nearest, depth, reinterpret_cast<std::uint8_t*>(depth + num_cells)};
 }
 
-// Nearest depth in a cell and those around it; 0 where none is known. `depth` returns that of a row and column.
-template <class Depth>
-SPS_INLINE double nearest_around(const DepthGrids& grids, std::int64_t row, std::int64_t column, const Depth& depth) {
-  double nearest = 0.0;
-  for (std::int64_t r = row > 0 ? row - 1 : 0; r <= row + 1 && r < grids.rows; ++r) {
-    for (std::int64_t c = column > 0 ? column - 1 : 0; c <= column + 1 && c < grids.columns; ++c) {
-      const double z = depth(r, c);
-      if (z > 0.0 && (nearest == 0.0 || z < nearest)) nearest = z;
-    }
+// Depth of a cell of the frame; the cells of an earlier one.
+SPS_INLINE std::uint16_t frame_cell(const DepthGrids& grids, std::int64_t row, std::int64_t column) {
+  return grids.depth[row * grids.step * grids.width + column * grids.step];
+}
+SPS_INLINE const std::uint16_t* earlier_cells(const DepthGrids& grids, std::int64_t i) {
+  return grids.earlier + grids.slots[i] * grids.rows * grids.columns;
+}
+
+// The nearer of two depths, of which 0 is unknown: less 1 that is the largest.
+SPS_INLINE std::uint16_t nearer(std::uint16_t a, std::uint16_t b) {
+  const std::uint16_t x = static_cast<std::uint16_t>(a - 1), y = static_cast<std::uint16_t>(b - 1);
+  return static_cast<std::uint16_t>((x < y ? x : y) + 1);
+}
+SPS_INLINE std::uint16_t nearest_of(std::uint16_t a, std::uint16_t b, std::uint16_t c) {
+  return nearer(a, nearer(b, c));
+}
+
+// The motion that takes points in the axes of a frame at pose `from` into those of one at pose `to`.
+SPS_INLINE Pose<double> motion_between(const Pose<double>& from, const Pose<double>& to) {
+  const double *a = to.rotation.m, *b = from.rotation.m;
+  Pose<double> motion{{}, in_frame(to, from.translation)};
+  for (int r = 0; r < 3; ++r) {
+    for (int c = 0; c < 3; ++c) motion.rotation.m[3 * r + c] = a[r] * b[c] + a[3 + r] * b[3 + c] + a[6 + r] * b[6 + c];
   }
-  return nearest;
+  return motion;
 }
 
-// World point of a cell of depth z in a frame at a pose.
-SPS_INLINE Vec3<double> cell_point(const DepthGrids& grids, const Pose<double>& pose, std::int64_t row,
-                                   std::int64_t column, double z) {
-  const Intrinsics& k = grids.intrinsics;
-  const double u = static_cast<double>(column * grids.step), v = static_cast<double>(row * grids.step);
-  return pose.rotation * Vec3<double>{(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z} + pose.translation;
-}
-
-// Cell in which a frame at a pose sees a world point, and the point's depth there; none outside of the image.
+// The cell in which a frame sees the surface of a cell of another one, of depth z (m, 0 where unknown), by the motion
+// to that frame, and the depth there; cell -1 where it does not see it.
 struct SeenCell {
-  bool is_seen;
-  std::int64_t row, column;
+  std::int32_t cell;
   double depth;
 };
-SPS_INLINE SeenCell seen_cell(const DepthGrids& grids, const Pose<double>& pose, const Vec3<double>& point) {
-  const auto [x, y, z] = in_frame(pose, point);
-  if (!(z > kMinPointDepth)) return {false, 0, 0, 0.0};
+SPS_INLINE SeenCell seen_cell(const DepthGrids& grids, const Pose<double>& motion, std::int64_t row,
+                              std::int64_t column, double z) {
   const Intrinsics& k = grids.intrinsics;
   const double step = static_cast<double>(grids.step);
-  const double column = std::floor((x / z * k.fx + k.cx) / step + 0.5);
-  const double row = std::floor((y / z * k.fy + k.cy) / step + 0.5);
-  const bool is_seen = column >= 0.0 && column < static_cast<double>(grids.columns) && row >= 0.0 &&
-                       row < static_cast<double>(grids.rows);
-  if (!is_seen) return {false, 0, 0, 0.0};
-  return {true, static_cast<std::int64_t>(row), static_cast<std::int64_t>(column), z};
+  const double u = static_cast<double>(column) * step, v = static_cast<double>(row) * step;
+  const Vec3<double> own{(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z};
+  const Vec3<double> seen = motion.rotation * own + motion.translation;
+  const double scale = 1.0 / (seen.z * step);
+  const double c = std::floor(seen.x * scale * k.fx + k.cx / step + 0.5);
+  const double r = std::floor(seen.y * scale * k.fy + k.cy / step + 0.5);
+  const bool is_seen = (z > 0.0) & (seen.z > kMinPointDepth) & (c >= 0.0) & (c < static_cast<double>(grids.columns)) &
+                       (r >= 0.0) & (r < static_cast<double>(grids.rows));
+  const double cell = is_seen ? r * static_cast<double>(grids.columns) + c : -1.0;
+  return {static_cast<std::int32_t>(cell), seen.z};
 }
 
-// What the i-th earlier frame, at `then`, says of a cell of the frame, at `now`: kFree, kSame or 0.
-SPS_INLINE std::uint32_t earlier_evidence(const DepthGrids& grids, std::int64_t i, const Pose<double>& then,
-                                          const Pose<double>& now, std::int64_t row, std::int64_t column) {
-  const double own = cell_depth(grids, row, column);
-  if (!(own > 0.0)) return 0u;
-  const SeenCell seen = seen_cell(grids, then, cell_point(grids, now, row, column, own));
-  if (!seen.is_seen) return 0u;
-  const std::int64_t slot = grids.slots[i];
-  const double margin = depth_margin(grids, seen.depth);
-  const double measured = cell_depth(grids, slot, seen.row, seen.column);
-  std::uint32_t evidence = measured > 0.0 && std::fabs(seen.depth - measured) < margin ? kSame : 0u;
-  const double nearest = nearest_around(grids, seen.row, seen.column,
-                                        [&](std::int64_t r, std::int64_t c) { return cell_depth(grids, slot, r, c); });
-  if (nearest > 0.0 && seen.depth < nearest - margin) evidence |= kFree;
-  return evidence;
+// What an earlier frame says of a cell of the frame, by where it sees its surface, the depths that it measured there
+// and around, and how much depths there may differ: kFree, kSame or 0.
+SPS_INLINE std::uint32_t earlier_evidence(const DepthGrids& grids, double seen, std::uint16_t measured,
+                                          std::uint16_t nearest, double margin) {
+  const double there = grids.unit * measured, around = grids.unit * nearest;
+  const std::uint32_t same = measured != 0 && std::fabs(seen - there) < margin ? kSame : 0u;
+  return nearest != 0 && seen < around - margin ? same | kFree : same;
 }
 
-// The cell of the frame, at `now`, that sees through where a cell of the i-th earlier frame, at `then`, saw surface; -1
-// where none does.
-SPS_INLINE std::int64_t gone_before(const DepthGrids& grids, std::int64_t i, const Pose<double>& then,
-                                    const Pose<double>& now, std::int64_t row, std::int64_t column) {
-  const double own = cell_depth(grids, grids.slots[i], row, column);
-  if (!(own > 0.0)) return -1;
-  const SeenCell seen = seen_cell(grids, now, cell_point(grids, then, row, column, own));
-  if (!seen.is_seen) return -1;
-  const double nearest = nearest_around(grids, seen.row, seen.column,
-                                        [&](std::int64_t r, std::int64_t c) { return cell_depth(grids, r, c); });
-  const bool is_gone = nearest > 0.0 && seen.depth < nearest - depth_margin(grids, nearest);
-  return is_gone ? seen.row * grids.columns + seen.column : -1;
+// Whether the frame sees through surface of an earlier one, at `seen`, by the nearest depth around.
+SPS_INLINE bool is_gone(const DepthGrids& grids, double seen, std::uint16_t nearest) {
+  const double around = grids.unit * nearest;
+  return nearest != 0 && seen < around - depth_margin(grids, around);
 }
 
 // Whether the evidence says that a cell moves.
@@ -104,13 +104,15 @@ SPS_INLINE bool seems_moving(std::uint32_t evidence) {
 }
 
 // Whether a cell seems to move, as do more than half of it and those around it.
-SPS_INLINE bool is_moving(const DepthGrids& grids, const std::uint32_t* evidence, std::int64_t cell) {
+SPS_INLINE bool is_moving(const DepthGrids& grids, const std::uint32_t* evidence, const std::uint16_t* depth,
+                          std::int64_t cell) {
+  if (!seems_moving(evidence[cell]) || depth[cell] == 0) return false;
   const std::int64_t row = cell / grids.columns, column = cell % grids.columns;
-  if (!seems_moving(evidence[cell]) || !(cell_depth(grids, row, column) > 0.0)) return false;
   int moving = 0, all = 0;
   for (std::int64_t r = row > 0 ? row - 1 : 0; r <= row + 1 && r < grids.rows; ++r) {
     for (std::int64_t c = column > 0 ? column - 1 : 0; c <= column + 1 && c < grids.columns; ++c) {
-      moving += seems_moving(evidence[r * grids.columns + c]) && cell_depth(grids, r, c) > 0.0;
+      const std::int64_t other = r * grids.columns + c;
+      moving += seems_moving(evidence[other]) && depth[other] != 0;
       ++all;
     }
   }

@@ -7,6 +7,7 @@ import torch
 
 from spslam import ops
 from spslam.errors import DeviceError
+from spslam.scene.device import usable_device
 
 # What torch's allocators say, by the way they ask for memory.
 _CPU_OUT_OF_MEMORY = ("not enough memory", "can't allocate memory", "Cannot allocate memory")
@@ -22,18 +23,7 @@ def resolve_device(name: str) -> torch.device:
     """
     if name == "auto":
         name = "cpu" if ops.CUDA_OFF_REASON else "cuda"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise DeviceError(f"device must be auto, cpu, cuda or cuda:N, got {name}") from None
-    if device.type == "cuda":
-        if ops.CUDA_OFF_REASON:
-            raise DeviceError(f"device {name} is not available: {ops.CUDA_OFF_REASON}; use --device cpu")
-        if device.index is not None and device.index >= torch.cuda.device_count():
-            raise DeviceError(f"device {name} is not available: there are {torch.cuda.device_count()} CUDA devices")
-    elif device.type != "cpu":
-        raise DeviceError(f"device must be auto, cpu, cuda or cuda:N, got {name}")
-    return device
+    return usable_device(name)
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from spslam.errors import SpslamError, brief
 from spslam.options import SceneOptions
 from spslam.scene import sparse_volume, tri_planes
 from spslam.scene.decoders import COLOR_DECODER, GEOMETRY_DECODER, random_parameters
+from spslam.scene.device import usable_device
 from spslam.scene.sparse_volume import SparseVolume
 from spslam.scene.tri_planes import TriPlanes
 from spslam.tensor_file import TensorFile, load_header, load_tensors, save_tensors, whole_number
@@ -94,13 +95,16 @@ class Scene:
             origin: float [3], m; the world origin by default.
             geometry_decoder: trained parameters to start from; random by default.
             device: where the tensors are.
+
+        Raises:
+            DeviceError: the device is not available.
         """
         self.settings = settings
         self.seed = seed
         # Each frame asks for the view, and few change it: the last one, and the objects that it was made of.
         self._view: ops.SceneView | None = None
         self._view_parts: tuple[object, ...] = ()
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         self.origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin.to("cpu", torch.float64)
         self.volume = self._empty_volume()
         self.planes = self._empty_planes()
@@ -209,7 +213,9 @@ class Scene:
 
         Raises:
             SpslamError: no such file, not a map, truncated, or with tensors of another shape.
+            DeviceError: the device is not available.
         """
+        device = usable_device(device)
         header = load_header(path, _FILE)
         state = load_tensors(path, _FILE, TENSOR_SIZES)
         try:

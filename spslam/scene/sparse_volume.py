@@ -7,6 +7,7 @@ import torch
 
 from spslam import ops
 from spslam.errors import SpslamError
+from spslam.scene.device import usable_device
 
 FEATURES = 8
 
@@ -43,6 +44,7 @@ class SparseVolume:
 
     Raises:
         ValueError: a number out of range.
+        DeviceError: the device is not available.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class SparseVolume:
         if capacity < 1:
             raise ValueError(f"SparseVolume: capacity must be at least 1, got {capacity}")
         self.voxel_size_m = float(voxel_size_m)
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         self.cells = ops.VoxelHash(capacity, self.device, max_voxels)
         self._embeddings = torch.zeros((self.capacity, FEATURES), dtype=torch.float32, device=self.device)
         self._weights = torch.zeros(self.capacity, dtype=torch.float32, device=self.device)

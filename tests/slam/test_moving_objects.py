@@ -44,12 +44,12 @@ def frames(walked):
     return torch.stack(depth), torch.stack([pose_tensor(walked.poses()[i], CPU) for i in FRAMES])
 
 
-def found(walked, frames, device, newest=-1, rows=None, noise=NOISE):
+def found(walked, frames, device, newest=-1, rows=None, noise=NOISE, step=STEP):
     images, poses = (each.to(device) for each in frames)
-    cells = images[:, ::STEP, ::STEP].contiguous()
+    cells = images[:, ::step, ::step].contiguous()
     last = len(FRAMES) + newest
     rows = [(i, i) for i in range(last)] if rows is None else rows
-    grid = ops.comparison.DepthCells(depth_image_intrinsics(walked.camera), UNIT, STEP, MARGIN_M, TURN, DEVIATIONS)
+    grid = ops.comparison.DepthCells(depth_image_intrinsics(walked.camera), UNIT, step, MARGIN_M, TURN, DEVIATIONS)
     return ops.comparison.find_moving_cells(images[last], poses[last], (cells, poses, rows), noise.to(device), grid)
 
 
@@ -62,10 +62,10 @@ def nearest(depth, row, column):
     return known[known > 0].min() if (known > 0).any() else 0.0
 
 
-def expected(walked, frames):
+def expected(walked, frames, step):
     """The cells of the newest frame by the definition, one after the other."""
     images, poses = frames[0].numpy().astype(float) * UNIT, pose7_to_matrix(frames[1].double().numpy())
-    cells, k = images[:, ::STEP, ::STEP], depth_image_intrinsics(walked.camera)
+    cells, k = images[:, ::step, ::step], depth_image_intrinsics(walked.camera)
     now, shape = cells[-1], cells[-1].shape
     floor, growth = NOISE[:2].double().numpy()
 
@@ -73,12 +73,12 @@ def expected(walked, frames):
         return MARGIN_M + TURN * z + DEVIATIONS * np.sqrt(floor + growth * z**4)
 
     def seen(source, target, row, column, z):
-        u, v = column * STEP, row * STEP
+        u, v = column * step, row * step
         point = poses[source] @ [(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z, 1]
         x, y, depth, _ = inverse(poses[target]) @ point
         if depth <= 0.05:
             return None
-        column, row = (int(np.floor(p / STEP + 0.5)) for p in (x / depth * k.fx + k.cx, y / depth * k.fy + k.cy))
+        column, row = (int(np.floor(p / step + 0.5)) for p in (x / depth * k.fx + k.cx, y / depth * k.fy + k.cy))
         return (row, column, depth) if 0 <= row < shape[0] and 0 <= column < shape[1] else None
 
     free, same, gone = np.zeros((3, *shape), bool)
@@ -102,9 +102,10 @@ def expected(walked, frames):
     return np.reshape(marked, shape), [moving.sum(), (now > 0).sum()]
 
 
-def test_cells_by_the_definition(walked, frames, device):
-    cells, counts = found(walked, frames, device)
-    marked, numbers = expected(walked, frames)
+@pytest.mark.parametrize("step", [STEP, 2])  # 54 and 80 columns; the CPU looks at 64 at a time
+def test_cells_by_the_definition(walked, frames, device, step):
+    cells, counts = found(walked, frames, device, step=step)
+    marked, numbers = expected(walked, frames, step)
     assert 0.03 < numbers[0] / numbers[1] < 0.5
     assert (cells.cpu().numpy() != marked).sum() <= 9  # one cell and those around, at a border
     np.testing.assert_allclose(counts.cpu().numpy(), numbers, atol=1)

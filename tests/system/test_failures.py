@@ -7,10 +7,15 @@ import signal
 import pytest
 import torch
 
+from spslam.camera import Camera
+from spslam.config import load_config
 from spslam.errors import DeviceError
 from spslam.run.device import explained_failures, resolve_device
 from spslam.run.interruption import Interruption
+from spslam.scene.scene import Scene
+from spslam.scene.sparse_volume import SparseVolume
 from spslam.slam.mapper import Mapper
+from spslam.slam.system import SlamSystem
 from spslam.trajectory import Trajectory
 from tests.system.sequences import Recorded, results, run_on
 
@@ -79,9 +84,16 @@ def test_memory_that_is_really_not_there(tmp_path):
 def test_an_absent_device_is_one_line(monkeypatch, name):
     if name == "cuda" and torch.cuda.is_available():
         pytest.skip("it is there")
-    with pytest.raises(DeviceError, match=f"device {name} is not available: ") as raised:
-        resolve_device(name)
-    assert "\n" not in str(raised.value)
+    camera = Camera(fx=60, fy=60, cx=40, cy=30, width=80, height=60)
+    for call in (
+        resolve_device,
+        lambda device: SparseVolume(0.05, device=device),
+        lambda device: SlamSystem(load_config("demo"), camera, device=device),
+        lambda device: Scene.load("no-file", device),
+    ):
+        with pytest.raises(DeviceError, match=f"device {name} is not available: ") as raised:
+            call(name)
+        assert "\n" not in str(raised.value)
 
 
 def interrupt_after(frames: int):

@@ -27,8 +27,12 @@ struct DepthGrids {
   std::int32_t slots[kMaxEarlierGrids], frames[kMaxEarlierGrids];  // of each earlier frame: its cells, and its pose
 };
 
-template <class Device>
-std::int64_t moving_cells_workspace_size(Device device, const DepthGrids& grids);
+// Bytes of find_moving_cells's scratch, aligned to four.
+inline std::int64_t moving_cells_workspace_size(const DepthGrids& grids) {
+  constexpr std::int64_t kPerGrid = sizeof(std::uint16_t);
+  constexpr std::int64_t kOnce = sizeof(std::uint32_t) + sizeof(std::uint16_t) + sizeof(std::uint8_t);
+  return grids.rows * grids.columns * ((1 + grids.num_earlier) * kPerGrid + kOnce);
+}
 
 // cells [rows, columns] = 1 where the frame shows what moves, and in the cells around. A cell moves if an earlier frame
 // saw something clearly behind it, or if the frame sees through where an earlier one saw surface and no earlier one saw
