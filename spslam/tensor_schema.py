@@ -312,6 +312,7 @@ CHECKPOINT = TensorSchema(
         "depth_keyframes.intensities": TensorRule(
             torch.uint8, ("depth_images", "depth_image_rows", "depth_image_columns"), optional=True
         ),
+        "depth_keyframes.readouts": TensorRule(torch.float32, ("depth_images",), low=-1, high=1, optional=True),
         "depth_keyframes.frames": TensorRule(torch.int64, ("depth_images",), low=-1, optional=True),
         "depth_history.cells": TensorRule(
             torch.uint16, ("depth_histories", "depth_cell_rows", "depth_cell_columns"), optional=True
@@ -335,8 +336,7 @@ CHECKPOINT = TensorSchema(
         _check_moments,
     ),
     (
-        ("depth_keyframes.images", "depth_keyframes.intensities"),
-        ("depth_keyframes.images", "depth_keyframes.frames"),
+        *(("depth_keyframes.images", f"depth_keyframes.{name}") for name in ("intensities", "readouts", "frames")),
         *(("depth_history.cells", f"depth_history.{name}") for name in ("frames", "moving", "looked", "off", "found")),
         *(("newest.frame", name) for name in _newest_rules()),
         *(("graph.frames", name) for name in _graph_rules("graph.")),

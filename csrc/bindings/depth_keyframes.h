@@ -1,6 +1,8 @@
 // Depth keyframes as arguments of ops.
 #pragma once
 
+#include <algorithm>
+
 #include "bindings/number_list.h"
 #include "spslam/gauss_newton.h"
 
@@ -26,7 +28,7 @@ inline FrameMotion load_motion(const char* name, const std::int64_t* integers, s
 
 // Whether there are log gains among the tensors below: of all frames, the last but one, and of the one compared.
 inline bool has_log_gains(const std::vector<Tensor>& tensors) {
-  return tensors.size() >= 5;
+  return tensors.size() >= 5 && tensors[tensors.size() - 2].dim() == 2;
 }
 
 // The tensors below, contiguous; the log gains of all frames may stay a column of a table, which has a stride.
@@ -39,20 +41,23 @@ inline std::vector<Tensor> readable_keyframes(const std::vector<Tensor>& tensors
   return result;
 }
 
-// Of the images, the poses and, if any, the intensities, and after them the delay of colors, if any, and the log gains
-// of all frames and of the one compared, if any, there perhaps with a variance; none without tensors. They must outlive
-// the launch.
+// Of the images, the poses and, if any, the intensities, and after them, if any, the delay of colors and the readouts,
+// and the log gains of all frames and of the one compared, there perhaps with a variance; none without tensors. They
+// must outlive the launch.
 inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<Tensor>& tensors,
                                            const std::vector<double>& numbers,
                                            const std::vector<std::int64_t>& integers) {
   if (tensors.empty()) return {};
   const Scalars<KeyframeScalar> scalars(name, "depth_keyframe_scalars", numbers);
-  SPS_CHECK(tensors.size() >= 2 && tensors.size() <= 6 && tensors[0].dim() == 3 && tensors[1].dim() == 2 &&
+  SPS_CHECK(tensors.size() >= 2 && tensors.size() <= 7 && tensors[0].dim() == 3 && tensors[1].dim() == 2 &&
                 tensors[1].size(1) == kPoseSize && (tensors.size() == 2 || same_shape(tensors[2], tensors[0])),
             name, ": depth_keyframes must be images [R, H, W], poses [F, 7] and, if any, intensities [R, H, W]");
   const std::size_t size = tensors.size();
-  const bool has_delay = size == 4 || size == 6, has_gains = has_log_gains(tensors);
-  SPS_CHECK(!has_delay || tensors[3].numel() == 1, name, ": color_delay must have one element");
+  const bool has_gains = has_log_gains(tensors);
+  const std::size_t times = size - (has_gains ? 2 : 0) - std::min<std::size_t>(size, 3);
+  const bool has_delay = times >= 1, has_readouts = times == 2;
+  SPS_CHECK(times <= 2 && (!has_delay || tensors[3].numel() == 1), name, ": color_delay must have one element");
+  SPS_CHECK(!has_readouts || has_shape(tensors[4], {tensors[0].size(0)}), name, ": readouts must have shape [R]");
   const std::int64_t own = has_gains ? tensors[size - 1].numel() : 0;
   SPS_CHECK(!has_gains || (has_shape(tensors[size - 2], {tensors[1].size(0), 1}) && (own == 1 || own == 2) &&
                            tensors[size - 1].is_contiguous()),
@@ -68,6 +73,7 @@ inline DepthKeyframes load_depth_keyframes(const char* name, const std::vector<T
   keyframes.images = data<std::uint16_t>(tensors[0]);
   keyframes.intensities = tensors.size() > 2 ? data<std::uint8_t>(tensors[2]) : nullptr;
   keyframes.color_delay = has_delay ? data<float>(tensors[3]) : nullptr;
+  keyframes.readouts = has_readouts ? data<float>(tensors[4]) : nullptr;
   keyframes.log_gains = has_gains ? data<float>(tensors[size - 2]) : nullptr;
   keyframes.frame_log_gain = has_gains ? data<float>(tensors[size - 1]) : nullptr;
   keyframes.log_gain_stride = has_gains ? tensors[size - 2].stride(0) : 0;

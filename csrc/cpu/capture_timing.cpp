@@ -25,7 +25,7 @@ void measure_capture_timing<Cpu>(Cpu, const std::int32_t* pixels, std::int64_t n
   const MovingFrame frame = load_moving_frame(keyframes, pose);
   TimingEvidence all{};
   for (int k = 0; k < keyframes.count; ++k) {
-    const MovingKeyframe keyframe = load_moving_keyframe(keyframes, k);
+    const MovingKeyframe keyframe = load_moving_keyframe(keyframes, k, timing);
     double terms[kTimingTerms];
     const auto add = [&](std::int64_t begin, std::int64_t end, double* own) {
       for (std::int64_t first = begin; first < end; first += kPointsAhead) {

@@ -19,12 +19,13 @@ std::int64_t block_count(std::int64_t num_pixels) {
 // Thread i takes pixel i, row k of the grid keyframe k; partials [rows, blocks, kSums].
 __global__ void __launch_bounds__(kThreads)
     sum_kernel(const std::int32_t* pixels, std::int64_t num_pixels, const float* pose, Intrinsics intrinsics,
-               const float* noise, const __grid_constant__ DepthKeyframes keyframes, double* partials) {
+               const float* noise, const __grid_constant__ DepthKeyframes keyframes, const float* timing,
+               double* partials) {
   __shared__ MovingFrame frame;
   __shared__ MovingKeyframe keyframe;
   __shared__ float sums[kWarps][kSums];
   if (threadIdx.x == 0) frame = load_moving_frame(keyframes, pose);
-  if (threadIdx.x == kWarp) keyframe = load_moving_keyframe(keyframes, static_cast<int>(blockIdx.y));
+  if (threadIdx.x == kWarp) keyframe = load_moving_keyframe(keyframes, static_cast<int>(blockIdx.y), timing);
   __syncthreads();
   const std::int64_t i = std::int64_t{blockIdx.x} * kThreads + threadIdx.x;
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
@@ -74,7 +75,7 @@ void measure_capture_timing<Cuda>(Cuda device, const std::int32_t* pixels, std::
   const cudaStream_t stream = static_cast<cudaStream_t>(device.stream);
   double* partials = static_cast<double*>(workspace);
   const dim3 grid(static_cast<unsigned>(block_count(num_pixels)), static_cast<unsigned>(keyframes.count));
-  sum_kernel<<<grid, kThreads, 0, stream>>>(pixels, num_pixels, pose, intrinsics, noise, keyframes, partials);
+  sum_kernel<<<grid, kThreads, 0, stream>>>(pixels, num_pixels, pose, intrinsics, noise, keyframes, timing, partials);
   SPS_CUDA_CHECK(cudaGetLastError());
   update_kernel<<<1, kSums, 0, stream>>>(partials, grid.x, keyframes.count, state, timing);
   SPS_CUDA_CHECK(cudaGetLastError());

@@ -25,8 +25,9 @@ constexpr double kFrameDeviation = 0.004;
 constexpr double kFirstDeviation = 0.005;
 // s: the estimate is taken to be no better than this, so that it follows a clock that drifts.
 constexpr double kLeastDeviation = 0.001;
-// s: a frame's estimate counts as being off by no more, as a difference of intensities is linear over few pixels only.
-constexpr double kMostOff = 0.01;
+// Of the difference between a frame's estimate and what is known: it counts as no larger, as differences of intensities
+// are linear over few pixels only, and a camera does not move evenly.
+constexpr double kMostDeviations = 2.5;
 // s: no estimate is larger, as images farther apart in time are not compensated.
 constexpr double kMostTime = 0.9 * static_cast<double>(kMaxColorDelay);
 // 1/s^2: of less than a second's deviation a frame says nothing.
@@ -53,15 +54,18 @@ SPS_INLINE void add_timing_row(const T (&row)[kTimingUnknowns], T residual, T we
   for (int a = 0; a < kTimingUnknowns; ++a) terms[at++] += weight * row[a] * residual;
 }
 
-// A keyframe, and how the camera moved at it.
+// A keyframe, how the camera moved at it, and by how much the readout that is known is longer than the one by which its
+// images were rectified, s.
 struct MovingKeyframe {
   DepthKeyframe keyframe;
   CameraVelocity velocity;
+  float unrectified;
 };
 
-SPS_INLINE MovingKeyframe load_moving_keyframe(const DepthKeyframes& keyframes, int k) {
+SPS_INLINE MovingKeyframe load_moving_keyframe(const DepthKeyframes& keyframes, int k, const float* timing) {
   const float* pose = keyframes.poses + kPoseSize * keyframes.pose_rows[k];
-  return {load_depth_keyframe(keyframes, k), camera_velocity(keyframes.poses, keyframes.motions[k], pose)};
+  const float unrectified = keyframes.readouts ? timing[1] - keyframes.readouts[keyframes.image_rows[k]] : 0.0f;
+  return {load_depth_keyframe(keyframes, k), camera_velocity(keyframes.poses, keyframes.motions[k], pose), unrectified};
 }
 
 // The frame that is compared: where and how the camera is when it takes depth and color.
@@ -121,7 +125,7 @@ SPS_INLINE Vec3<float> carried(const CameraVelocity& velocity, const Vec3<float>
 
 // Adds what one pixel says against one keyframe to terms [kTimingTerms], weighted by inverse variances. The derivative
 // of a residual by a time is that of a point which the frame's camera carries along, less that of one which the
-// keyframe's does.
+// keyframe's does. The frame was rectified by the readout that is known, the keyframe perhaps by another one.
 template <class T>
 SPS_INLINE void add_timing_residuals(const DepthKeyframes& keyframes, const MovingKeyframe& moving,
                                      const MovingFrame& frame, const Pixel& pixel, const Intrinsics& intrinsics,
@@ -148,8 +152,9 @@ SPS_INLINE void add_timing_residuals(const DepthKeyframes& keyframes, const Movi
     const T row[kTimingUnknowns] = {facing.x, facing.y, facing.z, turned.x,
                                     turned.y, turned.z, 0,        dot(facing, by_frame - by_keyframe)};
     const float width = kRobustDeviations * std::sqrt(plane.variance) + kSurfaceWidth * at.in_camera.z;
-    const float weight = robust_weight(plane.distance, width) / plane.variance;
-    add_timing_row(row, static_cast<T>(plane.distance), static_cast<T>(weight), terms);
+    const float distance = plane.distance - moving.unrectified * dot(facing, by_keyframe);
+    const float weight = robust_weight(distance, width) / plane.variance;
+    add_timing_row(row, static_cast<T>(distance), static_cast<T>(weight), terms);
   }
   const IntensityDifference difference = intensity_difference(keyframes, keyframe, color_at, luma(pixel.color));
   const float deviation = intensity_deviation(&sensor, difference.by_u, difference.by_v);
@@ -166,8 +171,9 @@ SPS_INLINE void add_timing_residuals(const DepthKeyframes& keyframes, const Movi
                                         arm.z,
                                         dot(slope, by_frame - by_keyframe),
                                         dot(slope, own_share * by_frame - other_share * by_keyframe)};
-  const float weight = intensity_share(sensor) * robust_weight(difference.value, kRobustDeviations * deviation);
-  add_timing_row(color_row, static_cast<T>(difference.value), static_cast<T>(weight / (deviation * deviation)), terms);
+  const float value = difference.value - moving.unrectified * other_share * dot(slope, by_keyframe);
+  const float weight = intensity_share(sensor) * robust_weight(value, kRobustDeviations * deviation);
+  add_timing_row(color_row, static_cast<T>(value), static_cast<T>(weight / (deviation * deviation)), terms);
   terms[kTimingTerms - 1] += T(1);
 }
 
@@ -227,9 +233,9 @@ SPS_INLINE void update_capture_timing(const TimingEvidence& evidence, double* st
   }
   for (int i = 0; i < kTimings; ++i) {
     double* own = state + 2 * i;
-    const double weight = 1.0 / (variance[i] + kFrameDeviation * kFrameDeviation);
-    const double sum = (own[1] > kFirst ? own[1] : kFirst) + weight;
-    const double moved = own[0] + weight / sum * std::fmin(std::fmax(steps[i], -kMostOff), kMostOff);
+    const double known = own[1] > kFirst ? own[1] : kFirst, of_frame = variance[i] + kFrameDeviation * kFrameDeviation;
+    const double most = kMostDeviations * std::sqrt(of_frame + 1.0 / known), sum = known + 1.0 / of_frame;
+    const double moved = own[0] + std::fmin(std::fmax(steps[i], -most), most) / (of_frame * sum);
     own[0] = std::fmin(std::fmax(moved, -kMostTime), kMostTime);
     own[1] = std::fmin(sum, kMost);
   }

@@ -84,11 +84,14 @@ class ColorTiming(NamedTuple):
             where color comes first (see `measure_capture_timing_`).
         keyframes: the motion of each keyframe.
         frame: that of the frame which is compared with them.
+        readouts: float32 [R] by which of them each image of the keyframes was rectified, s; None takes all to be
+            rectified as the frame is. Only `measure_capture_timing_` heeds it.
     """
 
     delay: torch.Tensor
     keyframes: tuple[FrameMotion, ...]
     frame: FrameMotion
+    readouts: torch.Tensor | None = None
 
     def check(self, function: str, like: torch.Tensor, keyframes: int, poses: int) -> None:
         """Raises TypeError or ValueError, naming `function`, where something does not fit."""
@@ -176,6 +179,9 @@ class DepthKeyframes(NamedTuple):
         if self.timing is not None:
             check(self.intensities is not None, function, f"{name}.timing", "come with intensities", "none")
             self.timing.check(function, like, count, len(self.poses))
+            if self.timing.readouts is not None:
+                shape = self.images.shape[:1]
+                check_tensor(function, f"{name}.timing.readouts", self.timing.readouts, shape, torch.float32, like=like)
         if self.exposure is not None:
             check(self.intensities is not None, function, f"{name}.exposure", "come with intensities", "none")
             self.exposure.check(function, like, len(self.poses))
@@ -186,8 +192,8 @@ class DepthKeyframes(NamedTuple):
         motions = [NO_MOTION] * (1 + count) if timing is None else [timing.frame, *timing.keyframes]
         frame, *others = ((each.row, round(1e9 * each.seconds), round(1e9 * each.color_offset)) for each in motions)
         places = [place for row, motion in zip(self.rows, others, strict=True) for place in (*row, *motion)]
-        delay = None if timing is None else timing.delay
-        tensors = [self.images, self.poses, self.intensities, delay, *(self.exposure or ())]
+        times = (None, None) if timing is None else (timing.delay, timing.readouts)
+        tensors = [self.images, self.poses, self.intensities, *times, *(self.exposure or ())]
         scalars = [*self.intrinsics, self.unit, self.kernel_end]
         return [one for one in tensors if one is not None], scalars, [self.first_iteration, *frame, *places]
 

@@ -21,7 +21,7 @@ MOST_BETWEEN = 15  # frames between two of them, where stamps say less
 
 
 class DepthHistory:
-    """Depth images of some of the last frames, every `step`-th pixel, whatever moves in them included.
+    """Depth images of some of the last frames, every `step`-th pixel, rectified, whatever moves in them included.
 
     Attributes:
         step: px of the depth image.
@@ -49,25 +49,26 @@ class DepthHistory:
         self.off: tuple[float, ...] = UNPREDICTED
         self.found = torch.zeros(2, dtype=torch.int32, device=device)
 
-    def keep(self, frame: int, seconds: float, depth: torch.Tensor, copies: RowCopies | None = None) -> bool:
-        """Takes frame number `frame` in, asynchronously, unless another one was taken in just before.
+    def takes(self, frame: int, seconds: float) -> bool:
+        """Whether frame number `frame` is to be kept; not if another one was just before.
 
         Args:
             frame: its number.
-            seconds: since the last one that was taken in; 0 where there is none, or no time has passed.
-            depth: uint16 [H, W], its depth image as it was read.
-            copies: cells are written when these are made; None writes them now.
-
-        Returns:
-            Whether it was taken in.
+            seconds: since the last one that was kept; 0 where there is none, or no time has passed.
         """
-        between = frame - max(self.frames)
-        if 0 < seconds < INTERVAL_S and between < MOST_BETWEEN:
-            return False
+        return not 0 < seconds < INTERVAL_S or frame - max(self.frames) >= MOST_BETWEEN
+
+    def keep(self, frame: int, cells: torch.Tensor, copies: RowCopies | None = None) -> None:
+        """Takes frame number `frame` in, asynchronously, in the place of the oldest.
+
+        Args:
+            frame: its number.
+            cells: uint16 [h, w] of its depth image.
+            copies: they are written when these are made; None writes them now.
+        """
         slot = self.frames.index(min(self.frames))
-        write_rows(copies, [self.cells], [slot], [depth[:: self.step, :: self.step].contiguous()])
+        write_rows(copies, [self.cells], [slot], [cells])
         self.frames[slot] = frame
-        return True
 
     def predicted(self, off_m: float, off_rad: float) -> None:
         """Takes account of by how much a frame's predicted pose was off; a jump says no more than `MOST_OFF`."""

@@ -20,6 +20,7 @@ class DepthKeyframeStore:
     Attributes:
         images: uint16 [S, h, w] depth in units of `unit` m, 0 where unknown; the first is the last frame's.
         intensities: uint8 [S, h, w] in 1/255.
+        readouts: float32 [S] by which each was rectified, s; 0 where it is as it was read.
         frames: number of the frame that each image is of, -1 for none.
         unit: m.
         max_depth_m: the largest depth that images hold.
@@ -40,16 +41,33 @@ class DepthKeyframeStore:
         slots = 2 + max(AGES)
         self.images = torch.zeros(slots, *depth_image_shape(camera), dtype=torch.uint16, device=device)
         self.intensities = torch.zeros_like(self.images, dtype=torch.uint8)
+        self._readout_rows = torch.zeros(slots, 1, dtype=torch.float32, device=device)
+        self.readouts = self._readout_rows[:, 0]  # a view
+        self._no_readout = torch.zeros(1, dtype=torch.float32, device=device)
         self.frames = [-1] * slots
         self.intrinsics = depth_image_intrinsics(camera)
 
-    def add(self, frame: int, depth: torch.Tensor, intensity: torch.Tensor, copies: RowCopies | None = None) -> None:
-        """Stores the images uint16 and uint8 [h, w] of frame number `frame`, asynchronously.
+    def add(
+        self,
+        frame: int,
+        depth: torch.Tensor,
+        intensity: torch.Tensor,
+        shutter: ops.ShutterMotion | None = None,
+        copies: RowCopies | None = None,
+    ) -> None:
+        """Stores the images of a frame, asynchronously.
 
-        With `copies`, they are written when these are made.
+        Args:
+            frame: its number.
+            depth: uint16 [h, w].
+            intensity: uint8 [h, w].
+            shutter: by which these were rectified; None where they are as they were read.
+            copies: all is written when these are made; None writes now.
         """
+        readout = self._no_readout if shutter is None else shutter.readout
         for slot in (0,) if frame % INTERVAL else (0, self._slot(frame)):
-            write_rows(copies, [self.images, self.intensities], [slot, slot], [depth, intensity])
+            columns = [self.images, self.intensities, self._readout_rows]
+            write_rows(copies, columns, [slot] * len(columns), [depth, intensity, readout])
             self.frames[slot] = frame
 
     def select(self, frame: int, is_lost: Callable[[int], bool], poses: torch.Tensor) -> ops.DepthKeyframes | None:
@@ -77,12 +95,13 @@ class DepthKeyframeStore:
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """All that a checkpoint needs."""
-        return {"images": self.images, "intensities": self.intensities, "frames": torch.tensor(self.frames)}
+        images = {name: getattr(self, name) for name in ("images", "intensities", "readouts")}
+        return {**images, "frames": torch.tensor(self.frames)}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replaces the content by a copy of what `tensors()` returned."""
-        self.images.copy_(state["images"])
-        self.intensities.copy_(state["intensities"])
+        for name in ("images", "intensities", "readouts"):
+            getattr(self, name).copy_(state[name])
         self.frames = state["frames"].tolist()
 
     @staticmethod

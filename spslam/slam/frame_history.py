@@ -161,7 +161,7 @@ class FrameHistory:
             return None
         motions = tuple(self.own_motion(row) for _, row in selected.rows)
         motion = self.motion(len(frames), depth_time, color_offset, COLOR_MOTION_S)
-        timing = ops.ColorTiming(state.noise.color_delay, motions, motion)
+        timing = ops.ColorTiming(state.noise.color_delay, motions, motion, state.depth_keyframes.readouts)
         exposure = ops.Exposure(frames.log_gain_rows, frames.gains[-1])
         return selected._replace(timing=timing, exposure=exposure)
 

@@ -93,7 +93,7 @@ class FramePipeline:
         self.tracker = Tracker(config, camera, confidence.score_kernel_m)
         self.recovery = Recovery(config, camera, self.tracker, confidence)
         self._localizer = Localizer(self.tracker, self.recovery, self._rectifier)
-        self._moving = MovingObjects(config, camera, self.tracker)
+        self._moving = MovingObjects(config, camera, self.tracker, self._rectifier if self._measures_timing else None)
         self.mapper = Mapper(config, camera, prior if config.prior.enabled else None)
         self.first_pose = np.eye(4)
         self.global_mapping: GlobalMapping | None = None
@@ -156,7 +156,7 @@ class FramePipeline:
         read, self.history.coming_s = self._receive(frame, events), frame.depth_time
         static = StaticFrame(self.features.of(read))
         if not begins_map:
-            static = self._moving.without(self.state, self.history, static.features)
+            static = self._moving.without(self.state, self.history, frame, static.features)
         if self.global_mapping is not None:
             self.global_mapping.before_tracking()
         constraints = Constraints()
@@ -340,11 +340,11 @@ class FramePipeline:
         is_known = not tracked.occluded and not tracked.lost
         if state.newest is not None and is_known:
             state.newest.replace(number, static.features.whole, shutter, copies)
-        moving = self._moving.keep(state, self.history, read, static, tracked, copies)
+        moving = self._moving.keep(state, self.history, read, static, shutter, tracked, copies)
         if state.depth_keyframes is not None and is_known:
             if constraints.depth_keyframes is not None:
                 state.noise.measure(pixels, tracked.pose, constraints.depth_keyframes, tracked.gain)
-            state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image, copies)
+            state.depth_keyframes.add(number, pixels.depth_image, pixels.intensity_image, shutter, copies)
         copies.make()
         return moving
 

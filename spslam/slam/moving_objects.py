@@ -23,12 +23,14 @@ from spslam.slam.depth_history import WATCHED_S, DepthHistory
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.device_events import DeviceEvent, event_recorder, fetch
 from spslam.slam.feature_store import uses_features
-from spslam.slam.frame_history import FrameHistory
+from spslam.slam.frame_history import COLOR_MOTION_S, FrameHistory
 from spslam.slam.frame_table import FrameTable
 from spslam.slam.image_features import FrameFeatures
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, FramePixels
+from spslam.slam.prepared_frame import PreparedFrame
 from spslam.slam.recovery.feature_alignment import FeatureAlignment, joined_too
 from spslam.slam.recovery.tracked_frame import TrackedFrame
+from spslam.slam.rolling_shutter import ShutterRectifier
 from spslam.slam.row_copies import RowCopies
 from spslam.slam.state import SlamState
 from spslam.slam.tracker import Tracker
@@ -77,12 +79,12 @@ class MovingObjects:
         config: options of the run.
         camera: of all frames.
         tracker: predicts poses.
+        rectifier: of frames that a rolling shutter bends; None where none is measured.
     """
 
-    def __init__(self, config: Config, camera: Camera, tracker: Tracker):
-        self._camera, self._tracker = camera, tracker
+    def __init__(self, config: Config, camera: Camera, tracker: Tracker, rectifier: ShutterRectifier | None):
+        self._camera, self._tracker, self._rectifier = camera, tracker, rectifier
         self._unit = depth_unit(config.dataset.max_depth_m)
-        self._intrinsics = depth_image_intrinsics(camera)
         self._image_step = depth_image_step(camera)
         self._uses_features = uses_features(config)
         self._coming: tuple[DeviceEvent, torch.Tensor] | None = None  # what was found, on its way from the device
@@ -91,13 +93,16 @@ class MovingObjects:
         """Another state follows."""
         self._coming = None
 
-    def without(self, state: SlamState, history: FrameHistory, features: FrameFeatures) -> StaticFrame:
+    def without(
+        self, state: SlamState, history: FrameHistory, frame: PreparedFrame, features: FrameFeatures
+    ) -> StaticFrame:
         """The next frame without what moves in it.
 
         Args:
             state: before the frame; when something moved last is noted in it.
             history: the frames before.
-            features: of the frame as it was read.
+            frame: the next one.
+            features: of it, as it was read.
         """
         known = state.depth_history
         if known is None or history.is_lost or not features.pixels.count:
@@ -106,10 +111,12 @@ class MovingObjects:
         if not self._is_watched(known, history):
             return StaticFrame(features)
         predicted, start = self._tracker.predict(state.frames, history.steps), None
+        shutter = self._predicted_shutter(state, history, frame, predicted)
         if self._uses_features:
-            start = self._by_features(state.frames.opened, history, features, predicted)
+            start = self._by_features(state.frames.opened, history, frame, features, predicted, shutter)
         pose, off = (predicted, known.off) if start is None else (start, NOT_OFF)
-        found = self._look(state.frames, known, history, features.pixels, pose, off)
+        cells = self._cells(features.pixels, known.step, shutter)
+        found = self._look(state.frames, known, history, cells, pose, off)
         if found is None:
             return StaticFrame(features, is_watched=True)
         left = features.having(self._left_out(features, known.step, *found))
@@ -132,6 +139,7 @@ class MovingObjects:
         history: FrameHistory,
         read: FramePixels,
         static: StaticFrame,
+        shutter: ops.ShutterMotion | None,
         tracked: TrackedFrame,
         copies: RowCopies,
     ) -> torch.Tensor | None:
@@ -142,6 +150,7 @@ class MovingObjects:
             history: the frames before.
             read: its pixels as they were read.
             static: those that do not move.
+            shutter: by which the frame was rectified; None where it was not.
             tracked: what tracking made of it.
             copies: what is stored is written when these are made.
 
@@ -154,13 +163,44 @@ class MovingObjects:
         off = tracked.fit.prediction_error_cm / 100, math.radians(tracked.fit.prediction_error_deg)
         if static.start is None and not math.isnan(sum(off)):
             known.predicted(*off)
-        if not static.is_watched and number % WATCHED_EVERY == 0:
-            found = self._look(state.frames, known, history, read, tracked.pose, NOT_OFF)
-            counts = None if found is None else self._fetched(known, number, found[1])
         last = max(known.frames)
         seconds = state.frames.depth_time(number) - state.frames.depth_time(last) if last >= 0 else 0.0
-        known.keep(number, seconds, read.depth_image, copies)
+        is_looked_at = not static.is_watched and number % WATCHED_EVERY == 0
+        is_kept = known.takes(number, seconds)
+        if not (is_looked_at or is_kept):
+            return counts
+        cells = self._cells(read, known.step, shutter)
+        if is_looked_at:
+            found = self._look(state.frames, known, history, cells, tracked.pose, NOT_OFF)
+            counts = None if found is None else self._fetched(known, number, found[1])
+        if is_kept:
+            known.keep(number, cells, copies)
         return counts
+
+    def _predicted_shutter(
+        self, state: SlamState, history: FrameHistory, frame: PreparedFrame, predicted: torch.Tensor
+    ) -> ops.ShutterMotion | None:
+        """By which the next frame is bent where the camera goes on as it came; None where that is not known."""
+        frames, seconds = state.frames, None
+        if self._rectifier is not None and frames.knows_speed:
+            seconds = self._rectifier.seconds(state, history, frame.depth_time)
+        if seconds is None:
+            return None
+        return ops.ShutterMotion(frames.pose_rows[len(frames) - 1], predicted, seconds, state.noise.readout)
+
+    def _cells(self, pixels: FramePixels, step: int, shutter: ops.ShutterMotion | None) -> torch.Tensor:
+        """Depth uint16 [h, w] of a frame as it was read, every step-th pixel, rectified."""
+        cells = pixels.depth_image[::step, ::step].contiguous()
+        if shutter is None or min(cells.shape) < 2:
+            return cells
+        rectified, gray = torch.empty_like(cells), torch.empty_like(cells, dtype=torch.uint8)
+        ops.trusted.rectify_shutter_images_(
+            rectified, torch.empty_like(gray), cells, gray, shutter, self._cell_intrinsics(step), self._unit
+        )
+        return rectified
+
+    def _cell_intrinsics(self, step: int) -> ops.Intrinsics:
+        return ops.Intrinsics(*(each / step for each in depth_image_intrinsics(self._camera)))
 
     def _is_watched(self, known: DepthHistory, history: FrameHistory) -> bool:
         return known.moving >= 0 and 0 <= history.seconds_since(known.moving) <= WATCHED_S
@@ -170,23 +210,23 @@ class MovingObjects:
         frames: FrameTable,
         known: DepthHistory,
         history: FrameHistory,
-        pixels: FramePixels,
+        cells: torch.Tensor,
         pose: torch.Tensor,
         off: tuple[float, ...],
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Cells and counts of `ops.comparison.find_moving_cells` for a frame at a pose that may be off by so much, m
-        and radians; None where no earlier frame tells."""
+        """Cells and counts of `ops.comparison.find_moving_cells` for depth in cells at a pose that may be off by so
+        much, m and radians; None where no earlier frame tells."""
         earlier = known.known(frames.is_lost, history.seconds_since)
         if not earlier:
             return None
         off_m, off_rad = off
         margins = MARGIN_M + TIMES_OFF * off_m, TIMES_OFF * off_rad, DEVIATIONS
         return ops.comparison.find_moving_cells(
-            pixels.depth_image,
+            cells,
             pose,
             (known.cells, frames.pose_rows, earlier),
             history.noise,
-            ops.comparison.DepthCells(self._intrinsics, self._unit, known.step, *margins),
+            ops.comparison.DepthCells(self._cell_intrinsics(known.step), self._unit, 1, *margins),
         )
 
     def _fetched(self, known: DepthHistory, number: int, counts: torch.Tensor) -> torch.Tensor:
@@ -221,7 +261,13 @@ class MovingObjects:
         return dict(zip(names, tensors, strict=True))
 
     def _by_features(
-        self, first: int, history: FrameHistory, features: FrameFeatures, predicted: torch.Tensor
+        self,
+        first: int,
+        history: FrameHistory,
+        frame: PreparedFrame,
+        features: FrameFeatures,
+        predicted: torch.Tensor,
+        shutter: ops.ShutterMotion | None,
     ) -> torch.Tensor | None:
         """Pose float32 [7] that most features agree on with frames of the last two seconds, from number `first` on;
         None where too few do, or nearly as many with the one that motion predicts."""
@@ -229,8 +275,15 @@ class MovingObjects:
         known = {row: kept for row in rows if (kept := history.features(row)) is not None and len(kept)}
         if not known:
             return None
-        image = FeatureAlignment(features.extracted, self._camera, device=history.poses.device)
-        poses = history.color_poses(list(known), is_timed=False)
+        read = rectified = features.extracted
+        if shutter is not None and self._rectifier is not None:
+            rectified = self._rectifier.features(read, shutter)
+        motion = None
+        if self._rectifier is not None:
+            came = history.motion(len(history.poses), frame.depth_time, frame.offsets.color, COLOR_MOTION_S)
+            motion = history.color_motion(came)
+        image = FeatureAlignment(rectified, self._camera, motion, read, history.poses.device)
+        poses = history.color_poses(list(known), is_timed=self._rectifier is not None)
         matches = max(joined_too(image.matches_with(list(zip(known.values(), poses, strict=True)))), key=len)
         pose = image.pose(matches, history.poses.device) if len(matches) >= MIN_AGREEING else None
         if pose is None:

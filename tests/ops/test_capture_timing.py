@@ -124,6 +124,32 @@ def test_times_are_found(delay, readout, device):
     ]
 
 
+def test_a_long_readout_is_found_within_six_frames(device):
+    timing = _measured(Recording(20, readout=0.03, device=device), noise_model(*NOISE, device=device), rounds=1)
+    assert 0.022 < float(timing.state[1, 0]) < 0.033
+
+
+def test_keyframes_may_be_rectified_by_another_readout(device):
+    recording, noise = Recording(18, readout=0.03, device=device), noise_model(*NOISE, device=device)
+    read = recording.images.clone(), recording.grays.clone()
+    known, found = torch.tensor([0.0, 0.03], device=device), []
+    records = _rectified(recording, 17, known[1:])[2]
+    for by, is_said in ((0.03, False), (0.01, True), (0.01, False)):
+        readouts = torch.full((18,), by, device=device)
+        for one in (11, 16):
+            recording.images[one], recording.grays[one] = (part[one] for part in read)
+            recording.images[one], recording.grays[one] = _rectified(recording, one, readouts[:1])[:2]
+        state = torch.tensor([[0.0, 1e5], [0.03, 1e5]], dtype=torch.float64, device=device)
+        timing = ops.CaptureTiming(known.clone(), state)
+        keyframes = recording.keyframes(17, (11, 16), timing.color_delay)
+        times = keyframes.timing._replace(readouts=readouts if is_said else None)
+        keyframes = keyframes._replace(timing=times)
+        ops.measure_capture_timing_(timing, records, recording.poses[17], CAMERA, noise, keyframes)
+        found.append(float(timing.state[1, 0]))
+    assert found[:2] == pytest.approx([0.03, 0.03], abs=0.0005)
+    assert abs(found[2] - 0.03) > 0.004
+
+
 def test_the_delay_beyond_what_stamps_say_is_found(device):
     offsets = [0.01 * (i % 3 - 1) for i in range(30)]
     noise = noise_model(*NOISE, device=device)

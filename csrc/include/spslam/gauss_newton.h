@@ -62,6 +62,8 @@ struct DepthKeyframes {
   std::int64_t image_rows[kMaxDepthKeyframes], pose_rows[kMaxDepthKeyframes];  // of each keyframe
   // s, from a frame's depth image to its color image, beside what stamps say; null: they are of one moment.
   const float* color_delay;
+  // s, [R], by what readout each image was rectified; null: by that which is known. Read where that is measured.
+  const float* readouts;
   FrameMotion motions[kMaxDepthKeyframes], frame_motion;  // of each keyframe, and of the frame that is aligned
   // Natural logarithms of gains, by how much brighter a frame's image is than others': of row f of the poses at f times
   // the stride, and [1] of the frame that is aligned, as far as it is known. Null: all are alike.
