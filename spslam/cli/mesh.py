@@ -90,15 +90,15 @@ def _execute_run(
     args: argparse.Namespace, folder: RunFolder, config: Config, file_format: str, device: torch.device
 ) -> None:
     from spslam.evaluation.run_output import RunOutput
-    from spslam.run.mesh import MeshJob, measured_noise, write_mesh
+    from spslam.run.mesh import MeshJob, measured_noise, measured_readout_s, write_mesh
     from spslam.scene import Scene
 
     run = RunOutput.read(args.output)
     options = _mesh_options(args, config.mesh, "neural" if _is_live(run) else config.mesh.source)
     dataset = _open_again(run, config, args.texture) if options.source == "tsdf" or args.texture else None
     earlier = _earlier(folder, dataset is not None) if "map" in run.metrics else []
-    scene, noise = Scene.load(folder.map, device), measured_noise(run.metrics)
-    job = MeshJob(scene, run.trajectory, run.camera, options, noise, earlier, _texture(args), needs_frames=True)
+    scene, of_sensor = Scene.load(folder.map, device), (measured_noise(run.metrics), measured_readout_s(run.metrics))
+    job = MeshJob(scene, run.trajectory, run.camera, options, *of_sensor, earlier, _texture(args), needs_frames=True)
     path = folder.mesh_as(file_format)
     mesh, figures = _replace_mesh(path, lambda place: write_mesh(place, job, dataset))
     _print_mesh(path, mesh, figures)

@@ -106,7 +106,7 @@ def keep_colored(parts: Sequence[PosedFrames]) -> list[KeptFrames]:
             left -= len(more) * frame_bytes
             chosen.update(more)
     return [
-        KeptFrames(part.dataset, part.indices, part.poses, part.noise, frozenset(chosen))
+        KeptFrames(part.dataset, part.indices, part.poses, part.noise, part.readout, frozenset(chosen))
         for part, chosen in zip(parts, wanted, strict=True)
     ]
 

@@ -23,6 +23,7 @@ from spslam.meshing.extract import CHUNK_POINTS, MAX_SLOPE
 from spslam.meshing.flying_pixels import flying_pixels, has_flying_pixels
 from spslam.meshing.ray_noise import noise_along_rays
 from spslam.meshing.reading import reading_threads
+from spslam.meshing.rolling_shutter import FrameReadout
 from spslam.meshing.sdf_sampling import near_surface
 from spslam.ops.tsdf_volume import BLOCK_BYTES, NEAR_SHARE, TRUNCATION_VOXELS
 from spslam.scene import Scene
@@ -85,22 +86,28 @@ class PosedFrames:
         indices: int64 [F] of the frames in the dataset.
         poses: float64 [F, 4, 4] T_world_camera, finite.
         noise: of their depth, see `FusionOptions`; None is that of the fusion.
+        readout: by which frames of a rolling shutter are rectified; None where they are of one moment each.
     """
 
     dataset: RgbdDataset
     indices: np.ndarray
     poses: np.ndarray
     noise: tuple[float, float] | None = None
+    readout: FrameReadout | None = None
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def __getitem__(self, position: int) -> RgbdFrame:
-        return self.dataset[int(self.indices[position])]
+        index = int(self.indices[position])
+        frame = self.dataset[index]
+        return frame if self.readout is None else self.readout.rectified(index, frame, self.dataset.camera)
 
     def depth(self, position: int) -> np.ndarray:
         """Float32 [H, W], m: of the frame alone, which takes less time."""
-        return self.dataset.depth(int(self.indices[position]))
+        index = int(self.indices[position])
+        depth = self.dataset.depth(index)
+        return depth if self.readout is None else self.readout.rectified_depth(index, depth, self.dataset.camera)
 
     def covered(self, frame: RgbdFrame) -> RgbdFrame:
         """One of the frames for what takes its colors: in pixels that are left out something lies before all else."""

@@ -22,6 +22,7 @@ from spslam.meshing.depth_views import DepthViews
 from spslam.meshing.extract import cubes_per_cell
 from spslam.meshing.frame_fusion import FusionOptions, PosedFrames, fuse_frames
 from spslam.meshing.fused_mesh import extract_fused_mesh
+from spslam.meshing.rolling_shutter import FrameReadout
 from spslam.meshing.texture.export import check_textured_format
 from spslam.ops.depth_planes import DEFAULT_NOISE
 from spslam.options import MeshOptions
@@ -69,6 +70,7 @@ class MeshJob:
         camera: intrinsics of the frames; None leaves surface in that no view sees, of a mesh from the map alone.
         options: of the mesh.
         noise: of depth, see `ops.measure_planes`; where it was not measured, None.
+        readout_s: of the run's frames, from the first row that is read to the last; 0 where they are of one moment.
         earlier: recordings that the map is of beside the run's.
         texture: whether the frames' colors are baked into a texture; None for colors of vertices.
         needs_frames: a mesh is fused only where a frame can be read; else the map fills in for all of them.
@@ -79,6 +81,7 @@ class MeshJob:
     camera: Camera | None
     options: MeshOptions
     noise: tuple[float, float] | None = None
+    readout_s: float = 0.0
     earlier: Sequence[EarlierFrames] = ()
     texture: TextureWish | None = None
     needs_frames: bool = False
@@ -94,6 +97,12 @@ def measured_noise(metrics: Mapping[str, Any]) -> tuple[float, float] | None:
     if not isinstance(floor, float) or not isinstance(growth, float) or not (0 <= floor < 1 and 0 <= growth < 1):
         return None
     return floor, growth
+
+
+def measured_readout_s(metrics: Mapping[str, Any]) -> float:
+    """The readout of frames that a run measured, from its metrics.json; 0 where it says nothing."""
+    readout_ms = metrics.get("readout_ms")
+    return 1e-3 * readout_ms if isinstance(readout_ms, float) and abs(readout_ms) < 1e3 else 0.0
 
 
 def write_mesh(path: Path, job: MeshJob, dataset: RgbdDataset | None) -> tuple[TriangleMesh, dict[str, Any]]:
@@ -214,7 +223,7 @@ def frames_of(job: MeshJob, dataset: RgbdDataset) -> list[PosedFrames]:
     Raises:
         OutputError: there is none of the run.
     """
-    return [*_earlier_frames(job.earlier), posed_frames(dataset, job.trajectory)]
+    return [*_earlier_frames(job.earlier), posed_frames(dataset, job.trajectory, job.readout_s)]
 
 
 def _earlier_frames(earlier: Sequence[EarlierFrames]) -> list[PosedFrames]:
@@ -222,8 +231,13 @@ def _earlier_frames(earlier: Sequence[EarlierFrames]) -> list[PosedFrames]:
     return [replace(posed_frames(dataset, each.trajectory), noise=each.noise) for each, dataset in known]
 
 
-def posed_frames(dataset: RgbdDataset, trajectory: Trajectory) -> PosedFrames:
+def posed_frames(dataset: RgbdDataset, trajectory: Trajectory, readout_s: float = 0.0) -> PosedFrames:
     """The dataset's frames that a trajectory has a pose for.
+
+    Args:
+        dataset: that they are read from.
+        trajectory: of them.
+        readout_s: as of `MeshJob`.
 
     Raises:
         OutputError: there is none.
@@ -232,7 +246,8 @@ def posed_frames(dataset: RgbdDataset, trajectory: Trajectory) -> PosedFrames:
     rows = np.flatnonzero((indices >= 0) & ~trajectory.lost)
     if not len(rows):
         raise OutputError(f"{dataset.name}: has none of the run's frames to fuse; --source neural needs no frames")
-    return PosedFrames(dataset, indices[rows], trajectory.poses[rows])
+    readout = FrameReadout(readout_s, trajectory, indices) if readout_s else None
+    return PosedFrames(dataset, indices[rows], trajectory.poses[rows], readout=readout)
 
 
 def noise_of_model(model: torch.Tensor) -> tuple[float, float]:

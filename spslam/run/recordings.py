@@ -79,7 +79,7 @@ def write_map_mesh(
     dataset, noise = earlier[own].dataset, earlier[own].noise
     camera = archive.recordings[own].camera
     rest = [each for i, each in enumerate(earlier) if i != own]
-    job = MeshJob(scene, earlier[own].trajectory, camera, options, noise, rest, texture)
+    job = MeshJob(scene, earlier[own].trajectory, camera, options, noise, earlier=rest, texture=texture)
     return (*write_mesh(path, job, dataset), missing)
 
 

@@ -28,7 +28,7 @@ from spslam.run.figures import (
     tracking_figures,
     truth_figures,
 )
-from spslam.run.mesh import EarlierFrames, MeshJob, noise_of_model, write_mesh
+from spslam.run.mesh import EarlierFrames, MeshJob, measured_readout_s, noise_of_model, write_mesh
 from spslam.run.output_folder import OutputFolder
 from spslam.run.recordings import read_again, source_of
 from spslam.run.request import RunRequest
@@ -140,7 +140,8 @@ def write_results(
     metrics |= timing_figures(sensor.color_delay, sensor.readout)
     if request.mesh:
         # The trajectory is the file's, so that `spslam mesh` makes the same one.
-        job = MeshJob(system.state.scene, written, system.camera, config.mesh, noise_of_model(noise), earlier)
+        of_sensor = noise_of_model(noise), measured_readout_s(metrics)
+        job = MeshJob(system.state.scene, written, system.camera, config.mesh, *of_sensor, earlier)
         metrics |= write_mesh(folder.mesh, job, source.dataset)[1]
     finish_results(RunOutput(folder, trajectory, source.poses, metrics, log, "", system.camera), source, config)
     folder.checkpoint.unlink(missing_ok=True)

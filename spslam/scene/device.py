@@ -21,7 +21,8 @@ def usable_device(device: torch.device | str) -> torch.device:
         raise DeviceError(f"device must be cpu, cuda or cuda:N, got {device}") from None
     if usable.type == "cuda":
         if ops.CUDA_OFF_REASON:
-            raise DeviceError(f"device {device} is not available: {ops.CUDA_OFF_REASON}; use device cpu")
+            hint = 'use --device cpu, in Python device="cpu"'
+            raise DeviceError(f"device {device} is not available: {ops.CUDA_OFF_REASON}; {hint}")
         if usable.index is not None and usable.index >= torch.cuda.device_count():
             raise DeviceError(f"device {device} is not available: there are {torch.cuda.device_count()} CUDA devices")
     elif usable.type != "cpu":
