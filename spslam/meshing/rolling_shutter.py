@@ -36,7 +36,7 @@ class FrameReadout:
 
     def __init__(self, readout_s: float, trajectory: Trajectory, indices: np.ndarray):
         self._readout = torch.tensor([readout_s], dtype=torch.float32)
-        rows = np.flatnonzero((indices >= 0) & ~trajectory.lost)
+        rows = np.flatnonzero((indices >= 0) & ~trajectory.lost).tolist()
         self._moved = {int(indices[row]): moved for row in rows if (moved := _moved(trajectory, row)) is not None}
 
     def rectified_depth(self, index: int, depth: np.ndarray, camera: Camera) -> np.ndarray:
