@@ -17,6 +17,9 @@ MOST_OFF = 0.3
 # By so much the moments of a frame's depth and color may differ, or those of an image's rows: as in recordings whose
 # images are paired by time, and with a rolling shutter.
 LATE_S = 0.02
+# s, between two frames: nearer stamps are of one moment (ops count in whole nanoseconds), and over a longer time the
+# camera hardly moves evenly.
+LEAST_MOTION_S, MAX_MOTION_S = 1e-9, 0.12
 _MOST_AT_ONCE = 1 << 15  # windows in memory
 
 

@@ -1,8 +1,8 @@
 """Frames of a rolling shutter as of their middle row's moment, for meshes; see `spslam.ops.rolling_shutter`.
 
-Between two frames a moving camera is as long at a pose as it takes to read one out: what a Kinect's rows show while it
-turns at 60 degrees/s is off by a degree at the image's borders. All poses are known here, so the camera's velocity at a
-frame is the mean one from the frame before to the frame after.
+While a camera reads a frame out, it moves on: of a Kinect that turns at 60 degrees/s, whose readout is 26 ms, the first
+and the last row see 1.6 degrees apart. All poses are known here, so the camera's velocity at a frame is the mean one from
+the frame before to the frame after.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import torch
 from spslam import ops
 from spslam.camera import Camera
 from spslam.datasets.base import RgbdFrame
-from spslam.geometry import inverse, matrix_to_pose7, rotation_angle
+from spslam.datasets.clock import LEAST_MOTION_S, MAX_MOTION_S
+from spslam.geometry import matrix_to_pose7, rotation_angle
 from spslam.pose_graph import rotation_matrices, rotation_vectors
 from spslam.trajectory import Trajectory
 
-LEAST_S, MOST_S = 1e-6, 0.12  # between two frames; over a longer time the camera hardly moves evenly
 BENT_PX = 1.0  # by which the turn must put the last row off against the first; less is not worth the time
 _INTERVAL_S = 1 / 30  # over which velocities are given to the op
 _DEPTH_STEPS = 65535
@@ -71,14 +71,14 @@ def _moved(trajectory: Trajectory, row: int) -> tuple[np.ndarray, np.ndarray] | 
     known."""
     times, poses = trajectory.timestamps, trajectory.poses
     near = [other for other in (row - 1, row + 1) if 0 <= other < len(times) and not trajectory.lost[other]]
-    near = [other for other in near if LEAST_S < abs(times[other] - times[row]) < MOST_S]
+    near = [other for other in near if LEAST_MOTION_S <= abs(times[other] - times[row]) < MAX_MOTION_S]
     first, last = min([*near, row]), max([*near, row])
     seconds = times[last] - times[first]
-    if first == last or seconds <= 0:
+    if seconds <= 0:  # none is near, or stamps go back
         return None
     share = _INTERVAL_S / seconds
     before = poses[row].copy()
-    turn = rotation_vectors((poses[last] @ inverse(poses[first]))[:3, :3])
+    turn = rotation_vectors(poses[last][:3, :3] @ poses[first][:3, :3].T)
     before[:3, :3] = rotation_matrices(-share * turn) @ poses[row][:3, :3]
     before[:3, 3] -= share * (poses[last][:3, 3] - poses[first][:3, 3])
     return before, poses[row]
@@ -87,7 +87,8 @@ def _moved(trajectory: Trajectory, row: int) -> tuple[np.ndarray, np.ndarray] | 
 def _rectified(
     depth: np.ndarray, channels: list[np.ndarray], motion: ops.ShutterMotion, camera: Camera
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Depth float32 [H, W], m, and channels uint8 [H, W] of a color image."""
+    """Depth float32 [H, W], m, and channels uint8 [H, W] of a color image; the op takes one channel, and depth each
+    time."""
     unit = max(float(depth.max()), 1e-3) / _DEPTH_STEPS
     read = torch.from_numpy((depth / np.float32(unit) + np.float32(0.5)).astype(np.uint16))
     intrinsics = ops.Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)

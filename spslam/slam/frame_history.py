@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from spslam import ops
+from spslam.datasets.clock import LEAST_MOTION_S, MAX_MOTION_S
 from spslam.geometry import pose7_to_matrix
 from spslam.slam.color_motion import MAX_COLOR_DELAY_S, MAX_SHARE, ColorMotion
 from spslam.slam.device_events import read_together
@@ -16,10 +17,8 @@ from spslam.slam.state import SlamState
 
 MAX_COMPARED = 128  # frames that a pose is verified against: the most recent and an even sample of the others
 RECENT_COMPARED = 16
-LEAST_MOTION_S = 1e-9  # ops count in whole nanoseconds; nearer stamps are of one moment
 UNEVEN_STEPS = 1.4  # times between frames differ by less where they are of one rate, and stamps are late or early
 MAX_STEPS = 4.0
-MAX_MOTION_S = 0.12  # between two frames; over a longer time the camera hardly moves evenly
 # At least between the two that say where a color image was taken. What a pose is off by moves the color image that the
 # next one is found by: with color half of that time before depth it would be off as much to the other side, and with
 # more than half farther and farther (docs/experiments/2026-11-color-before-depth.md).

@@ -193,7 +193,7 @@ class MovingObjects:
         cells = pixels.depth_image[::step, ::step].contiguous()
         if shutter is None or min(cells.shape) < 2:
             return cells
-        rectified, gray = torch.empty_like(cells), torch.empty_like(cells, dtype=torch.uint8)
+        rectified, gray = torch.empty_like(cells), torch.zeros_like(cells, dtype=torch.uint8)  # colors are not asked
         ops.trusted.rectify_shutter_images_(
             rectified, torch.empty_like(gray), cells, gray, shutter, self._cell_intrinsics(step), self._unit
         )
@@ -252,6 +252,8 @@ class MovingObjects:
     def _left_out(
         self, features: FrameFeatures, step: int, cells: torch.Tensor, counts: torch.Tensor
     ) -> dict[str, torch.Tensor]:
+        """The frame as it was read without what lies in cells that move. These are of the rectified frame: in a rolling
+        shutter's turn the first and last rows are some pixels beside them."""
         pixels = features.pixels
         names = ("records", "normals", "depth_image", "depth_thumbnail")
         steps = ops.comparison.SampleSteps(self._image_step, THUMBNAIL_STEP_PX, step)

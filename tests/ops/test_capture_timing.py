@@ -146,8 +146,8 @@ def test_keyframes_may_be_rectified_by_another_readout(device):
         keyframes = keyframes._replace(timing=times)
         ops.measure_capture_timing_(timing, records, recording.poses[17], CAMERA, noise, keyframes)
         found.append(float(timing.state[1, 0]))
-    assert found[:2] == pytest.approx([0.03, 0.03], abs=0.0005)
-    assert abs(found[2] - 0.03) > 0.004
+    assert found[:2] == pytest.approx([0.03, 0.03], abs=0.0005)  # the camera does not move quite evenly
+    assert abs(found[2] - 0.03) > 0.004  # where nobody says by which they were
 
 
 def test_the_delay_beyond_what_stamps_say_is_found(device):

@@ -16,7 +16,7 @@ from spslam.slam.depth_history import FADES, MOST_OFF, DepthHistory
 from spslam.slam.depth_keyframes import depth_image_intrinsics, depth_image_step, depth_unit
 from spslam.slam.device_events import HostEvent
 from spslam.slam.image_features import ImageFeatures
-from spslam.slam.moving_objects import DEVIATIONS, FEWEST_PIXELS, MARGIN_M, MovingObjects, StaticFrame
+from spslam.slam.moving_objects import DEVIATIONS, FEWEST_PIXELS, MARGIN_M, NOTICED, MovingObjects, StaticFrame
 from spslam.slam.pixels import THUMBNAIL_STEP_PX, sample_frame
 from spslam.slam.poses import pose_tensor
 from spslam.slam.recovery.tracked_frame import TrackedFrame
@@ -298,7 +298,7 @@ def test_nothing_moves_in_the_frames_of_a_rolling_shutter():
     data = PlacesDataset("hall", "fast_turns", "exact", 50, 9, capture=capture)
     system = SlamSystem(load_config("places", overrides=["device=cpu"]), data.camera)
     shares = [system.process(frame).moving_share for frame in data]
-    assert max(share for share in shares[15:] if share is not None) < 0.01  # the readout has to be found first
+    assert max(share for share in shares[15:] if share is not None) < NOTICED  # the readout has to be found first
 
 
 def test_anchors_are_of_the_recording_alone():
