@@ -1,8 +1,8 @@
 """Frames of a rolling shutter as of their middle row's moment, for meshes; see `spslam.ops.rolling_shutter`.
 
 While a camera reads a frame out, it moves on: of a Kinect that turns at 60 degrees/s, whose readout is 26 ms, the first
-and the last row see 1.6 degrees apart. All poses are known here, so the camera's velocity at a frame is the mean one from
-the frame before to the frame after.
+and the last row see 1.6 degrees apart. All poses are known here, so the camera's velocity at a frame is the mean one
+from the frame before to the frame after.
 """
 
 from __future__ import annotations
